@@ -1,0 +1,29 @@
+"""Gymnasium environments with hidden states, and learned KKL observers that reveal them."""
+
+import gymnasium as gym
+
+from kkl_gym.envs import KKLEnv
+from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
+from kkl_gym.wrappers import ActionRepeat, KKLObservation
+
+__version__ = "0.1.0"
+
+ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
+
+for _name, _id in ENV_IDS.items():
+    if _id not in gym.registry:  # a second import, as after importlib.reload, changes nothing
+        gym.register(_id, entry_point="kkl_gym.envs:KKLEnv", kwargs={"system": _name}, max_episode_steps=5000)
+
+__all__ = [
+    "ENV_IDS",
+    "SYSTEMS",
+    "ActionRepeat",
+    "KKLEnv",
+    "KKLObservation",
+    "Lorenz",
+    "ReverseDuffing",
+    "Rossler",
+    "System",
+    "VanDerPol",
+    "get_system",
+]

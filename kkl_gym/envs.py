@@ -1,0 +1,200 @@
+"""Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+import gymnasium as gym
+import numpy as np
+
+from kkl_gym.simulate import advance, check_dt
+from kkl_gym.systems import System, get_system
+
+NOISE_BLOCK = 64  # noise is drawn for so many samples at once, because single draws cost more than the simulation
+
+
+class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
+    """One system, seen through noise.
+
+    x' = f(x) + g(x) u + w, y_k = h(x(t_k)) + v_k, simulated with the input and the process noise held over each
+    sampling interval (paper, sec. 7, eq. sys-noisy).
+
+    **Timing.** ``reset`` returns the sample y_0 = h(x_0) + v_0; ``step(a_k)`` holds u_k and w_k over [t_k, t_k+1]
+    and returns the sample y_k+1.
+
+    **Action.** ``Box(-1, 1, (nu,))``, multiplied by the system's input bounds; values outside are clipped. Action 0 is
+    the autonomous system.
+
+    **Observation.** float32: the true state x (``observe="state"``) or the noisy output y (``observe="output"``),
+    clipped to the system's declared bounds (for y, to the outputs that those bounds allow, widened by six standard
+    deviations of the noise).
+
+    **Info.** ``y`` the noisy output, ``x`` the true state and, after a step, ``u`` the physical input that acted;
+    float64, never clipped.
+
+    **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
+
+    **Ends.** ``terminated`` with ``info["escaped"]`` where the state leaves its declared bounds; the last state and
+    output inside them are then returned. The registered ids truncate after 5,000 steps.
+
+    Parameters
+    ----------
+    system : a name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
+    dt : sampling interval in seconds.
+    process_noise : bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
+        \\|w_i\\| <= process_noise * scale_i; None takes the system's own default.
+    measurement_noise : standard deviation of the Gaussian noise v on each sample of each output.
+    observe : "state" or "output".
+    parameters : physical parameters of the system, by name, where they differ from its defaults.
+    render_mode : None or "rgb_array".
+
+    Raises
+    ------
+    ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+
+    def __init__(
+        self,
+        system: str | System,
+        dt: float = 0.01,
+        process_noise: float | None = None,
+        measurement_noise: float = 0.5,
+        observe: Literal["state", "output"] = "state",
+        parameters: Mapping[str, float] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        self.system = get_system(system, parameters)
+        check_dt(dt)
+        process_noise = self.system.process_noise if process_noise is None else process_noise
+        for name, level in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
+            if not 0 <= level < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {level!r}")
+        if observe not in ("state", "output"):
+            raise ValueError(f'observe must be "state" or "output", got {observe!r}')
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        self.dt = float(dt)
+        self.process_noise = float(process_noise)
+        self.measurement_noise = float(measurement_noise)
+        self.observe = observe
+        self.render_mode = render_mode
+
+        self._nx, self._ny, self._nu = self.system.nx, self.system.ny, self.system.nu
+        self._w_max = np.array(self.system.scale) * self.process_noise
+        self._target, self._scale = self.system.target, self.system.scale
+        self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
+        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
+        self.observation_space = self.state_space if observe == "state" else self.output_space
+        self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._nu,), np.float32)
+        self._noise: list[tuple[list[float], list[float]]] = []
+        self._x: tuple[float, ...] | None = None
+        self._trail: list[tuple[float, ...]] = []
+        self._canvas: Any = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode, from ``options["x0"]`` (nx numbers) or uniformly in the system's training box.
+
+        Raises ValueError if x0 has the wrong shape, is not finite, lies outside the declared bounds, or if
+        ``options`` holds an unknown key.
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self._noise.clear()
+        start = None
+        for key, value in (options or {}).items():
+            if key != "x0":
+                raise ValueError(f'unknown reset option {key!r}; the one there is is "x0"')
+            start = np.asarray(value, dtype=float)
+            if start.shape != (self._nx,) or not self._inside(start.tolist()):
+                raise ValueError(f"x0 must be {self._nx} numbers within {self.system.bounds}, got {value!r}")
+        if start is None:
+            start = self.np_random.uniform(*self.system.box())
+        self._x = tuple(start.tolist())
+        self._y = self._measure(self._next_noise()[1])
+        self._u = [0.0] * self._nu
+        self._trail = [self._x]
+        return self._observation(), {"y": np.array(self._y), "x": np.array(self._x)}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Hold the input over one sampling interval; raises ValueError on an action of wrong shape or with NaN."""
+        if self._x is None:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        self._u = self._input(action)
+        w, v = self._next_noise()
+        x = advance(self.system, self._x, self._u, w, self.dt)
+        escaped = not self._inside(x)
+        if not escaped:
+            self._x = tuple(x)
+            self._y = self._measure(v)
+        info = {"y": np.array(self._y), "x": np.array(self._x), "u": np.array(self._u), "escaped": escaped}
+        if self.render_mode is not None:
+            self._trail.append(self._x)
+        cost = 0.0
+        for xi, ti, si in zip(self._x, self._target, self._scale, strict=True):
+            distance = (xi - ti) / si
+            cost += distance * distance
+        reward = 1.0 / (1.0 + 4.0 * cost / self._nx)
+        return self._observation(), reward, escaped, False, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
+        if self.render_mode is None:
+            return None
+        if self._canvas is None:
+            from kkl_gym.rendering import Canvas
+
+            self._canvas = Canvas(self.system)
+        return self._canvas.draw(self._trail)  # type: ignore[no-any-return]
+
+    def _input(self, action: np.ndarray) -> list[float]:
+        values = np.asarray(action, dtype=float).tolist()
+        if not isinstance(values, list) or len(values) != self._nu:
+            raise ValueError(f"the action must have shape ({self._nu},), got {action!r}")
+        u = []
+        for a, u_max in zip(values, self.system.u_max, strict=True):
+            if a != a:
+                raise ValueError(f"the action must be numbers, got {action!r}")
+            u.append(max(-1.0, min(1.0, a)) * u_max)
+        return u
+
+    def _measure(self, v: list[float]) -> list[float]:
+        return [hi + vi for hi, vi in zip(self.system.h(self._x), v, strict=True)]  # type: ignore[arg-type]
+
+    def _inside(self, x: Any) -> bool:
+        for xi, (low, high) in zip(x, self.system.bounds, strict=True):
+            if not low <= xi <= high:  # false for NaN too
+                return False
+        return True
+
+    def _observation(self) -> np.ndarray:
+        values = self._x if self.observe == "state" else self._y
+        clipped = [max(low, min(high, value)) for value, (low, high) in zip(values, self._limits, strict=True)]  # type: ignore[arg-type]
+        return np.array(clipped, dtype=np.float32)
+
+    def _next_noise(self) -> tuple[list[float], list[float]]:
+        """One sample of (w, v)."""
+        if not self._noise:
+            w = self.np_random.uniform(-self._w_max, self._w_max, (NOISE_BLOCK, self._nx))
+            v = self.np_random.normal(0.0, self.measurement_noise, (NOISE_BLOCK, self._ny))
+            self._noise = [*zip(w.tolist()[::-1], v.tolist()[::-1], strict=True)]
+        return self._noise.pop()
+
+
+def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high, each (ny,), of h over the declared bounds, widened by ``margin``.
+
+    Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
+    """
+    ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
+    points = np.array(np.meshgrid(*ends, indexing="ij")).reshape(system.nx, -1)
+    y = np.array([np.broadcast_to(yi, points.shape[1:]) for yi in system.h(points)])
+    return y.min(1) - margin, y.max(1) + margin
+
+
+def _float32_box(low: Any, high: Any) -> gym.spaces.Box:
+    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)

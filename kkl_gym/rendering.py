@@ -1,0 +1,44 @@
+"""The phase portrait that ``render_mode="rgb_array"`` shows."""
+
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.systems import System
+
+TRAIL = 1000  # samples shown
+
+
+class Canvas:
+    """A phase portrait of a system's first and last state, with a target and a fading trail.
+
+    Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not installed.
+    """
+
+    def __init__(self, system: System) -> None:
+        try:
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+            from matplotlib.figure import Figure
+        except ImportError as error:
+            raise ImportError('rendering needs matplotlib: pip install "kkl-gym[plots]"') from error
+        self._axes = (0, system.nx - 1)
+        figure = Figure(figsize=(4.8, 4.8), dpi=100, layout="constrained")
+        self._canvas: Any = FigureCanvasAgg(figure)
+        ax = figure.add_subplot()
+        names = [system.state_names[i] for i in self._axes]
+        (low, high), (bottom, top) = ((1.5 * np.array(system.X[i])).tolist() for i in self._axes)
+        pad_x, pad_y = 0.05 * (high - low), 0.05 * (top - bottom)
+        ax.set(xlim=(low - pad_x, high + pad_x), ylim=(bottom - pad_y, top + pad_y), xlabel=names[0], ylabel=names[1])
+        ax.set_title(system.name.replace("_", " "))
+        ax.plot(*(system.target[i] for i in self._axes), "+", color="C2", markersize=12, label="target")
+        (self._line,) = ax.plot([], [], color="0.4", lw=1.0)
+        (self._head,) = ax.plot([], [], "o", color="C0", label="state")
+        ax.legend(loc="upper right")
+
+    def draw(self, trail: list[tuple[float, ...]]) -> np.ndarray:
+        """The last samples of ``trail`` (states) as an RGB image, uint8, shape (height, width, 3)."""
+        points = np.array(trail[-TRAIL:])[:, self._axes]
+        self._line.set_data(*points.T)
+        self._head.set_data(*points[-1:].T)
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()

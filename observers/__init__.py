@@ -1,0 +1,18 @@
+"""Learned KKL observers at run time: arrays and artifacts, NumPy alone."""
+
+from observers.artifact import Artifact, ArtifactError, ForwardMap, InverseMap, shipped
+from observers.filter import LinearFilter
+from observers.network import MLP
+from observers.observer import KKLObserver, load
+
+__all__ = [
+    "MLP",
+    "Artifact",
+    "ArtifactError",
+    "ForwardMap",
+    "InverseMap",
+    "KKLObserver",
+    "LinearFilter",
+    "load",
+    "shipped",
+]

@@ -1,0 +1,76 @@
+"""Multilayer perceptrons, evaluated with NumPy alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+def _tanh(h: np.ndarray) -> np.ndarray:
+    return np.tanh(h, out=h)
+
+
+def _silu(h: np.ndarray) -> np.ndarray:
+    h *= 0.5  # h sigmoid(h) = h/2 + h/2 tanh(h/2), which cannot overflow
+    return h + h * np.tanh(h)
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "silu": _silu}
+
+
+@dataclass(frozen=True)
+class MLP:
+    """A multilayer perceptron in float32.
+
+    weights : for each layer (outputs, inputs), as torch stores them.
+    biases : for each layer (outputs,).
+    activation : after every layer but the last, "tanh" or "silu".
+
+    Raises ValueError if shapes do not chain, a weight is not finite or the activation is unknown.
+    """
+
+    weights: Sequence[np.ndarray]
+    biases: Sequence[np.ndarray]
+    activation: str
+
+    def __post_init__(self) -> None:
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"unknown activation {self.activation!r}, expected one of {', '.join(ACTIVATIONS)}")
+        if not self.weights or len(self.weights) != len(self.biases):
+            raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
+        width = np.shape(self.weights[0])[-1]
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            if weight.ndim != 2 or weight.shape != (len(bias), width):
+                raise ValueError(f"layer of shape {weight.shape}, bias {bias.shape}, cannot follow {width} values")
+            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+                raise ValueError("the network holds weights that are not finite")
+            width = len(bias)
+        layers = [
+            (np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32))
+            for weight, bias in zip(self.weights, self.biases, strict=True)
+        ]
+        object.__setattr__(self, "_layers", layers)
+
+    @property
+    def inputs(self) -> int:
+        """Width of the input."""
+        return int(self.weights[0].shape[1])
+
+    @property
+    def outputs(self) -> int:
+        """Width of the output."""
+        return int(self.weights[-1].shape[0])
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """(..., inputs) to (..., outputs), float32."""
+        activation = ACTIVATIONS[self.activation]
+        *hidden, (weight, bias) = self._layers  # type: ignore[attr-defined]
+        h: Any = x.astype(np.float32, copy=False)
+        for w, b in hidden:
+            h = h @ w
+            h += b
+            h = activation(h)
+        h = h @ weight
+        h += bias
+        return h  # type: ignore[no-any-return]

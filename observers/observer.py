@@ -1,0 +1,178 @@
+"""The observer at run time: filter the output, invert the map."""
+
+import math
+import os
+from typing import Any
+
+import numpy as np
+
+from observers.artifact import Artifact, ArtifactError, resolve
+
+_CHUNK = 200_000  # rows of a record that go through the network at once
+
+
+class KKLObserver:
+    """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (paper, sec. 3.2).
+
+    ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
+    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx).
+
+    Parameters
+    ----------
+    artifact : what was learned.
+    measurement_noise : standard deviation of the noise on each sample of the output, for maps that ask for it.
+
+    Raises
+    ------
+    ValueError : if the noise level is negative or beyond what the map was trained for.
+    """
+
+    def __init__(self, artifact: Artifact, measurement_noise: float = 0.5) -> None:
+        self.artifact = artifact
+        self.measurement_noise = measurement_noise
+        self._z: np.ndarray | None = None
+
+    @property
+    def measurement_noise(self) -> float:
+        """Standard deviation sigma_v of the measurement noise that the estimate assumes."""
+        return self._measurement_noise
+
+    @measurement_noise.setter
+    def measurement_noise(self, level: float) -> None:
+        inverse = self.artifact.inverse
+        if not 0 <= level < math.inf:
+            raise ValueError(f"measurement_noise must be finite and not negative, got {level!r}")
+        if "measurement_noise" in inverse.features and level > inverse.noise_max:
+            raise ValueError(
+                f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.noise_max}; "
+                f"pass measurement_noise={inverse.noise_max} to use it all the same"
+            )
+        self._measurement_noise = float(level)
+        gain = inverse.gain(level)[:, None] * inverse.whiten
+        self._whiten = np.ascontiguousarray(gain.T)
+        self._offset = -inverse.z_offset @ self._whiten
+        self._conditions: list[Any] = []
+        if "measurement_noise" in inverse.features:
+            self._conditions.append(float(inverse.noise_feature(level)))
+
+    @property
+    def z(self) -> np.ndarray:
+        """The filter's state [z_y, z_u], a copy of shape (..., nz * (1 + nu)); raises RuntimeError before reset."""
+        if self._z is None:
+            raise RuntimeError("call reset(y0) before the observer is used")
+        return self._z.copy()
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Forget the past and take in the first sample, (..., ny); returns the first estimate, (..., nx)."""
+        y0 = np.asarray(y0, dtype=float)
+        self._check_output(y0, y0.shape[:-1])
+        self._z, self._y, self._age = self.artifact.filter.start(y0), y0, 0
+        return self._invert(self._z, 0.0)
+
+    def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
+        """Take in the sample y, (..., ny), that followed the input u, (..., nu); returns the estimate, (..., nx).
+
+        Without a sample (``y=None``) the observer coasts: the filter takes the output as unchanged since the
+        last one. ``u=None`` is zero.
+
+        Raises ValueError on a wrong shape, NaN or infinity, or a nonzero input that the map does not know of;
+        the observer is then as it was. Raises RuntimeError before :meth:`reset`.
+        """
+        if self._z is None:
+            raise RuntimeError("call reset(y0) before step(y)")
+        batch = self._z.shape[:-1]
+        if y is None:
+            y = self._y
+        else:
+            y = np.asarray(y, dtype=float)
+            self._check_output(y, batch)
+        self._z = self.artifact.filter.advance(self._z, self._y, self._input(u, batch), y)
+        self._y = y
+        self._age += 1
+        return self._invert(self._z, self._age * self.artifact.filter.dt)
+
+    def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Estimates for a whole record, the same as :meth:`reset` and :meth:`step` would give row by row.
+
+        Parameters
+        ----------
+        y : (steps, ..., ny); the first row is y_0.
+        u : (steps - 1, ..., nu), the input held after each row but the last (a last row more is ignored); None is 0.
+
+        Returns
+        -------
+        (steps, ..., nx). The observer's own state is left as it was.
+        """
+        y = np.asarray(y, dtype=float)
+        if y.ndim < 2 or not len(y):
+            raise ValueError(f"a record must have shape (steps, ..., {self.artifact.ny}), got {y.shape}")
+        self._check_output(y, y.shape[:-1])
+        steps, batch = len(y), y.shape[1:-1]
+        if u is not None and len(u) not in (steps - 1, steps):
+            raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got {len(u)}")
+        linear = self.artifact.filter
+        out = np.empty((*y.shape[:-1], self.artifact.nx))
+        rows = max(1, _CHUNK // max(1, math.prod(batch)))
+        z = linear.start(y[0])
+        for first in range(0, steps, rows):
+            count = min(rows, steps - first)
+            record = np.empty((count, *z.shape))
+            for i, k in enumerate(range(first, first + count)):
+                if k > 0:
+                    z = linear.advance(z, y[k - 1], self._input(None if u is None else u[k - 1], batch), y[k])
+                record[i] = z
+            age = np.arange(first, first + count) * linear.dt
+            out[first : first + count] = self._invert(record, age.reshape(count, *(1 for _ in batch)))
+        return out
+
+    def _invert(self, z: np.ndarray, age: Any) -> np.ndarray:
+        inverse = self.artifact.inverse
+        modes = z @ self._whiten
+        modes += self._offset
+        conditions = self._conditions
+        if inverse.features[-1] == "age":
+            conditions = [*conditions, inverse.age_feature(age)]
+        width = modes.shape[-1]
+        inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
+        inputs[..., :width] = modes
+        for i, condition in enumerate(conditions):
+            inputs[..., width + i] = condition
+        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
+
+    def _check_output(self, y: np.ndarray, batch: tuple[int, ...]) -> None:
+        if y.shape != (*batch, self.artifact.ny):
+            raise ValueError(f"y must have shape {(*batch, self.artifact.ny)}, got {y.shape}")
+        if not np.isfinite(y).all():
+            raise ValueError("y holds NaN or infinity; a missing sample is step(None, u)")
+
+    def _input(self, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
+        nu = self.artifact.nu
+        if u is None:
+            return np.zeros((*batch, nu))
+        u = np.asarray(u, dtype=float)
+        if nu == 0:
+            if u.any():
+                raise ValueError(
+                    f"this map for {self.artifact.system} knows no inputs, but u = {u}; take one that does, "
+                    "or pass u=None to ignore the input"
+                )
+            return np.zeros((*batch, 0))
+        if u.shape != (*batch, nu):
+            raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
+        if not np.isfinite(u).all():
+            raise ValueError("u holds NaN or infinity")
+        return u
+
+
+def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5) -> KKLObserver:
+    """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
+
+    A name without a version is the newest; ``"van_der_pol-v1"`` is that version for good.
+
+    Raises ArtifactError (a ValueError) if there is none or the file is damaged, ValueError on a noise level out
+    of range.
+    """
+    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise)
+
+
+__all__ = ["ArtifactError", "KKLObserver", "load"]

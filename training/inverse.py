@@ -1,0 +1,224 @@
+"""Learning the inverse T_inv, either from simulated trajectories or from a learned forward map."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from observers import InverseMap, LinearFilter
+from training.data import Trajectories
+from training.networks import Network, tensor
+from training.noise import noise_covariance, root, stationary_covariance
+
+# A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
+SMALLEST_MODE = 1e-7
+NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
+AGE_UNIT = 0.05  # s, in the age feature log(1 + t / unit)
+
+# inputs (batch, inputs), x scaled (batch, nx), weight (batch,), cell (batch,)
+Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Coordinates of z in which the signal has unit covariance and stationary noise a diagonal one.
+
+    The components of z are nearly collinear, with variances that spread over ten orders of magnitude; a network
+    in float32 cannot read them unless they are whitened.
+
+    offset : (size,).
+    whiten : (modes, size), sorted by falling ratio of signal to noise.
+    noise_gain : (modes,), standard deviation of each coordinate's noise at sigma_v = 1.
+    """
+
+    offset: np.ndarray
+    whiten: np.ndarray
+    noise_gain: np.ndarray
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        return (z - self.offset) @ self.whiten.T
+
+
+def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
+    """Coordinates from samples of z, (n, size), and the covariance of the noise in z, (size, size)."""
+    offset, scale = z.mean(0), z.std(0)
+    scale = np.where(scale > 0, scale, 1.0)
+    _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)
+    keep = singular > SMALLEST_MODE * singular[0]
+    whiten = directions[keep] / singular[keep, None] * np.sqrt(len(z)) / scale
+    variances, rotation = np.linalg.eigh(whiten @ noise @ whiten.T)
+    return Coordinates(offset, rotation.T @ whiten, np.sqrt(np.maximum(variances, 0.0)))
+
+
+class TrajectorySampler:
+    """Batches along trajectories: every age since reset, every noise level up to ``noise_max``.
+
+    Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
+    that fits such data in the mean square is the conditional mean of x.
+
+    The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
+    into ``cells`` of like age and level, and the loss divides each by its cell's own recent error, so that all
+    improve in proportion.
+    """
+
+    AGES_PER_BATCH = 32
+    QUIET = 0.25  # share of samples without any noise
+    LEVELS = 6  # cells of noise level, the quiet one aside
+    AGE_CELLS = 8
+
+    def __init__(
+        self,
+        data: Trajectories,
+        linear: LinearFilter,
+        noise_max: float,
+        batch: int,
+        device: torch.device,
+    ) -> None:
+        m, n, size = data.z.shape
+        rows = np.random.default_rng(0).permutation(m * n)[:100_000]
+        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], stationary_covariance(linear))
+        gain = self.coordinates.noise_gain
+        self.x_offset = data.x.mean((0, 1))
+        self.x_scale = data.x.std((0, 1))
+        self.noise_max = noise_max
+        self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
+        self._per_age = batch // self.AGES_PER_BATCH
+        self._modes = torch.empty((m, n, len(gain)), device=device)
+        for i in range(m):
+            self._modes[i] = tensor(self.coordinates(data.z[i]), device)
+        self._x = tensor((data.x - self.x_offset) / self.x_scale, device)
+        size_of_x = ((data.x / self.x_scale) ** 2).sum(-1)
+        self._weight = tensor(data.x.shape[-1] / (size_of_x + 0.1 * data.x.shape[-1]), device)
+        self._gain = tensor(gain, device)
+        # Noise in units of the stationary one, so that its covariances are well conditioned.
+        unit = self.coordinates.whiten / np.where(gain > 0, gain, 1.0)[:, None]
+        late = int(np.ceil(2 * settling_time(linear) / linear.dt))
+        saturated = np.minimum(data.ages, late)
+        self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
+        self._age = tensor(data.ages * linear.dt, device)
+        position = np.log1p(data.ages) / np.log1p(data.ages[-1])
+        self._age_cell = torch.as_tensor(np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1))
+        self._age_cell = self._age_cell.to(device)
+        self.cells = self.AGE_CELLS * (1 + self.LEVELS)
+
+    def __call__(self, generator: torch.Generator) -> Batch:
+        device = self._x.device
+        m, n, _ = self._x.shape
+        ages = torch.randint(m, (self.AGES_PER_BATCH, 1), generator=generator, device=device)
+        shape = (self.AGES_PER_BATCH, self._per_age)
+        rows = torch.randint(n, shape, generator=generator, device=device)
+        position = (torch.rand(shape, generator=generator, device=device) - self.QUIET) / (1 - self.QUIET)
+        level = self.noise_max * 100 ** (position - 1)  # log-uniform over two decades
+        level = torch.where(position > 0, level, torch.zeros_like(level))[..., None]
+        white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)
+        noise = white @ self._noise_root[ages[:, 0]].mT
+        modes = self._modes[ages, rows] + level * self._gain * noise
+        modes = modes / torch.sqrt(1.0 + (level * self._gain) ** 2)
+        conditions = [torch.log1p(level / NOISE_UNIT)]
+        conditions.append(torch.log1p(self._age[ages].clamp(max=self.age_max) / AGE_UNIT)[..., None].expand_as(level))
+        inputs = torch.cat([modes, *conditions], -1)
+        level_cell = torch.where(position > 0, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
+        cell = self._age_cell[ages] * (1 + self.LEVELS) + level_cell
+        batch = self.AGES_PER_BATCH * self._per_age
+        return (
+            inputs.reshape(batch, -1),
+            self._x[ages, rows].reshape(batch, -1),
+            self._weight[ages, rows].reshape(batch),
+            cell.reshape(batch),
+        )
+
+    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
+        """The map that a network trained on these batches makes."""
+        return InverseMap(
+            mlp=network.export(),
+            features=("z_y", *(["z_u"] if linear.nu else []), "measurement_noise", "age"),
+            z_offset=self.coordinates.offset,
+            whiten=self.coordinates.whiten,
+            noise_gain=self.coordinates.noise_gain,
+            x_offset=self.x_offset,
+            x_scale=self.x_scale,
+            noise_unit=NOISE_UNIT,
+            noise_max=self.noise_max,
+            age_unit=AGE_UNIT,
+            age_max=self.age_max,
+        )
+
+
+class ForwardMapSampler:
+    """The paper's second data set S_2: x' uniform in the training box, z' = T(x') by the learned map (sec. 5.2)."""
+
+    cells = 1
+
+    def __init__(
+        self,
+        forward: Callable[[torch.Tensor], torch.Tensor],
+        box: tuple[np.ndarray, np.ndarray],
+        batch: int,
+        device: torch.device,
+    ) -> None:
+        low, high = box
+        self._low, self._span = tensor(low, device), tensor(high - low, device)
+        self._forward, self._batch = forward, batch
+        x = self._draw(torch.Generator(device).manual_seed(0), 100_000)
+        z = forward(x).cpu().numpy().astype(float)
+        self.coordinates = coordinates(z, np.zeros((z.shape[1], z.shape[1])))
+        self.x_offset, self.x_scale = (low + high) / 2, (high - low) / 2
+        self._offset, self._scale = tensor(self.x_offset, device), tensor(self.x_scale, device)
+        # z' is evaluated in float64: its small modes lie below the rounding of float32.
+        self._z_offset = torch.as_tensor(self.coordinates.offset, device=device)
+        self._whiten = torch.as_tensor(self.coordinates.whiten, device=device)
+
+    def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
+        return self._low + self._span * torch.rand(
+            (n, len(self._low)), generator=generator, device=generator.device
+        )
+
+    def __call__(self, generator: torch.Generator) -> Batch:
+        x = self._draw(generator, self._batch)
+        modes = ((self._forward(x).double() - self._z_offset) @ self._whiten.T).float()
+        ones = torch.ones(len(x), device=x.device)
+        return modes, (x - self._offset) / self._scale, ones, torch.zeros(len(x), dtype=torch.long, device=x.device)
+
+    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
+        """The map that a network trained on these batches makes: the paper's, of z alone."""
+        return InverseMap(
+            mlp=network.export(),
+            features=("z_y",),
+            z_offset=self.coordinates.offset,
+            whiten=self.coordinates.whiten,
+            noise_gain=self.coordinates.noise_gain,
+            x_offset=self.x_offset,
+            x_scale=self.x_scale,
+        )
+
+
+class InverseProblem(nn.Module):
+    """The inverse network with the running mean square error of each cell."""
+
+    def __init__(self, network: Network, sampler: TrajectorySampler | ForwardMapSampler, device: torch.device) -> None:
+        super().__init__()
+        self.network = network
+        self.sampler = sampler
+        self.register_buffer("error", torch.ones(sampler.cells, device=device))
+        self.error: torch.Tensor
+
+    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Mean square error of a batch, each cell relative to its own running error."""
+        inputs, x, weight, cell = self.sampler(generator)
+        square = weight * ((self.network(inputs) - x) ** 2).mean(-1)
+        if len(self.error) == 1:
+            return {"loss": square.mean()}
+        detached = square.detach()
+        count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
+        mean = torch.zeros_like(self.error).index_add_(0, cell, detached) / count.clamp(min=1.0)
+        keep = torch.where(count > 0, 0.99, 1.0)
+        self.error.mul_(keep).add_((1 - keep) * mean)
+        return {"loss": (square / self.error[cell]).mean(), "rms": detached.mean().sqrt()}
+
+
+def settling_time(linear: LinearFilter) -> float:
+    """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
+    slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    return float(np.log(1e3) / slowest)

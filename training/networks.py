@@ -1,0 +1,42 @@
+"""Torch networks and their way into artifacts."""
+
+import numpy as np
+import torch
+from torch import nn
+
+from observers import MLP
+
+ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
+
+
+class Network(nn.Sequential):
+    """A multilayer perceptron of ``depth`` hidden layers of ``width``."""
+
+    def __init__(self, inputs: int, outputs: int, width: int, depth: int, activation: str) -> None:
+        widths = [inputs] + [width] * depth
+        layers: list[nn.Module] = []
+        for before, after in zip(widths, widths[1:], strict=False):
+            layers += [nn.Linear(before, after), ACTIVATIONS[activation]()]
+        super().__init__(*layers, nn.Linear(widths[-1], outputs))
+        self.activation = activation
+        for layer in self.linear_layers():
+            nn.init.xavier_normal_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def linear_layers(self) -> list[nn.Linear]:
+        """The layers that hold weights, in order."""
+        return [layer for layer in self if isinstance(layer, nn.Linear)]
+
+    def export(self) -> MLP:
+        """The same network for NumPy."""
+        layers = self.linear_layers()
+        return MLP(
+            [layer.weight.detach().cpu().numpy() for layer in layers],
+            [layer.bias.detach().cpu().numpy() for layer in layers],
+            self.activation,
+        )
+
+
+def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
+    """A float32 tensor on ``device``."""
+    return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)

@@ -1,0 +1,130 @@
+"""One optimisation loop for every network: Adam, cosine decay, checkpoints, resuming, progress."""
+
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from rich.progress import Progress
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+from torch.utils.tensorboard import SummaryWriter
+
+CHECKPOINT_SECONDS = 20.0
+LOG_EVERY = 100
+
+# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
+Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One optimisation within a run.
+
+    name : of its checkpoint and its scalars.
+    steps : number of batches.
+    learning_rate : at its highest; it decays to zero along a cosine after a short linear warm-up.
+    folder : where checkpoints go.
+    fingerprint : identifies the run's configuration; a checkpoint of another one is refused.
+    seed : of the batches.
+    """
+
+    name: str
+    steps: int
+    learning_rate: float
+    folder: Path
+    fingerprint: str
+    seed: int
+
+
+def optimise(
+    stage: Stage, module: nn.Module, loss: Loss, progress: Progress, writer: SummaryWriter, resume: bool
+) -> list[tuple[int, float]]:
+    """Minimise ``loss()["loss"]`` over the parameters of ``module``; returns the smoothed loss by step.
+
+    Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
+
+    Raises FloatingPointError if the loss stops being a number; the last checkpoint then remains.
+    """
+    device = next(module.parameters()).device
+    generator = torch.Generator(device).manual_seed(stage.seed)
+    optimiser = torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
+    warmup = max(1, stage.steps // 100)
+
+    def rate(step: int) -> float:
+        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + float(torch.cos(torch.tensor(torch.pi * step / stage.steps))))
+
+    checkpoint = stage.folder / f"{stage.name}.checkpoint.safetensors"
+    start, history = 0, []
+    if resume and checkpoint.exists():
+        start, history = _restore(checkpoint, stage, module, optimiser, generator)
+    task = progress.add_task(stage.name, total=stage.steps, completed=start)
+    total, saved_at = torch.zeros((), device=device), time.monotonic()
+    for step in range(start, stage.steps):
+        for group in optimiser.param_groups:
+            group["lr"] = stage.learning_rate * rate(step)
+        terms = loss(generator)
+        optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()
+        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+        total += terms["loss"].detach()
+        if (step + 1) % LOG_EVERY == 0 or step + 1 == stage.steps:
+            mean = float(total) / ((step % LOG_EVERY) + 1)
+            if mean != mean:
+                raise FloatingPointError(f"the loss of stage {stage.name!r} is not a number at step {step + 1}")
+            total.zero_()
+            history.append((step + 1, mean))
+            for name, value in terms.items():
+                writer.add_scalar(f"{stage.name}/{name}", mean if name == "loss" else float(value), step + 1)
+            progress.update(task, completed=step + 1, description=f"{stage.name} (loss {mean:.3g})")
+            if time.monotonic() - saved_at > CHECKPOINT_SECONDS or step + 1 == stage.steps:
+                _save(checkpoint, stage, module, optimiser, generator, step + 1, history)
+                saved_at = time.monotonic()
+    return history
+
+
+def _save(
+    path: Path,
+    stage: Stage,
+    module: nn.Module,
+    optimiser: torch.optim.Optimizer,
+    generator: torch.Generator,
+    step: int,
+    history: list[tuple[int, float]],
+) -> None:
+    tensors = {f"module.{name}": value.contiguous() for name, value in module.state_dict().items()}
+    for i, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser.{i}.{name}": value.contiguous() for name, value in state.items()}
+    tensors["generator"] = generator.get_state()
+    meta = {"fingerprint": stage.fingerprint, "step": step, "history": history}
+    temporary = path.with_name(f".{path.name}.new")
+    save_file(tensors, temporary, metadata={"checkpoint": json.dumps(meta)})
+    os.replace(temporary, path)
+
+
+def _restore(
+    path: Path, stage: Stage, module: nn.Module, optimiser: torch.optim.Optimizer, generator: torch.Generator
+) -> tuple[int, list[tuple[int, float]]]:
+    try:
+        with safe_open(path, framework="pt") as opened:
+            meta = json.loads(opened.metadata()["checkpoint"])
+            tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"the checkpoint {path} is damaged, remove it to train that stage anew: {error}") from error
+    if meta["fingerprint"] != stage.fingerprint:
+        raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
+    module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
+    blank = optimiser.state_dict()
+    state: dict[int, dict[str, torch.Tensor]] = {}
+    for key, value in tensors.items():
+        if key.startswith("optimiser."):
+            _, i, name = key.split(".", 2)
+            state.setdefault(int(i), {})[name] = value
+    optimiser.load_state_dict({**blank, "state": state})
+    generator.set_state(tensors["generator"])
+    return int(meta["step"]), [(int(step), float(value)) for step, value in meta["history"]]
