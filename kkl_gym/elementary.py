@@ -19,7 +19,10 @@ def _dispatching(name: str, array_name: str | None = None) -> Callable[[Any], An
 
     def function(x: Any) -> Any:
         if isinstance(x, float | int):
-            return on_floats(x)
+            try:
+                return on_floats(x)
+            except ValueError:  # sin(inf), sqrt(-1): not a number on arrays too
+                return math.nan
         if isinstance(x, np.ndarray | np.generic):
             return on_arrays(x)
         for library in ("torch", "sympy"):  # only if the caller has imported it already

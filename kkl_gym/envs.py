@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -145,6 +145,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
         if self.render_mode is None:
             return None
+        if self._x is None:
+            raise gym.error.ResetNeeded("call reset() before render()")
         if self._canvas is None:
             from kkl_gym.rendering import Canvas
 
@@ -152,11 +154,11 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._canvas.draw(self._trail)  # type: ignore[no-any-return]
 
     def _input(self, action: np.ndarray) -> list[float]:
-        values = np.asarray(action, dtype=float).tolist()
-        if not isinstance(values, list) or len(values) != self._nu:
+        values = np.asarray(action, dtype=float)
+        if values.shape != self.action_space.shape:
             raise ValueError(f"the action must have shape ({self._nu},), got {action!r}")
         u = []
-        for a, u_max in zip(values, self.system.u_max, strict=True):
+        for a, u_max in zip(values.tolist(), self.system.u_max, strict=True):
             if a != a:
                 raise ValueError(f"the action must be numbers, got {action!r}")
             u.append(max(-1.0, min(1.0, a)) * u_max)
@@ -166,7 +168,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return [hi + vi for hi, vi in zip(self.system.h(self._x), v, strict=True)]  # type: ignore[arg-type]
 
     def _inside(self, x: Any) -> bool:
-        for xi, (low, high) in zip(x, self.system.bounds, strict=True):
+        for xi, (low, high) in zip(x, self.system.bounds, strict=True):  # noqa: SIM110 - all() takes twice as long
             if not low <= xi <= high:  # false for NaN too
                 return False
         return True

@@ -96,16 +96,16 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Returns the nx components of the next state, which may be infinite or NaN if the motion escapes.
     """
-    need = system.rate(x) * dt / RATE_STEP
-    if not need <= MAX_SUBSTEPS:  # far outside any declared bounds, or not a number
-        return (math.nan,) * len(x)
-    n = 1
-    while n < need:
-        n *= 2
-    field, d = forced(system, u, w)
     try:
+        need = system.rate(x) * dt / RATE_STEP
+        if not need <= MAX_SUBSTEPS:  # far outside any declared bounds, or not a number
+            return (math.nan,) * len(x)
+        n = 1
+        while n < need:
+            n *= 2
+        field, d = forced(system, u, w)
         return runge_kutta(len(x))(field, x, d, dt / n, n)
-    except OverflowError:  # Python's ** and math functions raise where arithmetic gives inf
+    except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
         return (math.nan,) * len(x)
 
 
@@ -119,8 +119,8 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Returns the next states, shape (nx, n); rows that escape are NaN.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        need = system.rate(x) * (dt / RATE_STEP)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        need = np.broadcast_to(system.rate(x) * dt / RATE_STEP, x.shape[1:])
         out = np.full_like(x, np.nan)
         n = 1
         todo = need <= MAX_SUBSTEPS

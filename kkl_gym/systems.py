@@ -4,6 +4,8 @@ Every equation is written once, on components, in plain arithmetic. The same met
 floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) and sympy symbols (formulas).
 """
 
+# ruff: noqa: D102 - what each system overrides is documented on System
+
 import importlib
 import importlib.util
 import inspect
@@ -16,7 +18,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-Components = Sequence[Any]  # one float, array, tensor or symbol for each component
+Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 
@@ -219,7 +221,7 @@ class Rossler(System):
 
     def rate(self, x: Components) -> Any:
         x1, _, x3 = x
-        return 1.5 + abs(x1 - self.c) + abs(x3) ** 0.5
+        return 1.3 + abs(self.a) + abs(x1 - self.c) + abs(x3) ** 0.5
 
     @property
     def target(self) -> tuple[float, ...]:
@@ -260,7 +262,7 @@ class Lorenz(System):
 
     def rate(self, x: Components) -> Any:
         x1, _, x3 = x
-        return self.sigma + abs(x1) + abs(self.sigma * (self.rho - x3)) ** 0.5
+        return max(abs(self.sigma), abs(self.beta)) + abs(x1) + abs(self.sigma * (self.rho - x3)) ** 0.5
 
     @property
     def target(self) -> tuple[float, ...]:
@@ -307,13 +309,15 @@ def _find(name: str) -> type[System]:
         found = getattr(_module(where), class_name)
     except (ImportError, AttributeError, OSError) as error:
         raise ValueError(f"cannot load the system {name!r}: {error}") from error
-    if not (inspect.isclass(found) and issubclass(found, System)):
+    if not (inspect.isclass(found) and issubclass(found, System) and found is not System):
         raise ValueError(f"{name!r} is {found!r}, not a subclass of kkl_gym.System")
     return found
 
 
 def _module(where: str) -> Any:
     if not where.endswith(".py"):
+        if not where or where.startswith("."):
+            raise ImportError(f"{where!r} is no absolute module name")
         return importlib.import_module(where)
     path = Path(where).resolve()
     key = f"kkl_gym user script {path}"

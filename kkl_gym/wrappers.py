@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from kkl_gym.envs import KKLEnv, output_bounds
+from kkl_gym.envs import KKLEnv
 from observers import KKLObserver, load
 
 
@@ -91,7 +91,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         z = self.observer.z
         info["x_hat"], info["z"] = x_hat, z
         shown = np.maximum(x_hat if self.estimate == "x" else z, self._low)
-        return np.minimum(shown, self._high).astype(np.float32)
+        out: np.ndarray = np.minimum(shown, self._high).astype(np.float32)
+        return out
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):

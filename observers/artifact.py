@@ -39,7 +39,8 @@ class ForwardMap:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """States (..., nx) to z (..., nz)."""
-        return self.z_offset + self.z_scale * self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
+        z: np.ndarray = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
+        return self.z_offset + self.z_scale * z
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,8 @@ class InverseMap:
 
     The network's inputs are, in the order of ``features`` (of which "z_y" comes first and the rest may be missing):
 
-    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by sqrt(1 + (sigma_v * noise_gain)^2): over
-      the training data each has unit variance without measurement noise, and this is what noise adds;
+    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
+      data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
     - ``measurement_noise``: log(1 + sigma_v / noise_unit);
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
@@ -85,7 +86,7 @@ class InverseMap:
 
     def gain(self, measurement_noise: float) -> np.ndarray:
         """What the whitened modes are multiplied with at this noise level, (modes,)."""
-        return np.asarray(1.0 / np.sqrt(1.0 + (measurement_noise * self.noise_gain) ** 2))
+        return np.asarray(1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2))
 
     def noise_feature(self, measurement_noise: Any) -> Any:
         """The network's input for a noise level."""
@@ -208,7 +209,7 @@ class Artifact:
             with safe_open(path, framework="numpy") as opened:
                 text = (opened.metadata() or {}).get(_KEY)
                 tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError) as error:
+        except (SafetensorError, OSError, TypeError) as error:  # TypeError: a number type that NumPy lacks
             raise ArtifactError(f"{path} is damaged or no safetensors file: {error}") from error
         if text is None:
             raise ArtifactError(f"{path} was not written by kkl-gym: it carries no {_KEY!r} metadata")
@@ -227,13 +228,12 @@ class Artifact:
             if not np.isfinite(tensor).all():
                 raise ArtifactError(f"its tensor {name} is not finite")
         described = dict(meta["inverse"])
+        arrays = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
         inverse = InverseMap(
             mlp=_get_mlp(tensors, "inverse", described.pop("activation")),
             features=tuple(described.pop("features")),
-            **{
-                name: tensors[f"inverse.{name}"] for name in ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
-            },
             **described,
+            **{name: tensors[f"inverse.{name}"] for name in arrays},
         )
         forward = None
         if "forward" in meta:

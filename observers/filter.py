@@ -89,11 +89,13 @@ class LinearFilter:
 
     def start(self, y0: np.ndarray) -> np.ndarray:
         """The state that a constant output y0, (..., ny), would have led to: z_y = -A^-1 B y0, z_u = 0."""
-        return y0 @ self.equilibrium.T
+        z: np.ndarray = y0 @ self.equilibrium.T
+        return z
 
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """The state one sample later.
 
         z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them.
         """
-        return np.concatenate((z, y, u, y_next), axis=-1) @ self._update
+        z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
+        return z_next

@@ -8,12 +8,14 @@ import numpy as np
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
-    return np.tanh(h, out=h)
+    np.tanh(h, out=h)
+    return h
 
 
 def _silu(h: np.ndarray) -> np.ndarray:
     h *= 0.5  # h sigmoid(h) = h/2 + h/2 tanh(h/2), which cannot overflow
-    return h + h * np.tanh(h)
+    h += h * np.tanh(h)
+    return h
 
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "silu": _silu}
@@ -41,7 +43,7 @@ class MLP:
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
         width = np.shape(self.weights[0])[-1]
         for weight, bias in zip(self.weights, self.biases, strict=True):
-            if weight.ndim != 2 or weight.shape != (len(bias), width):
+            if weight.ndim != 2 or bias.shape != weight.shape[:1] or weight.shape[1] != width:
                 raise ValueError(f"layer of shape {weight.shape}, bias {bias.shape}, cannot follow {width} values")
             if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
                 raise ValueError("the network holds weights that are not finite")

@@ -8,7 +8,7 @@ import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, resolve
 
-_CHUNK = 200_000  # rows of a record that go through the network at once
+_CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
 class KKLObserver:
@@ -64,7 +64,7 @@ class KKLObserver:
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget the past and take in the first sample, (..., ny); returns the first estimate, (..., nx)."""
-        y0 = np.asarray(y0, dtype=float)
+        y0 = np.array(y0, dtype=float)  # a copy: it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1])
         self._z, self._y, self._age = self.artifact.filter.start(y0), y0, 0
         return self._invert(self._z, 0.0)
@@ -84,7 +84,7 @@ class KKLObserver:
         if y is None:
             y = self._y
         else:
-            y = np.asarray(y, dtype=float)
+            y = np.array(y, dtype=float)
             self._check_output(y, batch)
         self._z = self.artifact.filter.advance(self._z, self._y, self._input(u, batch), y)
         self._y = y

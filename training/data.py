@@ -1,5 +1,6 @@
 """Pairs of state and filter state, along simulated trajectories."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,8 @@ from kkl_gym.simulate import simulate
 from kkl_gym.systems import System
 from observers import LinearFilter
 from training.signals import random_inputs
+
+CHUNK = 500  # trajectories simulated at once
 
 
 @dataclass(frozen=True)
@@ -43,18 +46,18 @@ def record(
     steps: int,
     ages: np.ndarray,
     rng: np.random.Generator,
-    chunk: int = 500,
+    report: Callable[[int], None] = lambda done: None,
 ) -> Trajectories:
     """Simulate n trajectories from starts uniform in the training box, under random inputs if the filter takes any.
 
-    Trajectories that leave the declared bounds are replaced by new ones.
+    Trajectories that leave the declared bounds are replaced by new ones; ``report`` is told how many there are so far.
     """
     low, high = system.box()
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
     kept = tried = 0
     while kept < n:
-        count = min(chunk, n - kept)
+        count = min(CHUNK, n - kept)
         x0 = rng.uniform(low, high, (count, system.nx))
         u = random_inputs(system, count, steps, linear.dt, rng) if linear.nu else np.zeros((steps, count, 0))
         x = simulate(system, x0, steps, linear.dt, u=u if linear.nu else None)
@@ -70,6 +73,7 @@ def record(
         z = run_filter(linear, output(system, x), u, ages)
         xs.append(x[ages])
         zs.append(z)
+        report(kept)
     return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1))
 
 

@@ -38,7 +38,8 @@ class Coordinates:
     noise_gain: np.ndarray
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
-        return (z - self.offset) @ self.whiten.T
+        """Filter states (..., size) to coordinates (..., modes)."""
+        return np.asarray((z - self.offset) @ self.whiten.T)
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
@@ -64,7 +65,7 @@ class TrajectorySampler:
     """
 
     AGES_PER_BATCH = 32
-    QUIET = 0.25  # share of samples without any noise
+    QUIET = 0.2  # share of samples without any noise
     LEVELS = 6  # cells of noise level, the quiet one aside
     AGE_CELLS = 8
 
@@ -104,18 +105,20 @@ class TrajectorySampler:
         self.cells = self.AGE_CELLS * (1 + self.LEVELS)
 
     def __call__(self, generator: torch.Generator) -> Batch:
+        """One batch."""
         device = self._x.device
         m, n, _ = self._x.shape
         ages = torch.randint(m, (self.AGES_PER_BATCH, 1), generator=generator, device=device)
         shape = (self.AGES_PER_BATCH, self._per_age)
         rows = torch.randint(n, shape, generator=generator, device=device)
         position = (torch.rand(shape, generator=generator, device=device) - self.QUIET) / (1 - self.QUIET)
-        level = self.noise_max * 100 ** (position - 1)  # log-uniform over two decades
+        position = position.sign() * position.abs().sqrt()  # more of the high levels, which are harder to learn
+        level = self.noise_max * 100 ** (position - 1)  # over two decades
         level = torch.where(position > 0, level, torch.zeros_like(level))[..., None]
         white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)
         noise = white @ self._noise_root[ages[:, 0]].mT
         modes = self._modes[ages, rows] + level * self._gain * noise
-        modes = modes / torch.sqrt(1.0 + (level * self._gain) ** 2)
+        modes = modes / (1.0 + (level * self._gain) ** 2)
         conditions = [torch.log1p(level / NOISE_UNIT)]
         conditions.append(torch.log1p(self._age[ages].clamp(max=self.age_max) / AGE_UNIT)[..., None].expand_as(level))
         inputs = torch.cat([modes, *conditions], -1)
@@ -171,11 +174,10 @@ class ForwardMapSampler:
         self._whiten = torch.as_tensor(self.coordinates.whiten, device=device)
 
     def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
-        return self._low + self._span * torch.rand(
-            (n, len(self._low)), generator=generator, device=generator.device
-        )
+        return self._low + self._span * torch.rand((n, len(self._low)), generator=generator, device=generator.device)
 
     def __call__(self, generator: torch.Generator) -> Batch:
+        """One batch."""
         x = self._draw(generator, self._batch)
         modes = ((self._forward(x).double() - self._z_offset) @ self._whiten.T).float()
         ones = torch.ones(len(x), device=x.device)

@@ -1,5 +1,7 @@
 """Torch networks and their way into artifacts."""
 
+import itertools
+
 import numpy as np
 import torch
 from torch import nn
@@ -15,7 +17,7 @@ class Network(nn.Sequential):
     def __init__(self, inputs: int, outputs: int, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
         layers: list[nn.Module] = []
-        for before, after in zip(widths, widths[1:], strict=False):
+        for before, after in itertools.pairwise(widths):
             layers += [nn.Linear(before, after), ACTIVATIONS[activation]()]
         super().__init__(*layers, nn.Linear(widths[-1], outputs))
         self.activation = activation

@@ -1,6 +1,7 @@
 """One optimisation loop for every network: Adam, cosine decay, checkpoints, resuming, progress."""
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable
@@ -56,10 +57,11 @@ def optimise(
     warmup = max(1, stage.steps // 100)
 
     def rate(step: int) -> float:
-        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + float(torch.cos(torch.tensor(torch.pi * step / stage.steps))))
+        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + math.cos(math.pi * step / stage.steps))
 
     checkpoint = stage.folder / f"{stage.name}.checkpoint.safetensors"
-    start, history = 0, []
+    start = 0
+    history: list[tuple[int, float]] = []
     if resume and checkpoint.exists():
         start, history = _restore(checkpoint, stage, module, optimiser, generator)
     task = progress.add_task(stage.name, total=stage.steps, completed=start)
@@ -69,7 +71,7 @@ def optimise(
             group["lr"] = stage.learning_rate * rate(step)
         terms = loss(generator)
         optimiser.zero_grad(set_to_none=True)
-        terms["loss"].backward()
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
         total += terms["loss"].detach()

@@ -4,7 +4,7 @@ import numpy as np
 
 from kkl_gym.systems import System
 
-KINDS = ("zero", "steps", "sine")
+KINDS = ("zero", "steps", "zero", "sine")
 
 
 def random_inputs(

@@ -1,0 +1,43 @@
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SYSTEMS := reverse_duffing van_der_pol rossler lorenz
+
+.PHONY: demo test test-slow lint format maps speed clean
+
+demo: $(VENV)/ready  ## run the four environments with their shipped observers
+	$(BIN)/kkl-gym demo
+
+test: $(VENV)/ready lint  ## everything CI runs
+	$(BIN)/pytest
+
+test-slow: $(VENV)/ready  ## the tests that train for minutes
+	$(BIN)/pytest -m slow
+
+lint: $(VENV)/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# The commands that made the shipped maps, version 1. About an hour on two cores.
+maps: $(VENV)/ready
+	for system in $(SYSTEMS); do for method in input-aware spinn; do \
+		$(BIN)/kkl-gym train $$system --method $$method || exit 1; done; done
+
+speed: $(VENV)/ready  ## single environments against Pendulum-v1
+	$(BIN)/kkl-gym speed
+
+clean:
+	rm -rf $(VENV) runs demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+
+$(VENV)/ready: pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "kkl-gym needs Python 3.11 to 3.13: make PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install --quiet --editable ".[all]" --group dev
+	touch $@

@@ -1,0 +1,425 @@
+import json
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+from scipy.integrate import solve_ivp
+from scipy.linalg import solve_sylvester
+
+import training.optimise
+from kkl_gym import ReverseDuffing, System, VanDerPol, get_system
+from observers import Artifact, KKLObserver, LinearFilter
+from training import errors, preset, smape, train, unseen_runs
+from training.config import Config, override, spectrum
+from training.data import output, record, recording_ages, run_filter
+from training.evaluate import starts
+from training.forward import ForwardProblem, on_tensors, truncation_time
+from training.inverse import TrajectorySampler, coordinates
+from training.networks import Network
+from training.noise import noise_covariance, root, stationary_covariance
+from training.signals import random_inputs
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Oscillator(System):
+    """x1' = x2, x2' = -x1 + u, y = x1: linear and neither growing nor decaying."""
+
+    name: ClassVar[str] = "oscillator"
+    X: ClassVar = ((-1, 1), (-1, 1))
+    bounds: ClassVar = ((-30, 30), (-30, 30))
+    u_max: ClassVar = (0.5,)
+    G: ClassVar = ((0.0,), (1.0,))
+
+    def f(self, x):
+        return x[1], -x[0]
+
+    def h(self, x):
+        return (x[0],)
+
+
+TOY = {"trajectories": 20, "duration": 5.0, "samples": 40, "width": 16, "depth": 2, "batch": 128}
+
+
+def toy(system, method="input-aware", **changes):
+    steps = {"inverse_steps": 200} | ({"forward_steps": 200} if method == "spinn" else {})
+    return override(preset(system, method, "fast"), TOY | steps | changes)
+
+
+def sylvester(eigenvalues):
+    """M with T(x) = M x for the oscillator: M F = A M + B C."""
+    n = len(eigenvalues)
+    F, C = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[1.0, 0.0]])
+    return solve_sylvester(-np.diag(eigenvalues), F, np.ones((n, 1)) @ C)
+
+
+def backward_quadrature(x, eigenvalues):
+    """T(x) = integral over tau < 0 of exp(-A tau) B h(x(tau)) for reverse Duffing, by integrating backward in time."""
+    system, horizon = ReverseDuffing(), 37.0 / min(-np.array(eigenvalues))
+
+    def field(s, state):
+        f = system.f(state[:2])
+        return [-f[0], -f[1], *(np.exp(np.array(eigenvalues) * s) * state[0])]
+
+    return solve_ivp(field, (0, horizon), [*x, *np.zeros(len(eigenvalues))], method="DOP853", rtol=1e-10).y[2:, -1]
+
+
+# Metrics
+
+
+def test_smape_by_hand():
+    x = np.array([[[3.0, 4.0]], [[0.0, 2.0]]])
+    x_hat = np.array([[[0.0, 0.0]], [[0.0, 1.0]]])
+    assert smape(x, x_hat)[0] == pytest.approx(100 * (2 * 5 / 5 + 2 * 1 / 3) / 2)
+    assert smape(x, x_hat, skip=1)[0] == pytest.approx(100 * 2 / 3)
+    assert smape(np.zeros((2, 1, 2)), np.zeros((2, 1, 2)))[0] == 0.0
+    with pytest.raises(ValueError, match="cannot compare"):
+        smape(x, x_hat[:1])
+
+
+# Data
+
+
+def test_signals_are_bounded_and_of_three_kinds():
+    u = random_inputs(VanDerPol(), 6, 1000, 0.01, np.random.default_rng(0))
+    assert u.shape == (1000, 6, 1)
+    assert np.abs(u).max() <= 5.0
+    assert not u[:, [0, 3]].any()
+    assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 4))
+    assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (2, 5))
+
+
+def test_recording_ages_cover_start_transient_and_end():
+    ages = recording_ages(5000, 200)
+    assert ages[0] == 0
+    assert ages[-1] == 5000
+    assert (np.diff(ages) > 0).all()
+    assert (ages < 50).sum() > 20
+
+
+def test_recorded_filter_states_are_those_of_the_observer_at_run_time():
+    system = VanDerPol()
+    linear = LinearFilter(np.diag([-1.0, -3.0]), np.ones((2, 1)), 0.01, 1)
+    rng = np.random.default_rng(0)
+    y, u = rng.normal(size=(31, 4, 1)), rng.normal(size=(30, 4, 1))
+    z = run_filter(linear, y, u, np.array([0, 7, 30]))
+    state = linear.start(y[0])
+    np.testing.assert_allclose(z[0], state)
+    for k in range(30):
+        state = linear.advance(state, y[k], u[k], y[k + 1])
+        if k == 6:
+            np.testing.assert_allclose(z[1], state)
+    np.testing.assert_allclose(z[2], state)
+    data = record(system, linear, 5, 20, np.array([0, 20]), rng)
+    assert data.x.shape == (2, 5, 2)
+    assert data.z.shape == (2, 5, 4)
+
+
+def test_recording_gives_up_on_a_system_that_always_escapes():
+    @dataclass(frozen=True)
+    class Runaway(Oscillator):
+        name: ClassVar[str] = "runaway"
+
+        def f(self, x):
+            return 50.0 * x[0], 50.0 * x[1]
+
+    linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
+    with pytest.raises(ValueError, match="stayed within bounds"):
+        record(Runaway(), linear, 5, 200, np.array([0]), np.random.default_rng(0))
+
+
+# Noise
+
+
+def test_noise_covariance_against_simulation_at_every_age():
+    linear = LinearFilter(np.diag([-0.5, -4.0, -20.0]), np.ones((3, 1)), 0.05)
+    ages = np.array([0, 1, 2, 5, 50])
+    n = 200_000
+    y = np.random.default_rng(0).normal(size=(51, n, 1))
+    e = run_filter(linear, y, np.zeros((50, n, 0)), ages)
+    for predicted, sample in zip(noise_covariance(linear, ages), e, strict=True):
+        measured = sample.T @ sample / n
+        size = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+        assert np.abs(measured - predicted).max() / size.max() < 0.015
+
+
+def test_noise_covariance_tends_to_the_lyapunov_solution():
+    linear = LinearFilter(np.diag([-0.5, -4.0]), np.ones((2, 1)), 0.01, 1)
+    late = noise_covariance(linear, np.array([5000]))[0]
+    np.testing.assert_allclose(late, stationary_covariance(linear), rtol=1e-9, atol=1e-15)
+    assert not late[2:].any()  # the input is known exactly
+    np.testing.assert_allclose(root(late) @ root(late).T, late, atol=1e-15)
+
+
+def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
+    rng = np.random.default_rng(0)
+    z = rng.normal(size=(5000, 3)) @ np.array([[1.0, 1.0, 1.0], [0.0, 1e-3, 2e-3], [0, 0, 1e-5]]) + 7.0
+    noise = np.diag([1e-3, 2e-3, 1e-3])
+    found = coordinates(z, noise)
+    np.testing.assert_allclose(np.cov(found(z).T, bias=True), np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(found.whiten @ noise @ found.whiten.T, np.diag(found.noise_gain**2), atol=1e-3)
+    assert (np.diff(found.noise_gain) >= 0).all()
+    flat = coordinates(z[:, [0, 0, 0]], noise)
+    assert len(flat.noise_gain) == 1  # two modes hold nothing but rounding
+
+
+def test_batches_hold_the_noise_that_they_say():
+    system = VanDerPol()
+    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
+    data = record(system, linear, 50, 500, recording_ages(500, 40), np.random.default_rng(0))
+    sampler = TrajectorySampler(data, linear, 1.0, 4096, CPU)
+    inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
+    assert inputs.shape == (4096, len(sampler.coordinates.noise_gain) + 2)
+    assert x.shape == (4096, 2)
+    assert torch.isfinite(inputs).all()
+    assert (weight > 0).all()
+    quiet = inputs[:, -2] == 0
+    assert 0.2 < quiet.float().mean() < 0.3
+    assert ((cell % 7 == 0) == quiet).all()
+    assert cell.max() < sampler.cells
+
+
+# Forward map
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_residual_is_the_pde_by_finite_differences(name):
+    system = get_system(name)
+    linear = LinearFilter(np.diag([-1.0, -2.0, -3.0]), np.ones((3, 1)), 0.01)
+    rng = np.random.default_rng(0)
+    low, high = system.box()
+    x, z = rng.uniform(low, high, (100, system.nx)), rng.normal(size=(100, 3))
+    torch.manual_seed(0)
+    problem = ForwardProblem(Network(system.nx, 3, 16, 2, "tanh"), system, linear, x, z, 1.0, 64, CPU).double()
+    for attribute in ("_xo", "_xs", "_zo", "_zs", "_A", "_B"):
+        setattr(problem, attribute, getattr(problem, attribute).double())
+    points = torch.as_tensor(x[:10])
+    f, h = on_tensors(system.f, points), on_tensors(system.h, points)
+    eps = 1e-5 / (1.0 + f.norm(dim=-1, keepdim=True))
+    derivative = (problem.T(points + eps * f) - problem.T(points - eps * f)) / (2 * eps)
+    expected = derivative - problem.T(points) @ problem._A.T - h @ problem._B.T
+    residual, _ = problem.residual(points)
+    torch.testing.assert_close(residual.detach(), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_truncation_time_leaves_epsilon():
+    A = np.array([[-1.0, 5.0], [0.0, -2.0]])
+    linear = LinearFilter(A, np.ones((2, 1)), 0.01)
+    t = truncation_time(linear, 10.0, 1e-6)
+    poles, V = np.linalg.eig(A)
+    left = np.linalg.norm((V * np.exp(poles * t)) @ np.linalg.inv(V), 2) * 10.0
+    assert left <= 1e-6
+    assert t == pytest.approx(np.log(np.linalg.cond(V) * 10.0 / 1e-6))
+
+
+def test_truncation_beyond_the_trajectories_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match="make them longer"):
+        train(Oscillator(), toy(Oscillator(), "spinn"), tmp_path)
+
+
+@pytest.mark.slow
+def test_linear_system_gives_the_sylvester_solution(tmp_path):
+    system = Oscillator()
+    sizes = {"trajectories": 200, "duration": 30.0, "samples": 200, "forward_steps": 12000, "inverse_steps": 50}
+    config = override(preset(system, "spinn", "fast"), sizes | {"width": 64, "depth": 2, "batch": 1024})
+    artifact = train(system, config, tmp_path).artifact
+    M = sylvester(config.eigenvalues)
+    x = np.random.default_rng(0).uniform(*system.box(), (1000, 2))
+    error = artifact.forward(x) - x @ M.T
+    assert np.sqrt((error**2).mean()) < 1e-3 * np.sqrt(((x @ M.T) ** 2).mean())
+
+
+def test_backward_quadrature_solves_the_pde():
+    eigenvalues, eps = [-1.5, -3.0], 1e-4
+    x, system = np.array([1.2, -0.7]), ReverseDuffing()
+    f = np.array(system.f(x))
+    ahead, behind = (backward_quadrature(x + sign * eps * f, eigenvalues) for sign in (1, -1))
+    derivative = (ahead - behind) / (2 * eps)
+    np.testing.assert_allclose(derivative, eigenvalues * backward_quadrature(x, eigenvalues) + x[0], atol=1e-6)
+
+
+def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
+    from observers.artifact import resolve
+
+    artifact = Artifact.read(resolve("reverse_duffing-spinn-v1"))
+    eigenvalues = artifact.filter.A.diagonal()
+    x = np.random.default_rng(0).uniform(*ReverseDuffing().box(), (60, 2))
+    truth = np.array([backward_quadrature(point, eigenvalues) for point in x])
+    error = artifact.forward(x) - truth
+    assert np.sqrt((error**2).mean()) < 2e-2 * np.sqrt((truth**2).mean())
+
+
+# Whole runs
+
+
+def test_training_makes_the_error_fall(tmp_path):
+    system = Oscillator()
+    config = toy(system, trajectories=100, duration=20.0, inverse_steps=1500, width=32)
+    runs = unseen_runs(system, config.dt, 20, 20.0, seed=0)
+    before = train(system, replace(config, inverse_steps=1), tmp_path / "a").artifact
+    after = train(system, config, tmp_path / "b").artifact
+    errors_before, errors_after = (np.median(errors(a, system, runs, 0.0, 0).late) for a in (before, after))
+    assert errors_after < 0.1 * errors_before
+    assert errors_after < 5.0
+    driven = unseen_runs(system, config.dt, 20, 20.0, seed=0, driven=True)
+    assert np.median(errors(after, system, driven, 0.0, 0).late) < 10.0
+
+
+@pytest.mark.parametrize("method", ["input-aware", "spinn"])
+def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method):
+    system = Oscillator()
+    config = toy(system, method, duration=20.0, inverse_steps=400)
+    whole = train(system, config, tmp_path / "whole").artifact
+
+    monkeypatch.setattr(training.optimise, "CHECKPOINT_SECONDS", 0.0)
+    save, saved = training.optimise._save, []
+
+    def save_and_stop(path, stage, module, optimiser, generator, step, history):
+        save(path, stage, module, optimiser, generator, step, history)
+        saved.append(step)
+        if stage.name == "inverse" and step == 200:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training.optimise, "_save", save_and_stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(system, config, tmp_path / "cut")
+    monkeypatch.setattr(training.optimise, "_save", save)
+    resumed = train(system, config, tmp_path / "cut", resume=True)
+    for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert resumed.losses["inverse"][-1][0] == 400
+    with pytest.raises(ValueError, match="another configuration"):
+        train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
+    checkpoint = tmp_path / "cut" / "inverse.checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:100])
+    with pytest.raises(ValueError, match="damaged"):
+        train(system, config, tmp_path / "cut", resume=True)
+
+
+def test_artifact_of_a_run_records_what_made_it(tmp_path):
+    system = Oscillator()
+    artifact = train(system, toy(system, "spinn", duration=20.0), tmp_path).artifact
+    artifact.save(tmp_path / "o.safetensors")
+    read = Artifact.read(tmp_path / "o.safetensors")
+    assert read.training["method"] == "spinn"
+    assert read.training["seed"] == 0
+    assert read.versions["torch"] == torch.__version__
+    assert read.forward is not None
+    assert read.nu == 0
+    assert json.loads((tmp_path / "config.json").read_text())["forward_steps"] == 200
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    np.testing.assert_allclose(read.forward(x), artifact.forward(x))
+
+
+def test_two_outputs_train_and_run(tmp_path):
+    @dataclass(frozen=True)
+    class Both(Oscillator):
+        name: ClassVar[str] = "both"
+
+        def h(self, x):
+            return x[0], x[0] + x[1]
+
+    artifact = train(Both(), toy(Both(), duration=20.0), tmp_path).artifact
+    assert artifact.ny == 2
+    assert KKLObserver(artifact).estimate(np.zeros((10, 3, 2)), np.zeros((9, 3, 1))).shape == (10, 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt": 0.0}, "dt"),
+        ({"eigenvalues": (1.0,)}, "eigenvalues"),
+        ({"eigenvalues": (-1.0, -1.0)}, "distinct"),
+        ({"forward_steps": 5}, "forward_steps"),
+        ({"width": 0}, "width"),
+        ({"batch": 2}, "batch"),
+        ({"noise_max": float("nan")}, "noise_max"),
+    ],
+)
+def test_impossible_configurations(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(preset(Oscillator(), "input-aware", "fast"), **change)
+
+
+def test_paper_preset_has_the_papers_table():
+    config = preset(VanDerPol(), "spinn", "paper")
+    assert (config.width, config.depth, config.activation, config.learning_rate) == (512, 4, "silu", 1e-3)
+    assert config.physics_weight == 0.1
+    assert len(config.eigenvalues) == 5
+    assert (max(config.eigenvalues), min(config.eigenvalues)) == (-1.5, -3.0)
+    assert isinstance(config, Config)
+    assert all(value < 0 for value in spectrum(Oscillator()))
+
+
+# Evaluation
+
+
+def test_starts_outside_lie_outside():
+    system = VanDerPol()
+    x0 = starts(system, "2X", 50, np.random.default_rng(0))
+    low, high = system.box()
+    assert ((x0 < low) | (x0 > high)).any(-1).all()
+    assert (np.abs(x0) <= 2 * high).all()
+
+
+def test_escapes_are_counted():
+    runs = unseen_runs(get_system("rossler"), 0.01, 200, 20.0, seed=0, domain="2X")
+    assert runs.escaped > 0
+    assert runs.x.shape[1] == 200 - runs.escaped
+    assert np.isfinite(runs.x).all()
+
+
+def test_output_of_constant_and_state():
+    x = np.arange(12.0).reshape(2, 3, 2)
+    np.testing.assert_array_equal(output(Oscillator(), x), x[..., :1])
+
+
+# Command line
+
+
+def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monkeypatch):
+    from training.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    toy_sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 50"
+    main(["train", "van_der_pol", *toy_sizes.split(), "--threads", "1"])
+    path = tmp_path / "runs" / "van_der_pol" / "van_der_pol.safetensors"
+    assert path.exists()
+    assert (path.parent / "report.png").stat().st_size > 10_000
+    csv = tmp_path / "errors.csv"
+    main(["evaluate", str(path), "--trajectories", "3", "--duration", "2", "--csv", str(csv)])
+    assert "2X" in capsys.readouterr().out
+    assert len(csv.read_text().splitlines()) == 1 + 3 * 3 * 2
+    for wrong in (["train", "nonsense"], ["evaluate", "nonsense"], ["train", "lorenz", "--dt", "0"]):
+        with pytest.raises(SystemExit, match="kkl-gym: "):
+            main(wrong)
+
+
+def test_demo_and_maps(tmp_path, capsys):
+    from training.cli import main
+
+    main(["demo", "--out", str(tmp_path), "--duration", "1"])
+    main(["maps"])
+    out = capsys.readouterr().out
+    assert "KKLLorenz-v0" in out
+    assert "van_der_pol-spinn" in out
+    assert (tmp_path / "estimates.png").stat().st_size > 10_000
+
+
+def test_speed_measures_every_environment(capsys):
+    from training.speed import Speed
+
+    ratios = Speed(steps=20, turns=1).run(Console())
+    assert len(ratios) == 9
+    assert all(ratio > 0 for ratio in ratios.values())
+
+
+def test_every_seed_of_evaluation_differs_from_training():
+    from training.evaluate import EVALUATION_SEED
+    from training.pipeline import TRAINING_SEED
+
+    assert EVALUATION_SEED != TRAINING_SEED

@@ -1,0 +1,217 @@
+"""The command line, ``kkl-gym`` (or ``python -m training``)."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from kkl_gym.systems import SYSTEMS, System, get_system
+from observers import Artifact, shipped
+from observers.artifact import resolve
+from training.config import Config, Method, Preset, override, preset
+from training.evaluate import Domain, errors, unseen_runs
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn an observer for a system and write it to one file.
+
+    The run's folder, runs/NAME, receives NAME.safetensors, a report (PNG), checkpoints and TensorBoard scalars.
+    """
+
+    system: tyro.conf.Positional[str]
+    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    method: Method = "input-aware"
+    """input-aware: fitted along driven, noisy trajectories. spinn: the paper's pipeline, without inputs."""
+    preset: Preset = "fast"
+    """fast: at most ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
+    out: Path | None = None
+    """The run's folder."""
+    resume: bool = False
+    """Go on from the checkpoints in the run's folder."""
+    threads: int = 2
+    """CPU threads."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where networks are trained; auto takes a GPU if there is one."""
+    eigenvalues: tuple[float, ...] | None = None
+    """Of the diagonal A, in 1/s, instead of the preset's."""
+    dt: float | None = None
+    """Sampling interval in seconds, instead of 0.01."""
+    trajectories: int | None = None
+    """Number of simulated trajectories."""
+    duration: float | None = None
+    """Their length in seconds."""
+    samples: int | None = None
+    """Points recorded along each trajectory."""
+    width: int | None = None
+    """Neurons in each hidden layer."""
+    depth: int | None = None
+    """Number of hidden layers."""
+    batch: int | None = None
+    """Samples in a batch."""
+    learning_rate: float | None = None
+    """At its highest."""
+    forward_steps: int | None = None
+    """Batches for the forward map (spinn)."""
+    inverse_steps: int | None = None
+    """Batches for the inverse map."""
+    physics_weight: float | None = None
+    """Weight nu of the PDE residual (spinn)."""
+    noise_max: float | None = None
+    """Largest measurement noise to train for (input-aware)."""
+    seed: int | None = None
+    """Of everything random; 0 by default."""
+
+    def run(self, console: Console) -> Path:
+        """Train; returns the artifact's path."""
+        from training.pipeline import train
+        from training.report import write_report
+
+        torch.set_num_threads(self.threads)
+        system = get_system(self.system)
+        name = system.name if self.method == "input-aware" else f"{system.name}-{self.method}"
+        folder = self.out or Path("runs") / name
+        names = {field.name for field in fields(Config)}
+        config = override(
+            preset(system, self.method, self.preset),
+            {key: value for key, value in vars(self).items() if key in names and key != "method"},
+        )
+        device = None if self.device == "auto" else torch.device(self.device)
+        result = train(system, config, folder, self.resume, device, console)
+        path = folder / f"{name}.safetensors"
+        result.artifact.save(path)
+        console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
+        write_report(folder / "report.png", result, system)
+        console.print(f"wrote {folder / 'report.png'}")
+        return path
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Print an observer's errors on unseen trajectories: in X and in 2X without X, with and without noise.
+
+    SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
+    after the transient. Trajectories that leave the system's declared bounds are counted, and left out.
+    """
+
+    observer: tyro.conf.Positional[str]
+    """A shipped map, or a .safetensors file."""
+    system: str | None = None
+    """For a file of your own system: its class, as script.py:Class or module:Class."""
+    noise: tuple[float, ...] = (0.0, 0.5)
+    """Standard deviations of the measurement noise."""
+    trajectories: int = 100
+    """Number of trajectories from each domain."""
+    duration: float = 50.0
+    """Their length in seconds."""
+    seed: int = 0
+    """Of the trajectories and the noise; never one that training draws."""
+    csv: Path | None = None
+    """Write the error of each trajectory to this file as well."""
+
+    def run(self, console: Console) -> list[dict[str, Any]]:
+        """Evaluate; returns one row for each line of the table."""
+        artifact = Artifact.read(resolve(self.observer))
+        system = system_of(artifact, self.system)
+        dt = artifact.filter.dt
+        cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
+        if artifact.nu:
+            cases.append(("X, driven", "X", True))
+        table = Table(title=f"{self.observer}: SMAPE in %, median (IQR) of {self.trajectories} x {self.duration:g} s")
+        for column in ("starts", "noise", "all steps", "after transient", "escaped"):
+            table.add_column(column, justify="left" if column == "starts" else "right")
+        rows: list[dict[str, Any]] = []
+        lines = ["observer,starts,noise,trajectory,smape,smape_late\n"]
+        for label, domain, driven in cases:
+            runs = unseen_runs(system, dt, self.trajectories, self.duration, self.seed, domain, driven)
+            for level in self.noise:
+                found = errors(artifact, system, runs, level, self.seed, skip=5.0 if driven else None)
+                rows.append({"starts": label, "noise": level, "full": found.full, "late": found.late})
+                table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
+                lines += [
+                    f"{self.observer},{label},{level},{i},{full:.6g},{late:.6g}\n"
+                    for i, (full, late) in enumerate(zip(found.full, found.late, strict=True))
+                ]
+        console.print(table)
+        if artifact.nu:
+            console.print("The transient is the first fifth of a run, or 5 s where it is driven.")
+        if self.csv:
+            self.csv.write_text("".join(lines))
+        return rows
+
+
+@dataclass(frozen=True)
+class Maps:
+    """List the maps that ship with the package."""
+
+    def run(self, console: Console) -> None:
+        """Print the list."""
+        table = Table("name", "file", "system", "method", "inputs", "modes", "noise up to", "MB")
+        for name, full in shipped().items():
+            if name == full:
+                continue
+            path = resolve(full)
+            artifact = Artifact.read(path)
+            knows_noise = "measurement_noise" in artifact.inverse.features
+            table.add_row(
+                name,
+                path.name,
+                artifact.system,
+                str(artifact.training.get("method")),
+                str(artifact.nu),
+                str(len(artifact.filter.A)),
+                f"{artifact.inverse.noise_max:g}" if knows_noise else "not told",
+                f"{path.stat().st_size / 1e6:.2f}",
+            )
+        console.print(table)
+
+
+def system_of(artifact: Artifact, given: str | None) -> System:
+    """The system that an artifact was made for, checked against it."""
+    if given is None and artifact.system not in SYSTEMS:
+        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
+    base = get_system(given or artifact.system)
+    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
+        base = base.replace(artifact.parameters)
+    artifact.check(base.name, base.parameters, artifact.filter.dt, base.ny, base.nu)
+    return base
+
+
+def spread(values: np.ndarray) -> str:
+    """Median and interquartile range as text."""
+    low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return f"{median:.2f} ({low:.2f} – {high:.2f})"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point of the ``kkl-gym`` command."""
+    from training.demo import Demo
+    from training.speed import Speed
+
+    commands: dict[str, Callable[..., Any]] = {
+        "train": Train,
+        "evaluate": Evaluate,
+        "maps": Maps,
+        "demo": Demo,
+        "speed": Speed,
+    }
+    console = Console()
+    command: Any = tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="kkl-gym",
+        description="Learned KKL observers for Gymnasium environments.",
+        args=arguments,
+    )
+    try:
+        command.run(console)
+    except (ValueError, FloatingPointError) as error:
+        sys.exit(f"kkl-gym: {error}")
+    except KeyboardInterrupt:
+        sys.exit("kkl-gym: interrupted; train --resume goes on from the last checkpoint")

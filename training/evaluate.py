@@ -1,0 +1,88 @@
+"""Estimation errors of an observer on trajectories that its training never saw."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.systems import System
+from observers import Artifact, KKLObserver
+from training.data import output
+from training.metrics import smape
+from training.signals import random_inputs
+
+# First entry of every evaluation seed; training's is another (training.pipeline.TRAINING_SEED).
+EVALUATION_SEED = 2
+TRANSIENT = 0.2  # part of a run that is left out of the errors "after the transient"
+
+Domain = Literal["X", "2X"]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
+
+    full : over all steps (the paper's), (n,).
+    late : after the first 20 % of the steps, (n,).
+    escaped : number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+    """
+
+    full: np.ndarray
+    late: np.ndarray
+    escaped: int
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Noise-free test trajectories: states (steps + 1, n, nx), inputs (steps, n, nu), and how many escaped."""
+
+    x: np.ndarray
+    u: np.ndarray
+    escaped: int
+
+
+def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts (n, nx), uniform in the training box X, or in 2X without X."""
+    if domain == "X":
+        return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
+    low, high = system.box()
+    found: list[np.ndarray] = []
+    while len(found) < n:
+        x = rng.uniform(2 * low, 2 * high)
+        if ((x < low) | (x > high)).any():
+            found.append(x)
+    return np.array(found)
+
+
+def unseen_runs(
+    system: System, dt: float, n: int, duration: float, seed: int, domain: Domain = "X", driven: bool = False
+) -> Runs:
+    """Test trajectories without noise; driven ones alternate random bounded steps and sines.
+
+    Raises ValueError if every trajectory leaves the declared bounds.
+    """
+    rng = np.random.default_rng([EVALUATION_SEED, seed])
+    x0 = starts(system, domain, n, rng)
+    steps = round(duration / dt)
+    u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
+    x = simulate(system, x0, steps, dt, u=u if driven else None)
+    inside = np.isfinite(x[-1]).all(-1)
+    if not inside.any():
+        raise ValueError(f"all {n} trajectories from {domain} left the bounds of {system.name}")
+    return Runs(x[:, inside], u[:, inside], int(n - inside.sum()))
+
+
+def errors(
+    artifact: Artifact, system: System, runs: Runs, measurement_noise: float, seed: int, skip: float | None = None
+) -> Errors:
+    """Errors of an observer on test trajectories, told the noise level that it sees.
+
+    skip : seconds left out of ``late``; None is a fifth of the run.
+    """
+    rng = np.random.default_rng([EVALUATION_SEED, seed, 1])
+    y = output(system, runs.x)
+    y = y + measurement_noise * rng.standard_normal(y.shape)
+    x_hat = KKLObserver(artifact, measurement_noise).estimate(y, runs.u if artifact.nu else None)
+    first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
+    return Errors(smape(runs.x, x_hat), smape(runs.x, x_hat, first), runs.escaped)

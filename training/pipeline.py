@@ -1,0 +1,139 @@
+"""From a system and a configuration to an artifact."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import platform
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from kkl_gym.systems import System
+from observers import Artifact, LinearFilter
+from training.config import Config
+from training.data import record, recording_ages
+from training.forward import ForwardProblem, truncation_time
+from training.inverse import ForwardMapSampler, InverseProblem, TrajectorySampler
+from training.networks import Network
+from training.optimise import Stage, optimise
+
+# Random numbers of different purposes never meet: seeds are sequences (purpose, seed).
+TRAINING_SEED = 1
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run leaves behind."""
+
+    artifact: Artifact
+    losses: dict[str, list[tuple[int, float]]]
+    forward: ForwardProblem | None
+
+
+def train(
+    system: System,
+    config: Config,
+    folder: Path,
+    resume: bool = False,
+    device: torch.device | None = None,
+    console: Console | None = None,
+) -> Result:
+    """Learn an observer for a system.
+
+    Parameters
+    ----------
+    system : any system.
+    config : how.
+    folder : where checkpoints and TensorBoard scalars go; created if missing.
+    resume : go on from the checkpoints in ``folder``; without it they are ignored and overwritten.
+    device : of the networks; None takes a GPU if there is one.
+    console : for the progress bars; None prints none.
+
+    Raises
+    ------
+    ValueError : if the checkpoints belong to another configuration, or the system's trajectories leave its bounds.
+    FloatingPointError : if the loss stops being a number.
+    """
+    if config.method == "spinn" and not system.ny:
+        raise ValueError(f"{system.name} has no output")
+    started = time.monotonic()
+    device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    folder.mkdir(parents=True, exist_ok=True)
+    identity = json.dumps([system.name, system.parameters, dataclasses.asdict(config)], sort_keys=True)
+    fingerprint = hashlib.sha256(identity.encode()).hexdigest()[:16]
+    (folder / "config.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng([TRAINING_SEED, config.seed])
+
+    nu = system.nu if config.method == "input-aware" else 0
+    linear = make_filter(config.eigenvalues, system.ny, config.dt, nu)
+    steps = max(1, round(config.duration / config.dt))
+    losses: dict[str, list[tuple[int, float]]] = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        SummaryWriter(folder) as writer,
+        Progress(*columns, TimeRemainingColumn(), console=console, disable=console is None) as progress,
+    ):
+
+        def run(name: str, problem: Any, count: int) -> None:
+            stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed)
+            losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)
+
+        task = progress.add_task(f"simulating {system.name}", total=config.trajectories)
+        ages = recording_ages(steps, config.samples)
+        data = record(
+            system, linear, config.trajectories, steps, ages, rng, lambda done: progress.update(task, completed=done)
+        )
+        forward = None
+        sampler: TrajectorySampler | ForwardMapSampler
+        if config.method == "input-aware":
+            sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
+        else:
+            z0 = float(np.linalg.norm(data.z[0], axis=-1).max())
+            kept = ages * config.dt >= truncation_time(linear, z0, config.truncation)
+            if not kept.any():
+                raise ValueError(
+                    f"trajectories of {config.duration:g} s end before the filter has forgotten its start, "
+                    f"t* = {truncation_time(linear, z0, config.truncation):.3g} s; make them longer"
+                )
+            x, z = data.x[kept].reshape(-1, system.nx), data.z[kept].reshape(-1, linear.size)
+            network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
+            forward = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
+            run("forward", forward, config.forward_steps)
+            sampler = ForwardMapSampler(forward.T, system.box(), config.batch, device)
+        inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
+        inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
+        run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)
+
+    artifact = Artifact(
+        filter=linear,
+        inverse=sampler.inverse_map(inverse, linear),
+        system=system.name,
+        parameters=system.parameters,
+        forward=forward.forward_map() if forward else None,
+        training={
+            **dataclasses.asdict(config),
+            "seconds": round(time.monotonic() - started),
+            "device": device.type,
+            "threads": torch.get_num_threads(),
+            "resumed": resume,
+        },
+        versions={name: importlib.metadata.version(name) for name in ("kkl-gym", "torch", "numpy", "scipy")}
+        | {"python": platform.python_version()},
+    )
+    return Result(artifact, losses, forward)
+
+
+def make_filter(eigenvalues: tuple[float, ...], ny: int, dt: float, nu: int) -> LinearFilter:
+    """The filter with these modes for each of ny outputs: A = diag(eigenvalues) repeated, B = ones in its block."""
+    modes = len(eigenvalues)
+    A = np.kron(np.eye(ny), np.diag(eigenvalues))
+    return LinearFilter(A, np.kron(np.eye(ny), np.ones((modes, 1))), dt, nu)

@@ -1,0 +1,82 @@
+"""A training run in one picture."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from kkl_gym.systems import System
+from observers import KKLObserver
+from training.data import output
+from training.evaluate import errors, unseen_runs
+from training.forward import ForwardProblem
+from training.pipeline import Result
+
+
+def write_report(path: Path, result: Result, system: System, seed: int = 0) -> None:
+    """Losses, PDE residual over the domain (or error by noise level, where no T was learned), estimate against truth.
+
+    The trajectories shown are training's own kind, from ``seed``, without input.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    artifact = result.artifact
+    figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
+    grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
+    losses = figure.add_subplot(grid[0, 0])
+    for name, history in result.losses.items():
+        losses.semilogy(*np.array(history).T, label=name)
+    losses.set(xlabel="batch", ylabel="loss", title=f"{system.name}, {artifact.training['method']}")
+    losses.legend()
+    right = figure.add_subplot(grid[0, 1])
+    if result.forward is None:
+        _draw_noise_levels(right, result, system, seed)
+    else:
+        _draw_residual(figure, right, result.forward, system)
+
+    runs = unseen_runs(system, artifact.filter.dt, 1, 20.0, seed)
+    rng = np.random.default_rng(seed)
+    t = np.arange(len(runs.x)) * artifact.filter.dt
+    for column, noise in enumerate((0.0, 0.5)):
+        level = min(noise, artifact.inverse.noise_max)
+        y = output(system, runs.x) + level * rng.standard_normal((*runs.x.shape[:2], system.ny))
+        x_hat = KKLObserver(artifact, level).estimate(y)
+        for i in range(system.nx):
+            ax = figure.add_subplot(grid[1 + i, column])
+            ax.plot(t, runs.x[:, 0, i], "k", lw=1.2, label="true")
+            ax.plot(t, x_hat[:, 0, i], "m--", lw=1.2, label="estimated")
+            ax.set_ylabel(system.state_names[i])
+            if i == 0:
+                ax.set_title(f"measurement noise {level:g}")
+                ax.legend(loc="upper right")
+        ax.set_xlabel("t in s")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _draw_noise_levels(ax: Any, result: Result, system: System, seed: int) -> None:
+    artifact = result.artifact
+    runs = unseen_runs(system, artifact.filter.dt, 20, 20.0, seed)
+    levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.noise_max]
+    medians = [np.median(errors(artifact, system, runs, level, seed).late) for level in levels]
+    ax.plot(range(len(levels)), medians, "o-")
+    ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
+    ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
+
+
+def _draw_residual(figure: Any, ax: Any, forward: ForwardProblem, system: System, n: int = 120) -> None:
+    (low1, high1), (low2, high2) = system.X[0], system.X[-1]
+    first, last = np.linspace(low1, high1, n), np.linspace(low2, high2, n)
+    points = np.tile([(low + high) / 2 for low, high in system.X], (n * n, 1))
+    points[:, 0], points[:, -1] = (grid.ravel() for grid in np.meshgrid(first, last))
+    device = forward._x.device
+    with torch.no_grad():
+        residual, _ = forward.residual(torch.as_tensor(points, dtype=torch.float32, device=device))
+    size = residual.norm(dim=-1).cpu().numpy().reshape(n, n)
+    image = ax.pcolormesh(first, last, np.log10(size + 1e-12), shading="auto")
+    figure.colorbar(image, ax=ax, label="log10 |PDE residual|")
+    ax.set(xlabel=system.state_names[0], ylabel=system.state_names[-1], title="PDE residual over X")
