@@ -48,7 +48,7 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
     """Train, wrap and evaluate; returns the median SMAPE without noise, in percent.
 
     Args:
-        inverse_steps: batches of training (the full preset takes 20,000).
+        inverse_steps: batches of training (the full preset takes 30,000).
         trajectories: simulated trajectories to train on.
         out: the run's folder.
     """

@@ -23,7 +23,7 @@ class Config:
     """Of the diagonal A, in 1/s; B is all ones for each output."""
     dt: float = 0.01
     """Sampling interval in seconds."""
-    trajectories: int = 3000
+    trajectories: int = 4000
     """Number of simulated trajectories."""
     duration: float = 50.0
     """Their length in seconds."""
@@ -37,11 +37,11 @@ class Config:
     """Of the hidden layers."""
     batch: int = 4096
     """Samples in a batch (for the forward map: of data, and as many collocation points)."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 8e-3
     """At its highest; it decays to zero along a cosine."""
     forward_steps: int = 0
     """Batches for the forward map; the input-aware method has none."""
-    inverse_steps: int = 20000
+    inverse_steps: int = 30000
     """Batches for the inverse map."""
     physics_weight: float = 0.1
     """nu, the weight of the PDE residual in the forward map's risk."""
