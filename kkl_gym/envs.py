@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,10 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
     """
 
-    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares it without ClassVar
+        "render_modes": ["rgb_array"],
+        "render_fps": 50,
+    }
 
     def __init__(
         self,
@@ -83,7 +86,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
         self._nx, self._ny, self._nu = self.system.nx, self.system.ny, self.system.nu
         self._w_max = np.array(self.system.scale) * self.process_noise
-        self._target, self._scale = self.system.target, self.system.scale
+        weights = [1.0 / (self._nx * scale**2) for scale in self.system.scale]
+        self._goal = [*zip(self.system.target, weights, strict=True)]
+        self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
         self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
         self.observation_space = self.state_space if observe == "state" else self.output_space
@@ -135,11 +140,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode is not None:
             self._trail.append(self._x)
         cost = 0.0
-        for xi, ti, si in zip(self._x, self._target, self._scale, strict=True):
-            distance = (xi - ti) / si
-            cost += distance * distance
-        reward = 1.0 / (1.0 + 4.0 * cost / self._nx)
-        return self._observation(), reward, escaped, False, info
+        for xi, (target, weight) in zip(self._x, self._goal):
+            cost += weight * (xi - target) * (xi - target)
+        return self._observation(), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
@@ -155,28 +158,28 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _input(self, action: np.ndarray) -> list[float]:
         values = np.asarray(action, dtype=float)
-        if values.shape != self.action_space.shape:
+        if values.shape != (self._nu,):
             raise ValueError(f"the action must have shape ({self._nu},), got {action!r}")
         u = []
-        for a, u_max in zip(values.tolist(), self.system.u_max, strict=True):
+        for a, u_max in zip(values.tolist(), self._u_max):
             if a != a:
                 raise ValueError(f"the action must be numbers, got {action!r}")
-            u.append(max(-1.0, min(1.0, a)) * u_max)
+            u.append(u_max if a > 1.0 else -u_max if a < -1.0 else a * u_max)
         return u
 
     def _measure(self, v: list[float]) -> list[float]:
-        return [hi + vi for hi, vi in zip(self.system.h(self._x), v, strict=True)]  # type: ignore[arg-type]
+        return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
 
     def _inside(self, x: Any) -> bool:
-        for xi, (low, high) in zip(x, self.system.bounds, strict=True):  # noqa: SIM110 - all() takes twice as long
+        for xi, (low, high) in zip(x, self._bounds):  # noqa: SIM110 - all() takes twice as long
             if not low <= xi <= high:  # false for NaN too
                 return False
         return True
 
     def _observation(self) -> np.ndarray:
-        values = self._x if self.observe == "state" else self._y
-        clipped = [max(low, min(high, value)) for value, (low, high) in zip(values, self._limits, strict=True)]  # type: ignore[arg-type]
-        return np.array(clipped, dtype=np.float32)
+        if self.observe == "state":  # within the bounds by construction
+            return np.array(self._x, dtype=np.float32)
+        return np.array([max(low, min(high, y)) for y, (low, high) in zip(self._y, self._limits)], dtype=np.float32)
 
     def _next_noise(self) -> tuple[list[float], list[float]]:
         """One sample of (w, v)."""

@@ -123,23 +123,19 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
 def _filter_space(env: KKLEnv, observer: KKLObserver) -> gym.spaces.Box:
     """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
 
-    Each is the response to the worst signal, the L1 norm of its impulse response, which for a real mode is its DC gain.
+    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
+    constant output would have led, so that its start lies within as well.
     """
     linear = observer.artifact.filter
     y_max = np.maximum(np.abs(env.output_space.low), np.abs(env.output_space.high)).astype(float)
-    early_and_late = np.abs(linear.early_y) + np.abs(linear.late_y)
-    nz = len(linear.A)
-    held = np.abs(linear._update[linear.size + linear.B.shape[1] : -linear.B.shape[1]].T)
-    drive = early_and_late @ y_max + held @ np.array(env.system.u_max[: linear.nu])
-    poles = np.linalg.eigvals(linear.transition[:nz, :nz])
-    response, power = np.zeros_like(drive), np.eye(linear.size)
-    if np.allclose(linear.transition, np.diag(linear.transition.diagonal())):
-        response = drive / (1.0 - linear.transition.diagonal())
-    else:
-        for _ in range(int(np.ceil(np.log(1e-6) / np.log(np.abs(poles).max())))):
-            response += np.abs(power) @ drive
-            power = linear.transition @ power
-    bound = np.maximum(response, np.abs(linear.equilibrium) @ y_max).astype(np.float32)
+    driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
+    limits = np.concatenate([y_max, y_max, env.system.u_max[: linear.nu]])
+    forgetting = np.abs(np.linalg.eigvals(linear.transition)).max()
+    bound = np.zeros(linear.size)
+    for _ in range(int(np.ceil(np.log(1e-4) / np.log(forgetting)))):
+        bound += np.abs(driven) @ limits
+        driven = linear.transition @ driven
+    bound = (1.001 * bound).astype(np.float32)  # for the tail of the sum
     return gym.spaces.Box(-bound, bound, dtype=np.float32)
 
 

@@ -37,10 +37,17 @@ class ForwardMap:
     z_offset: np.ndarray
     z_scale: np.ndarray
 
+    def __post_init__(self) -> None:
+        sizes = (self.mlp.inputs,), (self.mlp.outputs,)
+        if not sizes[0] == self.x_offset.shape == self.x_scale.shape:
+            raise ArtifactError(f"a network of {self.mlp.inputs} inputs does not fit {self.x_offset.shape[-1]} states")
+        if not sizes[1] == self.z_offset.shape == self.z_scale.shape:
+            raise ArtifactError(f"a network of {self.mlp.outputs} outputs does not fit z of {self.z_offset.shape[-1]}")
+
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """States (..., nx) to z (..., nz)."""
-        z: np.ndarray = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
-        return self.z_offset + self.z_scale * z
+        z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
+        return np.asarray(self.z_offset + self.z_scale * z)
 
 
 @dataclass(frozen=True)
@@ -94,6 +101,8 @@ class InverseMap:
 
     def age_feature(self, age: Any) -> Any:
         """The network's input for a time since reset, in seconds."""
+        if isinstance(age, float):  # a single step: numpy's own overhead would be felt
+            return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)
 
 
@@ -227,13 +236,12 @@ class Artifact:
         for name, tensor in tensors.items():
             if not np.isfinite(tensor).all():
                 raise ArtifactError(f"its tensor {name} is not finite")
-        described = dict(meta["inverse"])
+        described: dict[str, Any] = dict(meta["inverse"])
         arrays = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
         inverse = InverseMap(
             mlp=_get_mlp(tensors, "inverse", described.pop("activation")),
             features=tuple(described.pop("features")),
-            **described,
-            **{name: tensors[f"inverse.{name}"] for name in arrays},
+            **{**described, **{name: tensors[f"inverse.{name}"] for name in arrays}},
         )
         forward = None
         if "forward" in meta:

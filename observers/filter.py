@@ -1,11 +1,8 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
 
-@dataclass(frozen=True)
 class LinearFilter:
     """z_y' = A z_y + B y and, for each known input, z_u' = A z_u + B 1 u, at the sampling interval ``dt``.
 
@@ -14,7 +11,8 @@ class LinearFilter:
     input beside the output is the functional KKL observer (Buisson-Fenet et al., TMLR 2023); with u = 0 what remains
     is the paper's (sec. 3, eq. kkl_observer).
 
-    The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``.
+    The filter's state is ``z = [z_y, z_u of the first input, ...]``, of size ``nz * (1 + nu)``, and
+    z_k+1 = transition z_k + early_y y_k + late_y y_k+1 + held_u u_k.
 
     Parameters
     ----------
@@ -28,19 +26,14 @@ class LinearFilter:
     ValueError : if a shape is wrong, A is not Hurwitz or not diagonalisable, or dt <= 0.
     """
 
-    A: np.ndarray
-    B: np.ndarray
-    dt: float
-    nu: int = 0
-
-    def __post_init__(self) -> None:
-        A, B = np.asarray(self.A, dtype=float), np.asarray(self.B, dtype=float)
+    def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
+        A, B = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
         if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
-        if not 0 < self.dt < np.inf:
-            raise ValueError(f"dt must be a positive, finite number of seconds, got {self.dt!r}")
+        if not 0 < dt < np.inf:
+            raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
         if np.count_nonzero(A - np.diag(A.diagonal())):
             poles, V = np.linalg.eig(A)
         else:
@@ -53,34 +46,22 @@ class LinearFilter:
         def function_of_A(values: np.ndarray) -> np.ndarray:
             return np.real((V * values) @ np.linalg.inv(V))
 
-        s = poles * self.dt
-        late = (np.expm1(s) - s) / (poles * s)  # integral of e^{poles (dt - t)} t / dt over [0, dt]
-        hold = np.expm1(s) / poles  # ... of e^{poles (dt - t)}
-        blocks = 1 + self.nu
+        s = poles * dt
+        hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
+        late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
         nz, ny = B.shape
-        transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
-        early_y, late_y = (np.zeros((blocks * nz, ny)) for _ in range(2))
-        early_y[:nz] = function_of_A(hold - late) @ B
-        late_y[:nz] = function_of_A(late) @ B
-        held_u = np.kron(np.eye(blocks, self.nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
-        equilibrium = np.zeros((blocks * nz, ny))
-        equilibrium[:nz] = -np.linalg.solve(A, B)
-        for name, value in {
-            "A": A,
-            "B": B,
-            "transition": transition,
-            "early_y": early_y,
-            "late_y": late_y,
-            "equilibrium": equilibrium,
-            "_update": np.hstack([transition, early_y, held_u, late_y]).T.copy(),
-        }.items():
-            object.__setattr__(self, name, value)
+        blocks = 1 + nu
 
-    transition: np.ndarray = None  # type: ignore[assignment]
-    early_y: np.ndarray = None  # type: ignore[assignment]
-    late_y: np.ndarray = None  # type: ignore[assignment]
-    equilibrium: np.ndarray = None  # type: ignore[assignment]
-    _update: np.ndarray = None  # type: ignore[assignment]
+        def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:
+            return np.vstack([matrix, np.zeros((nu * nz, ny))])
+
+        self.A, self.B, self.dt, self.nu = A, B, float(dt), nu
+        self.transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
+        self.early_y = acts_on_z_y(function_of_A(hold - late) @ B)
+        self.late_y = acts_on_z_y(function_of_A(late) @ B)
+        self.held_u = np.kron(np.eye(blocks, nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
+        self.equilibrium = acts_on_z_y(-np.linalg.solve(A, B))
+        self._update = np.hstack([self.transition, self.early_y, self.held_u, self.late_y]).T.copy()
 
     @property
     def size(self) -> int:

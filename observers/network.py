@@ -67,12 +67,14 @@ class MLP:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(..., inputs) to (..., outputs), float32."""
         activation = ACTIVATIONS[self.activation]
-        *hidden, (weight, bias) = self._layers  # type: ignore[attr-defined]
-        h: Any = x.astype(np.float32, copy=False)
+        *hidden, (weight, bias) = self._layers
+        h = x.astype(np.float32, copy=False)
+        if h.ndim > 2:
+            h = h.reshape(-1, h.shape[-1])
         for w, b in hidden:
-            h = h @ w
+            h = np.dot(h, w)
             h += b
             h = activation(h)
-        h = h @ weight
+        h = np.dot(h, weight)
         h += bias
-        return h  # type: ignore[no-any-return]
+        return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], -1)

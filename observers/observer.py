@@ -132,17 +132,20 @@ class KKLObserver:
         conditions = self._conditions
         if inverse.features[-1] == "age":
             conditions = [*conditions, inverse.age_feature(age)]
-        width = modes.shape[-1]
-        inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
-        inputs[..., :width] = modes
-        for i, condition in enumerate(conditions):
-            inputs[..., width + i] = condition
+        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
+            inputs = np.array([*modes.tolist(), *conditions], dtype=np.float32)
+        else:
+            width = modes.shape[-1]
+            inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
+            inputs[..., :width] = modes
+            for i, condition in enumerate(conditions):
+                inputs[..., width + i] = condition
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
 
     def _check_output(self, y: np.ndarray, batch: tuple[int, ...]) -> None:
         if y.shape != (*batch, self.artifact.ny):
             raise ValueError(f"y must have shape {(*batch, self.artifact.ny)}, got {y.shape}")
-        if not np.isfinite(y).all():
+        if not _finite(y):
             raise ValueError("y holds NaN or infinity; a missing sample is step(None, u)")
 
     def _input(self, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
@@ -159,9 +162,15 @@ class KKLObserver:
             return np.zeros((*batch, 0))
         if u.shape != (*batch, nu):
             raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
-        if not np.isfinite(u).all():
+        if not _finite(u):
             raise ValueError("u holds NaN or infinity")
         return u
+
+
+def _finite(values: np.ndarray) -> bool:
+    if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
+        return all(map(math.isfinite, values.tolist()))
+    return bool(np.isfinite(values).all())
 
 
 def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5) -> KKLObserver:

@@ -85,12 +85,12 @@ def test_smape_by_hand():
 
 
 def test_signals_are_bounded_and_of_three_kinds():
-    u = random_inputs(VanDerPol(), 6, 1000, 0.01, np.random.default_rng(0))
-    assert u.shape == (1000, 6, 1)
+    u = random_inputs(VanDerPol(), 8, 1000, 0.01, np.random.default_rng(0))
+    assert u.shape == (1000, 8, 1)
     assert np.abs(u).max() <= 5.0
-    assert not u[:, [0, 3]].any()
-    assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 4))
-    assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (2, 5))
+    assert not u[:, [0, 2, 4, 6]].any()
+    assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 5))
+    assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (3, 7))
 
 
 def test_recording_ages_cover_start_transient_and_end():
@@ -178,7 +178,7 @@ def test_batches_hold_the_noise_that_they_say():
     assert torch.isfinite(inputs).all()
     assert (weight > 0).all()
     quiet = inputs[:, -2] == 0
-    assert 0.2 < quiet.float().mean() < 0.3
+    assert 0.15 < quiet.float().mean() < 0.25
     assert ((cell % 7 == 0) == quiet).all()
     assert cell.max() < sampler.cells
 

@@ -84,6 +84,8 @@ def optimise(
             for name, value in terms.items():
                 writer.add_scalar(f"{stage.name}/{name}", mean if name == "loss" else float(value), step + 1)
             progress.update(task, completed=step + 1, description=f"{stage.name} (loss {mean:.3g})")
+            if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
+                progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, loss {mean:.3g}")
             if time.monotonic() - saved_at > CHECKPOINT_SECONDS or step + 1 == stage.steps:
                 _save(checkpoint, stage, module, optimiser, generator, step + 1, history)
                 saved_at = time.monotonic()

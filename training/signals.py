@@ -12,7 +12,7 @@ def random_inputs(
 ) -> np.ndarray:
     """Inputs held over each sampling interval, shape (steps, n, nu), each row of one of the ``kinds`` in turn.
 
-    - "zero": none;
+    - "zero": none (twice as often as each of the others by default);
     - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
     - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
     """

@@ -1,0 +1,115 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from kkl_gym import get_system
+from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+
+
+def random_mlp(rng, inputs, outputs, activation="silu", width=8):
+    sizes = (inputs, width, width, outputs)
+    weights = [rng.normal(size=(b, a)).astype(np.float32) / np.sqrt(a) for a, b in pairwise(sizes)]
+    biases = [rng.normal(size=b).astype(np.float32) for b in sizes[1:]]
+    return MLP(weights, biases, activation)
+
+
+def random_artifact(system="van_der_pol", inputs=True, noise=True, age=True, dt=0.01, pair=False, forward=False):
+    """A whole observer for a system with weights that nobody trained."""
+    system = get_system(system)
+    rng = np.random.default_rng(0)
+    nz = 2 * system.nx + 1
+    A = -np.diag(np.linspace(1.0, 6.0, nz))
+    if pair:
+        A[:2, :2] = [[-1.0, 4.0], [-4.0, -1.0]]
+    linear = LinearFilter(A, rng.normal(size=(nz, system.ny)), dt, system.nu if inputs else 0)
+    modes = linear.size - 1
+    told = (
+        "z_y",
+        *(["z_u"] if linear.nu else []),
+        *(["measurement_noise"] if noise else []),
+        *(["age"] if age else []),
+    )
+    inverse = InverseMap(
+        mlp=random_mlp(rng, modes + noise + age, system.nx),
+        features=told,
+        z_offset=rng.normal(size=linear.size),
+        whiten=rng.normal(size=(modes, linear.size)),
+        noise_gain=rng.uniform(0.1, 1.0, modes),
+        x_offset=rng.normal(size=system.nx),
+        x_scale=np.array(system.scale),
+        noise_unit=0.1,
+        noise_max=1.0 if noise else np.inf,
+        age_unit=0.05,
+        age_max=2.0 if age else 0.0,
+    )
+    ones, zeros = np.ones, np.zeros
+    return Artifact(
+        filter=linear,
+        inverse=inverse,
+        system=system.name,
+        parameters=system.parameters,
+        forward=ForwardMap(
+            random_mlp(rng, system.nx, nz, "tanh"), zeros(system.nx), 2 * ones(system.nx), ones(nz), 3 * ones(nz)
+        )
+        if forward
+        else None,
+        training={"preset": "none", "seed": 0},
+        versions={"numpy": np.__version__},
+    )
+
+
+@pytest.fixture(scope="session")
+def make_artifact():
+    return random_artifact
+
+
+@pytest.fixture(scope="session")
+def saved(tmp_path_factory):
+    """save(system, ...) -> path of a file that holds random_artifact(system, ...)."""
+    folder, paths = tmp_path_factory.mktemp("maps"), {}
+
+    def save(**options):
+        key = tuple(sorted(options.items()))
+        if key not in paths:
+            path = folder / f"map-{len(paths)}.safetensors"
+            random_artifact(**options).save(path)
+            paths[key] = str(path)
+        return paths[key]
+
+    return save
+
+
+AUTONOMOUS = """
+from dataclasses import dataclass
+
+from kkl_gym import System
+from kkl_gym.elementary import sin
+
+
+@dataclass(frozen=True)
+class Pendulum(System):
+    damping: float = 0.1
+
+    name = "pendulum"
+    X = ((-3.0, 3.0), (-2.0, 2.0))
+    bounds = ((-50.0, 50.0), (-20.0, 20.0))
+
+    def f(self, x):
+        return x[1], -sin(x[0]) - self.damping * x[1]
+
+    def h(self, x):
+        return (x[0],)
+
+
+class NoSystem:
+    pass
+"""
+
+
+@pytest.fixture(scope="session")
+def script(tmp_path_factory):
+    """Path of a user's script with an autonomous system, Pendulum."""
+    path = tmp_path_factory.mktemp("user") / "pendulum_script.py"
+    path.write_text(AUTONOMOUS)
+    return path

@@ -1,0 +1,477 @@
+import copy
+import json
+import math
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import kkl_gym
+from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, get_system
+from kkl_gym.envs import NOISE_BLOCK, output_bounds
+from kkl_gym.simulate import advance
+
+everyone = pytest.mark.parametrize("name", ENV_IDS)
+both = pytest.mark.parametrize("observe", ["state", "output"])
+ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler
+
+
+def play(env, steps, seed=None, actions=None, reset=True):
+    """Observations, rewards, and the last two of y and x of an episode under seeded actions."""
+    rng = np.random.default_rng(0)
+    out = []
+    if reset:
+        obs, info = env.reset(seed=seed)
+        out.append([*obs, 0.0, *info["y"], *info["x"]])
+    for k in range(steps):
+        action = rng.uniform(-1, 1, env.action_space.shape).astype(np.float32) if actions is None else actions[k]
+        obs, reward, terminated, truncated, info = env.step(action)
+        out.append([*obs, reward, *info["y"], *info["x"]])
+        assert not terminated
+        assert not truncated
+    return np.array(out)
+
+
+@everyone
+@both
+def test_checkers_are_content(name, observe):
+    env = gym.make(ENV_IDS[name], observe=observe)
+    check_env(env.unwrapped)
+    check_env_sb3(env)
+    check_env_sb3(env.unwrapped)
+
+
+def test_ids():
+    assert ENV_IDS == {
+        "reverse_duffing": "KKLReverseDuffing-v0",
+        "van_der_pol": "KKLVanDerPol-v0",
+        "rossler": "KKLRossler-v0",
+        "lorenz": "KKLLorenz-v0",
+    }
+    assert gym.make("kkl_gym:KKLLorenz-v0").unwrapped.system == Lorenz()
+
+
+def test_unknown_id():
+    with pytest.raises(gym.error.Error):
+        gym.make("KKLNonsense-v0")
+
+
+@everyone
+@both
+def test_equal_seeds_give_equal_episodes(name, observe):
+    a, b = (gym.make(ENV_IDS[name], observe=observe) for _ in range(2))
+    play(b, 10, seed=5)  # whatever came before
+    first = play(a, 150, seed=3)  # longer than two blocks of noise
+    assert np.array_equal(first, play(b, 150, seed=3))
+    assert np.array_equal(first, play(a, 150, seed=3))
+    assert not np.array_equal(first, play(a, 150, seed=4))
+
+
+@everyone
+def test_a_second_reset_without_seed_differs_but_reproducibly(name):
+    a, b = (gym.make(ENV_IDS[name]) for _ in range(2))
+    first = play(a, 20, seed=3)
+    second = play(a, 20)
+    assert (first[0, -2:] != second[0, -2:]).all()
+    play(b, 20, seed=3)
+    assert np.array_equal(second, play(b, 20))
+
+
+@everyone
+def test_starts_are_uniform_in_the_training_box(name):
+    env = KKLEnv(name)
+    env.reset(seed=0)
+    low, high = env.system.box()
+    x = np.array([env.reset()[1]["x"] for _ in range(2000)])
+    assert ((x >= low) & (x <= high)).all()
+    u = (x - low) / (high - low)
+    assert np.allclose(u.mean(0), 0.5, atol=0.03)
+    assert np.allclose(u.std(0), 12**-0.5, atol=0.02)
+
+
+def test_spec_round_trip():
+    env = gym.make(
+        "KKLLorenz-v0",
+        parameters={"rho": 15.0, "sigma": 9.0},
+        dt=0.02,
+        observe="output",
+        measurement_noise=0.1,
+        process_noise=0.2,
+        max_episode_steps=70,
+    )
+    text = env.spec.to_json()
+    again = gym.make(EnvSpec.from_json(text))
+    assert again.unwrapped.system == Lorenz(rho=15, sigma=9)
+    assert again.spec.max_episode_steps == 70
+    assert (again.unwrapped.dt, again.unwrapped.observe) == (0.02, "output")
+    assert (again.unwrapped.measurement_noise, again.unwrapped.process_noise) == (0.1, 0.2)
+    assert again.observation_space == env.observation_space
+    assert np.array_equal(play(env, 50, seed=1), play(again, 50, seed=1))
+    assert json.loads(again.spec.to_json()) == json.loads(text)
+
+
+PROPERTY = {name: {o: KKLEnv(name, observe=o) for o in ("state", "output")} for name in ENV_IDS}
+
+
+@everyone
+@both
+@settings(deadline=None, max_examples=25, derandomize=True)
+@given(data=st.data(), seed=st.integers(0, 2**31))
+def test_any_start_and_any_actions(name, observe, data, seed):
+    env = PROPERTY[name][observe]
+    x0 = data.draw(st.tuples(*(st.floats(*bounds) for bounds in env.system.bounds)))
+    actions = data.draw(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), max_size=40))
+    obs, info = env.reset(seed=seed, options={"x0": x0})
+    assert info["x"].tolist() == list(x0)
+    assert obs in env.observation_space
+    assert set(info) == {"y", "x"}
+    for action in actions:
+        obs, reward, terminated, truncated, info = env.step(np.array([action], np.float32))
+        assert obs.dtype == np.float32
+        assert np.isfinite(obs).all()
+        assert obs in env.observation_space
+        assert type(reward) is float
+        assert 0 <= reward <= 1
+        assert type(terminated) is bool
+        assert truncated is False
+        assert info["escaped"] is terminated
+        assert set(info) == {"y", "x", "u", "escaped"}
+        for key, size in (("y", env.system.ny), ("x", env.system.nx), ("u", env.system.nu)):
+            assert info[key].dtype == np.float64
+            assert info[key].shape == (size,)
+            assert np.isfinite(info[key]).all()
+        if terminated:
+            break
+
+
+@everyone
+def test_reward_is_one_at_the_target_and_follows_the_formula(name):
+    env = KKLEnv(name, process_noise=0)
+    system = env.system
+    env.reset(options={"x0": system.target})
+    _, reward, _, _, info = env.step(np.zeros(1))
+    assert reward == pytest.approx(1.0, abs=1e-9)
+    env.reset(seed=0)
+    for _ in range(5):
+        _, reward, _, _, info = env.step(np.ones(1))
+        c = np.mean(((info["x"] - system.target) / system.scale) ** 2)
+        assert reward == pytest.approx(1 / (1 + 4 * c), rel=1e-12)
+        assert reward < 1
+
+
+@everyone
+@both
+def test_observations_are_what_info_says(name, observe):
+    env = KKLEnv(name, observe=observe)
+    obs, info = env.reset(seed=2)
+    for _ in range(20):
+        shown = info["x" if observe == "state" else "y"]
+        assert np.array_equal(obs, shown.astype(np.float32))
+        obs, _, _, _, info = env.step(np.zeros(1))
+
+
+@both
+def test_observations_and_infos_are_copies(observe):
+    env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
+    obs, info = env.reset(seed=0)
+    other.reset(seed=0)
+    for _ in range(3):
+        for array in (obs, info["x"], info["y"], info.get("u", obs)):
+            array[:] = 7.0
+        obs, *_, info = env.step(np.ones(1))
+        expected = other.step(np.ones(1))
+        assert np.array_equal(obs, expected[0])
+        assert np.array_equal(info["x"], expected[-1]["x"])
+
+
+@both
+def test_escape_terminates_with_the_last_state(observe):
+    env = KKLEnv("rossler", observe=observe)
+    obs, info = env.reset(seed=0, options={"x0": ESCAPING})
+    for k in range(300):
+        before = obs, info
+        obs, reward, terminated, truncated, info = env.step(np.zeros(1))
+        if terminated:
+            break
+    assert k > 100
+    assert terminated is info["escaped"] is True
+    assert truncated is False
+    assert np.array_equal(obs, before[0])
+    assert np.array_equal(info["x"], before[1]["x"])
+    assert np.array_equal(info["y"], before[1]["y"])
+    assert 0 < reward < 1
+    assert not env.reset(seed=0)[1].get("escaped")
+
+
+def test_an_interval_too_long_to_simulate_is_an_escape():
+    env = KKLEnv("lorenz", dt=1000.0)
+    start, _ = env.reset(seed=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        obs, reward, terminated, _, info = env.step(np.zeros(1))
+    assert terminated
+    assert info["escaped"]
+    assert np.array_equal(obs, start)
+    assert math.isfinite(reward)
+
+
+@everyone
+def test_measurement_noise_has_the_stated_deviation(name):
+    env = KKLEnv(name, measurement_noise=0.5)
+    v = []
+    for _ in range(4):
+        _, info = env.reset(seed=len(v))
+        for _ in range(1000):
+            v.append(info["y"][0] - env.system.h(info["x"])[0])
+            *_, info = env.step(np.zeros(1))
+    assert np.mean(v) == pytest.approx(0.0, abs=0.04)
+    assert np.std(v) == pytest.approx(0.5, rel=0.05)
+    assert np.mean(np.multiply(v[1:], v[:-1])) == pytest.approx(0.0, abs=0.025)  # white
+
+
+@everyone
+def test_no_noise(name):
+    env = KKLEnv(name, process_noise=0, measurement_noise=0)
+    _, info = env.reset(seed=0)
+    for _ in range(100):
+        x = advance(env.system, info["x"].tolist(), [0.0], [0.0] * env.system.nx, env.dt)
+        *_, info = env.step(np.zeros(1))
+        assert info["x"].tolist() == list(x)
+        assert info["y"].tolist() == list(env.system.h(x))
+
+
+@pytest.mark.parametrize("level", [None, 0.3])
+@everyone
+def test_process_noise_is_bounded_and_uniform(name, level):
+    """w recovered from what the noise adds to a short interval; x' = f(x) + w makes x gain w dt + O(dt^2)."""
+    dt = 1e-5
+    env = KKLEnv(name, dt=dt, process_noise=level)
+    system = env.system
+    _, info = env.reset(seed=1)
+    w = []
+    for _ in range(3000):
+        still = advance(system, info["x"].tolist(), [0.0], [0.0] * system.nx, dt)
+        *_, info = env.step(np.zeros(1))
+        w.append((info["x"] - still) / dt)
+    bound = np.array(system.scale) * (system.process_noise if level is None else level)
+    u = np.array(w) / bound
+    assert np.abs(u).max() <= 1 + 1e-3
+    assert (np.abs(u).max(0) > 0.99).all()
+    assert np.allclose(u.mean(0), 0.0, atol=0.05)
+    assert np.allclose(u.std(0), 3**-0.5, rtol=0.05)
+    assert np.allclose(np.corrcoef(u.T), np.eye(system.nx), atol=0.08)
+
+
+def test_noise_is_not_repeated_between_blocks():
+    env = KKLEnv("lorenz")
+    _, info = env.reset(seed=0)
+    v = []
+    for _ in range(4 * NOISE_BLOCK):
+        v.append(info["y"][0] - info["x"][1])
+        *_, info = env.step(np.zeros(1))
+    assert len(np.unique(np.round(v, 9))) == len(v)
+
+
+@everyone
+def test_actions_are_scaled_and_clipped(name):
+    env = KKLEnv(name, process_noise=0)
+    u_max = env.system.u_max[0]
+    x0 = env.reset(seed=0)[1]["x"]
+    for action, u in ((0.5, 0.5), (-1, -1), (0, 0), (3.0, 1), (-1e30, -1), (math.inf, 1)):
+        env.reset(options={"x0": x0})
+        *_, info = env.step(np.array([action]))
+        assert info["u"] == pytest.approx([u * u_max], rel=1e-12)
+        expected = advance(env.system, x0.tolist(), [u * u_max], [0.0] * env.system.nx, env.dt)
+        assert np.allclose(info["x"], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("action", [
+    [math.nan], np.float32(0.5), 0.5, [], [0.1, 0.2], [[0.1]], np.zeros((1, 1)), np.zeros((2, 1)), None, "a", ["a"],
+])  # fmt: skip
+def test_wrong_actions_raise_and_change_nothing(action):
+    env, other = KKLEnv("lorenz"), KKLEnv("lorenz")
+    env.reset(seed=0), other.reset(seed=0)
+    with pytest.raises(ValueError):  # noqa: PT011 - some by numpy
+        env.step(action)
+    assert np.array_equal(env.step([0.3])[0], other.step([0.3])[0])
+
+
+@pytest.mark.parametrize("options", [
+    {"x0": [1.0, 2.0]}, {"x0": 1.0}, {"x0": [[1.0, 2.0, 3.0]]}, {"x0": [1.0, 2.0, math.nan]},
+    {"x0": [math.inf, 0.0, 0.0]}, {"x0": [61.0, 0.0, 0.0]}, {"x0": [0.0, 0.0, -50.1]},
+])  # fmt: skip
+def test_wrong_starts_raise(options):
+    with pytest.raises(ValueError, match="x0 must be 3 numbers within"):
+        KKLEnv("lorenz").reset(options=options)
+
+
+def test_start_is_taken():
+    env = KKLEnv("lorenz")
+    _, info = env.reset(seed=0, options={"x0": (60, -120, 160)})
+    assert info["x"].tolist() == [60.0, -120.0, 160.0]
+    for empty in (None, {}):
+        env.reset(options=empty)
+
+
+def test_unknown_option():
+    with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
+        KKLEnv("lorenz").reset(options={"x_0": [0.0, 0.0, 0.0]})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"system": "nonsense"}, "unknown system 'nonsense'"),
+        ({"dt": 0}, "dt must be"),
+        ({"dt": -0.01}, "dt must be"),
+        ({"dt": math.nan}, "dt must be"),
+        ({"dt": math.inf}, "dt must be"),
+        ({"observe": "all"}, "observe must be .* 'all'"),
+        ({"parameters": {"gamma": 1.0}}, "lorenz has no parameter 'gamma'"),
+        ({"parameters": {"rho": math.nan}}, "parameter rho"),
+        ({"process_noise": -0.1}, "process_noise must be"),
+        ({"process_noise": math.nan}, "process_noise must be"),
+        ({"measurement_noise": -0.1}, "measurement_noise must be"),
+        ({"measurement_noise": math.inf}, "measurement_noise must be"),
+        ({"render_mode": "human"}, "render_mode must be None or one of .* 'human'"),
+    ],
+)
+def test_wrong_arguments_raise(wrong, match):
+    with pytest.raises(ValueError, match=match):
+        KKLEnv(**{"system": "lorenz", **wrong})
+
+
+def test_step_and_render_before_reset():
+    env = KKLEnv("lorenz", render_mode="rgb_array")
+    for call in (env.render, lambda: env.step(np.zeros(1))):
+        with pytest.raises(gym.error.ResetNeeded):
+            call()
+
+
+@both
+def test_autonomous_user_system(script, observe):
+    env = KKLEnv(f"{script}:Pendulum", observe=observe)
+    assert env.action_space.shape == (0,)
+    check_env(env, skip_render_check=True)
+    obs, _ = env.reset(seed=0)
+    obs, _, _, _, info = env.step(np.zeros(0, np.float32))
+    assert info["u"].shape == (0,)
+    assert obs in env.observation_space
+
+
+def test_user_system_through_make_survives_json(script):
+    env = gym.make("KKLLorenz-v0", system=f"{script}:Pendulum", parameters={"damping": 0.4})
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.system == get_system(f"{script}:Pendulum", {"damping": 0.4})
+    assert np.array_equal(play(env, 10, seed=0), play(again, 10, seed=0))
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "rossler"])
+def test_render(name):
+    env = gym.make(ENV_IDS[name], render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.dtype == np.uint8
+    assert first.shape == (480, 480, 3)
+    assert len(np.unique(first.reshape(-1, 3), axis=0)) > 5
+    assert np.array_equal(env.render(), first)
+    for _ in range(50):
+        env.step(np.zeros(1, np.float32))
+    later = env.render()
+    assert not np.array_equal(later, first)
+    assert not np.shares_memory(later, first)
+    env.reset(seed=0)
+    assert np.array_equal(env.render(), first)
+    env.close()
+
+
+def test_no_render_without_mode():
+    env = KKLEnv("lorenz")
+    env.reset(seed=0)
+    assert env.render() is None
+
+
+def test_output_bounds():
+    low, high = output_bounds(Rossler(), 3.0)
+    assert (low.tolist(), high.tolist()) == ([-73.0], [73.0])
+    env = KKLEnv("rossler", measurement_noise=0.5)
+    assert (env.output_space.low, env.output_space.high) == (-73.0, 73.0)
+    assert env.state_space.low.tolist() == [-50.0, -70.0, -5.0]
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_a_copy_mid_episode_continues_identically(duplicate, render_mode):
+    env = KKLEnv("rossler", render_mode=render_mode)
+    play(env, 30, seed=0)
+    env.render()
+    twin = duplicate(env)
+    assert np.array_equal(play(env, 100, reset=False), play(twin, 100, reset=False))
+    assert np.array_equal(env.reset()[0], twin.reset()[0])
+    assert render_mode is None or np.array_equal(env.render(), twin.render())
+
+
+def test_under_gymnasiums_wrappers():
+    env = gym.make("KKLVanDerPol-v0", observe="output", max_episode_steps=25)
+    env = FrameStackObservation(RecordEpisodeStatistics(env), 4)
+    obs, _ = env.reset(seed=0)
+    assert obs.shape == (4, 1)
+    total = 0.0
+    for k in range(25):
+        obs, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
+        total += reward
+        assert obs[-1] == np.float32(info["y"])
+        assert obs in env.observation_space
+        assert truncated is (k == 24)
+        assert terminated is False
+    assert info["episode"]["l"] == 25
+    assert info["episode"]["r"] == pytest.approx(total)
+
+
+def test_registered_ids_truncate_after_5000_steps():
+    assert {gym.spec(id_).max_episode_steps for id_ in ENV_IDS.values()} == {5000}
+
+
+def test_vector_env():
+    envs = gym.make_vec("KKLLorenz-v0", num_envs=3, vectorization_mode="sync")
+    obs, info = envs.reset(seed=5)
+    assert obs.shape == info["x"].shape == (3, 3)
+    single = gym.make("KKLLorenz-v0")
+    assert np.array_equal(single.reset(seed=6)[0], obs[1])
+    assert np.array_equal(envs.step(np.ones((3, 1), np.float32))[0][1], single.step(np.ones(1, np.float32))[0])
+    envs.close()
+
+
+def isolated(code):
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
+
+
+def test_import_is_light_and_registers_once():
+    isolated(
+        "import importlib, sys, kkl_gym, observers, gymnasium as gym\n"
+        "heavy = {'torch', 'scipy', 'matplotlib', 'sympy', 'stable_baselines3', 'training'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+        "before = dict(gym.registry)\n"
+        "importlib.reload(kkl_gym)\n"
+        "assert gym.registry == before\n"
+        "env = gym.make('KKLLorenz-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
+        "assert not {'torch', 'scipy', 'matplotlib'} & set(sys.modules)\n"
+    )
+
+
+def test_the_prefixed_id_needs_no_import():
+    isolated("import gymnasium as gym; gym.make('kkl_gym:KKLRossler-v0').reset(seed=0)")
+
+
+def test_public_names_exist():
+    assert all(hasattr(kkl_gym, name) for name in kkl_gym.__all__)

@@ -1,0 +1,134 @@
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+
+from observers import LinearFilter
+
+DIAGONAL = -np.diag([0.5, 2.0, 7.0])
+PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])
+both = pytest.mark.parametrize("A", [DIAGONAL, PAIR], ids=["diagonal", "pair"])
+DT = 0.1
+
+
+def random_filter(A, ny=2, nu=1, dt=DT):
+    return LinearFilter(A, np.random.default_rng(0).normal(size=(len(A), ny)), dt, nu)
+
+
+def run(linear, y, u):
+    z = [linear.start(y[0])]
+    for k in range(len(u)):
+        z.append(linear.advance(z[-1], y[k], u[k], y[k + 1]))
+    return np.array(z)
+
+
+def signals(linear, steps, *batch):
+    rng = np.random.default_rng(1)
+    ny = linear.B.shape[1]
+    return rng.normal(size=(steps + 1, *batch, ny)), rng.normal(size=(steps, *batch, linear.nu))
+
+
+@both
+@pytest.mark.parametrize("nu", [0, 1, 2])
+@pytest.mark.parametrize("dt", [1e-3, 0.1, 2.0])
+def test_one_interval_is_exact(A, nu, dt):
+    """Against the exponential of the system augmented with the ramp of y and the constant u."""
+    linear = random_filter(A, 2, nu, dt)
+    nz = len(A)
+    (y, y_next), (u,) = signals(linear, 1)
+    z = np.random.default_rng(2).normal(size=linear.size)
+    expected = []
+    for block in range(1 + nu):
+        drive, slope = (
+            (linear.B @ y, linear.B @ (y_next - y) / dt) if block == 0 else (linear.B.sum(1) * u[block - 1], 0)
+        )
+        M = np.zeros((nz + 2, nz + 2))  # (z, 1, t)
+        M[:nz, :nz], M[:nz, nz], M[:nz, nz + 1], M[nz + 1, nz] = A, drive, slope, 1.0
+        expected.append((expm(M * dt) @ [*z[block * nz : (block + 1) * nz], 1.0, 0.0])[:nz])
+    assert np.allclose(linear.advance(z, y, u, y_next), np.concatenate(expected), rtol=1e-10, atol=1e-11)
+
+
+@both
+def test_a_record_is_exact(A):
+    """Against an integrator that knows nothing of matrix exponentials."""
+    linear = random_filter(A)
+    steps, nz = 15, len(A)
+    y, u = signals(linear, steps)
+    z = np.concatenate([-np.linalg.solve(A, linear.B @ y[0]), np.zeros(nz)])
+    for k in range(steps):
+
+        def field(t, z, k=k):
+            held = y[k] + (y[k + 1] - y[k]) * t / DT
+            return np.concatenate([A @ z[:nz] + linear.B @ held, A @ z[nz:] + linear.B @ np.ones(2) * u[k, 0]])
+
+        z = solve_ivp(field, (0, DT), z, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    assert np.allclose(run(linear, y, u)[-1], z, rtol=1e-9, atol=1e-10)
+
+
+@both
+def test_start_is_the_equilibrium_of_a_constant_output(A):
+    linear = random_filter(A)
+    y = np.array([0.7, -1.3])
+    z = linear.start(y)
+    assert np.allclose(A @ z[:3] + linear.B @ y, 0, atol=1e-12)
+    assert (z[3:] == 0).all()
+    assert np.allclose(linear.advance(z, y, np.zeros(1), y), z, rtol=1e-12, atol=1e-13)
+
+
+def test_early_and_late_outputs_add_up_to_a_held_one():
+    linear = random_filter(DIAGONAL)
+    held = (np.exp(DIAGONAL.diagonal() * DT) - 1) / DIAGONAL.diagonal()
+    assert np.allclose((linear.early_y + linear.late_y)[:3], held[:, None] * linear.B, rtol=1e-12)
+    assert (linear.early_y[3:] == 0).all()
+    assert (linear.late_y[3:] == 0).all()
+
+
+@both
+@pytest.mark.parametrize("nu", [0, 1, 2])
+@pytest.mark.parametrize("batch", [(1,), (5,), (2, 3), (0,)])
+def test_batched_equals_looped(A, nu, batch):
+    linear = random_filter(A, 2, nu)
+    y, u = signals(linear, 8, *batch)
+    z = run(linear, y, u)
+    assert z.shape == (9, *batch, linear.size) == (9, *batch, 3 * (1 + nu))
+    for index in np.ndindex(*batch):
+        one = run(linear, y[(slice(None), *index)], u[(slice(None), *index)])
+        assert np.allclose(z[(slice(None), *index)], one, rtol=1e-13, atol=1e-14)
+
+
+def test_lists_are_taken():
+    linear = LinearFilter([[-1, 0], [0, -2]], [[1], [1]], 1)
+    assert linear.A.dtype == linear.B.dtype == float
+    assert np.allclose(linear.transition, np.diag(np.exp([-1, -2])))
+
+
+@pytest.mark.parametrize(
+    ("A", "B", "match"),
+    [
+        (np.eye(2) * [-1, 0.5], np.ones((2, 1)), r"Hurwitz.*0\.5"),
+        (np.diag([-1.0, 0.0]), np.ones((2, 1)), "Hurwitz"),
+        ([[0.1, 3.0], [-3.0, 0.1]], np.ones((2, 1)), "Hurwitz"),
+        ([[0.0, 1.0], [-1.0, 0.0]], np.ones((2, 1)), "Hurwitz"),
+        ([[-1.0, 1.0], [0.0, -1.0]], np.ones((2, 1)), "diagonalisable"),
+        (-np.ones(2), np.ones((2, 1)), "must be"),
+        (-np.ones((2, 3)), np.ones((2, 1)), r"\(2, 3\)"),
+        (-np.eye(2), np.ones((3, 1)), r"\(3, 1\)"),
+        (-np.eye(2), np.ones(2), r"\(2,\)"),
+        (np.diag([-1.0, np.nan]), np.ones((2, 1)), "finite"),
+        (-np.eye(2), np.full((2, 1), np.inf), "finite"),
+    ],
+)
+def test_wrong_matrices_raise(A, B, match):
+    with pytest.raises(ValueError, match=match):
+        LinearFilter(A, B, DT)
+
+
+@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf])
+def test_wrong_dt_raises(dt):
+    with pytest.raises(ValueError, match="dt must be"):
+        LinearFilter(DIAGONAL, np.ones((3, 1)), dt)
+
+
+def test_repeated_poles_are_allowed_where_diagonal():
+    linear = LinearFilter(-np.eye(2), np.ones((2, 1)), DT)
+    assert np.allclose(linear.transition, np.exp(-DT) * np.eye(2))

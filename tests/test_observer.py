@@ -1,0 +1,277 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import observers.observer
+from kkl_gym import SYSTEMS
+from observers import KKLObserver, load
+
+everyone = pytest.mark.parametrize("system", SYSTEMS)
+KINDS = [{"inputs": inputs, "noise": noise, "age": age} for inputs in (0, 1) for noise in (0, 1) for age in (0, 1)] + [
+    {"pair": True}
+]
+CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # the network works in float32
+
+
+def record(observer, steps, *batch, seed=0):
+    rng = np.random.default_rng(seed)
+    artifact = observer.artifact
+    return rng.normal(size=(steps, *batch, artifact.ny)), rng.normal(size=(steps - 1, *batch, artifact.nu))
+
+
+def step_by_step(observer, y, u):
+    out = [observer.reset(y[0])]
+    out += [observer.step(y[k + 1], u[k]) for k in range(len(u))]
+    return np.array(out)
+
+
+@everyone
+@pytest.mark.parametrize("options", KINDS, ids=str)
+def test_the_estimate_is_the_formula(system, options, make_artifact):
+    """Everything that _invert folds together, written out with plain arrays."""
+    artifact = make_artifact(system, **options)
+    inverse, observer = artifact.inverse, KKLObserver(artifact, 0.3)
+    y, u = record(observer, 5)
+    x_hat = step_by_step(observer, y, u)[-1]
+    modes = inverse.whiten @ (observer.z - inverse.z_offset) / (1 + (0.3 * inverse.noise_gain) ** 2)
+    h = [*modes]
+    if options.get("noise", True):
+        h.append(math.log(1 + 0.3 / 0.1))
+    if options.get("age", True):
+        h.append(math.log(1 + 4 * 0.01 / 0.05))
+    h = np.array(h)
+    *hidden, (weight, bias) = zip(inverse.mlp.weights, inverse.mlp.biases, strict=True)
+    for w, b in hidden:
+        h = w @ h + b
+        h = h / (1 + np.exp(-h))
+    assert np.allclose(x_hat, inverse.x_offset + inverse.x_scale * (weight @ h + bias), **CLOSE)
+
+
+@pytest.mark.parametrize("options", KINDS, ids=str)
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_estimate_equals_step_by_step(options, batch, make_artifact):
+    observer = KKLObserver(make_artifact("lorenz", **options))
+    y, u = record(observer, 300, *batch)  # longer than age_max
+    assert np.allclose(observer.estimate(y, u), step_by_step(observer, y, u), **CLOSE)
+
+
+def test_estimate_in_chunks_is_the_same(make_artifact, monkeypatch):
+    observer = KKLObserver(make_artifact("rossler"))
+    y, u = record(observer, 23, 3)
+    whole = observer.estimate(y, u)
+    for chunk in (1, 12, 22, 69):
+        monkeypatch.setattr(observers.observer, "_CHUNK", chunk)
+        assert np.allclose(observer.estimate(y, u), whole, **CLOSE)
+
+
+def test_estimate_leaves_the_state_alone(make_artifact):
+    observer = KKLObserver(make_artifact())
+    y, u = record(observer, 10)
+    observer.estimate(y, u)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer.z
+    step_by_step(observer, y, u)
+    z = observer.z
+    observer.estimate(-y, u)
+    assert np.array_equal(observer.z, z)
+
+
+def test_estimate_takes_a_last_row_of_u_more_and_none(make_artifact):
+    observer = KKLObserver(make_artifact())
+    y, u = record(observer, 10)
+    expected = observer.estimate(y, u)
+    assert np.array_equal(observer.estimate(y, np.concatenate([u, [[99.0]]])), expected)
+    assert np.array_equal(observer.estimate(y), observer.estimate(y, 0 * u))
+    assert not np.allclose(observer.estimate(y), expected)
+    assert observer.estimate(y[:1]).shape == (1, 2)
+
+
+@settings(deadline=None, max_examples=40, derandomize=True)
+@given(
+    batch=st.lists(st.integers(0, 4), max_size=3).map(tuple),
+    system=st.sampled_from(list(SYSTEMS)),
+    options=st.sampled_from(KINDS),
+    seed=st.integers(0, 1000),
+)
+def test_batches_equal_their_rows(make_artifact, batch, system, options, seed):
+    observer = KKLObserver(make_artifact(system, **options))
+    y, u = record(observer, 6, *batch, seed=seed)
+    x_hat, z = step_by_step(observer, y, u), observer.z
+    assert x_hat.shape == (6, *batch, observer.artifact.nx)
+    assert x_hat.dtype == z.dtype == np.float64
+    assert z.shape == (*batch, observer.artifact.filter.size)
+    for index in np.ndindex(*batch):
+        row = (slice(None), *index)
+        assert np.allclose(x_hat[row], step_by_step(observer, y[row], u[row]), **CLOSE)
+        assert np.allclose(z[index], observer.z, rtol=1e-12, atol=1e-13)
+
+
+def test_reset_forgets(make_artifact):
+    observer = KKLObserver(make_artifact())
+    y, u = record(observer, 10)
+    first = step_by_step(observer, y, u)
+    assert np.array_equal(step_by_step(observer, y, u), first)
+
+
+def test_a_missing_sample_holds_the_last(make_artifact):
+    coasting, told = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    y, u = record(told, 4)
+    step_by_step(coasting, y, u)
+    step_by_step(told, y, u)
+    for _ in range(3):
+        assert np.array_equal(coasting.step(None, u[0]), told.step(y[-1], u[0]))
+    assert np.array_equal(coasting.step(y[0]), told.step(y[0]))
+
+
+def test_no_input_is_zero_input(make_artifact):
+    a, b = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    a.reset([1.0]), b.reset([1.0])
+    assert np.array_equal(a.step([2.0]), b.step([2.0], [0.0]))
+    assert not np.array_equal(a.step([2.0]), b.step([2.0], [1.0]))
+
+
+def test_the_callers_array_may_be_reused(make_artifact):
+    safe, reused = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    y, u = record(safe, 6)
+    expected = step_by_step(safe, y, u)
+    buffer = y[0].copy()
+    got = [reused.reset(buffer)]
+    for k in range(5):
+        buffer[:] = y[k + 1]
+        got.append(reused.step(buffer, u[k]))
+    assert np.array_equal(got, expected)
+
+
+def test_results_are_copies(make_artifact):
+    a, b = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    for observer in (a, b):
+        observer.reset([1.0])
+    a.step([2.0])[:] = 99.0
+    b.step([2.0])
+    a.z[:] = 99.0
+    assert np.array_equal(a.step([3.0]), b.step([3.0]))
+
+
+BAD_Y = [
+    ([math.nan], "NaN or infinity"),
+    ([math.inf], "NaN or infinity"),
+    ([-math.inf], "NaN or infinity"),
+    (1.0, r"shape \(1,\), got \(\)"),
+    ([1.0, 2.0], r"shape \(1,\), got \(2,\)"),
+    ([[1.0]], r"shape \(1,\), got \(1, 1\)"),
+    ([], r"got \(0,\)"),
+]
+BAD_U = [
+    ([math.nan], "u holds NaN or infinity"),
+    ([math.inf], "u holds NaN or infinity"),
+    (1.0, r"u must have shape \(1,\), got \(\)"),
+    ([1.0, 2.0], r"u must have shape \(1,\), got \(2,\)"),
+    ([[1.0]], r"u must have shape \(1,\), got \(1, 1\)"),
+]
+
+
+@pytest.mark.parametrize(("y", "u", "match"), [(y, None, m) for y, m in BAD_Y] + [([1.0], u, m) for u, m in BAD_U])
+def test_a_refused_step_changes_nothing(y, u, match, make_artifact):
+    tried, other = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    for observer in (tried, other):
+        observer.reset([0.5])
+        observer.step([0.7], [0.1])
+    with pytest.raises(ValueError, match=match):
+        tried.step(y, u)
+    assert np.array_equal(tried.z, other.z)
+    assert np.array_equal(tried.step(None), other.step(None))
+
+
+@pytest.mark.parametrize(("y0", "match"), [(y, m) for y, m in BAD_Y if np.shape(y) != (1, 1)])
+def test_a_refused_reset_changes_nothing(y0, match, make_artifact):
+    observer = KKLObserver(make_artifact())
+    observer.reset([0.5])
+    z = observer.z
+    with pytest.raises(ValueError, match=match.replace(r"\(1,\)", ".*")):
+        observer.reset(y0)
+    assert np.array_equal(observer.z, z)
+
+
+def test_reset_is_required(make_artifact):
+    observer = KKLObserver(make_artifact())
+    with pytest.raises(RuntimeError, match="reset"):
+        observer.step([1.0])
+    with pytest.raises(RuntimeError, match="reset"):
+        observer.step(None)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer.z
+
+
+@pytest.mark.parametrize(
+    ("y", "u", "match"),
+    [
+        (np.zeros(3), None, r"\(steps, \.\.\., 1\)"),
+        (np.zeros((0, 1)), None, "record"),
+        (np.zeros((3, 2)), None, r"\(3, 1\)"),
+        (np.full((3, 1), math.nan), None, "NaN"),
+        (np.zeros((3, 1)), np.zeros((1, 1)), "2 or 3 rows for 3 rows of y, got 1"),
+        (np.zeros((3, 1)), np.zeros((2, 2)), r"u must have shape \(1,\)"),
+        (np.zeros((3, 1)), np.full((2, 1), math.nan), "u holds NaN"),
+    ],
+)
+def test_wrong_records_raise(y, u, match, make_artifact):
+    with pytest.raises(ValueError, match=match):
+        KKLObserver(make_artifact()).estimate(y, u)
+
+
+def test_blind_map_refuses_inputs(make_artifact):
+    observer = KKLObserver(make_artifact(inputs=False))
+    observer.reset([1.0])
+    z = observer.z
+    with pytest.raises(ValueError, match=r"van_der_pol knows no inputs, but u = \[0\.5\]"):
+        observer.step([1.0], np.array([0.5]))
+    with pytest.raises(ValueError, match="knows no inputs"):
+        observer.estimate(np.zeros((3, 1)), np.ones((2, 1)))
+    assert np.array_equal(observer.z, z)
+    observer.step([1.0], [0.0])
+
+
+@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf])
+@pytest.mark.parametrize("noise", [False, True])
+def test_wrong_noise_level_raises(level, noise, make_artifact):
+    observer = KKLObserver(make_artifact(noise=noise), 0.2)
+    with pytest.raises(ValueError, match="measurement_noise must be finite and not negative"):
+        observer.measurement_noise = level
+    assert observer.measurement_noise == 0.2
+    with pytest.raises(ValueError, match="measurement_noise"):
+        KKLObserver(make_artifact(noise=noise), level)
+
+
+def test_noise_level_beyond_training_raises_only_where_it_is_a_feature(make_artifact):
+    with pytest.raises(ValueError, match=r"measurement_noise = 1\.01 is beyond the map's range, 0 to 1\.0"):
+        KKLObserver(make_artifact(), 1.01)
+    assert KKLObserver(make_artifact(), 1.0).measurement_noise == 1.0
+    assert KKLObserver(make_artifact(noise=False), 1.01).measurement_noise == 1.01
+
+
+def test_noise_level_told_changes_the_estimate(make_artifact):
+    observer = KKLObserver(make_artifact(), 0.0)
+    y, u = record(observer, 5)
+    clean = step_by_step(observer, y, u)
+    observer.measurement_noise = 0.8
+    assert not np.allclose(step_by_step(observer, y, u), clean, rtol=1e-2)
+    assert np.array_equal(step_by_step(KKLObserver(make_artifact(), 0.8), y, u), step_by_step(observer, y, u))
+
+
+def test_age_changes_the_estimate_until_age_max(make_artifact):
+    observer = KKLObserver(make_artifact(age=True))
+    x_hat = observer.estimate(np.full((400, 1), 0.3))  # the filter stays at its equilibrium
+    assert not np.allclose(x_hat[0], x_hat[1], rtol=1e-3)
+    assert not np.allclose(x_hat[198], x_hat[200], rtol=1e-6, atol=0)
+    assert np.allclose(x_hat[200:], x_hat[200], rtol=1e-6)
+
+
+def test_load_from_a_file(saved, make_artifact):
+    observer = load(saved(system="lorenz"), 0.4)
+    direct = KKLObserver(make_artifact("lorenz"), 0.4)
+    y, u = record(direct, 5)
+    assert observer.measurement_noise == 0.4
+    assert np.array_equal(observer.estimate(y, u), direct.estimate(y, u))

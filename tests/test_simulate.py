@@ -1,0 +1,341 @@
+import functools
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+
+from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
+from kkl_gym.elementary import exp, sin
+from kkl_gym.simulate import MAX_SUBSTEPS, RATE_STEP, advance, advance_batch, check_dt, runge_kutta, simulate
+
+everyone = pytest.mark.parametrize("name", SYSTEMS)
+DT = 0.01
+
+
+@dataclass(frozen=True)
+class Steered(System):
+    """Two inputs through a matrix that depends on the state (a unicycle with drift)."""
+
+    name = "steered"
+    X = ((-1, 1), (-1, 1), (-3, 3))
+    bounds = ((-10, 10), (-10, 10), (-30, 30))
+    u_max = (2.0, 3.0)
+
+    def f(self, x):
+        return -0.1 * x[1], 0.1 * x[0], 0.0 * x[2]
+
+    def g(self, x):
+        return (sin(x[2] + 1.5), 0.0), (sin(x[2]), 0.0), (0.0, 1.0)
+
+    def h(self, x):
+        return x[0], x[1]
+
+
+@dataclass(frozen=True)
+class TwoInputs(System):
+    name = "two_inputs"
+    X = ((-1, 1), (-1, 1))
+    bounds = ((-50, 50), (-50, 50))
+    u_max = (1.0, 2.0)
+    G = ((1.0, 0.5), (-1.0, 2.0))
+
+    def f(self, x):
+        return x[1], -sin(x[0])
+
+    def h(self, x):
+        return (x[0],)
+
+
+class ConstantRate(TwoInputs):
+    def rate(self, x):
+        return 5.0
+
+
+@dataclass(frozen=True)
+class Drift(System):
+    """Constant f: its numerical rate is a plain number for batches too."""
+
+    name = "drift"
+    X = ((-1, 1),)
+    bounds = ((-5, 5),)
+
+    def f(self, x):
+        return (2.0,)
+
+    def h(self, x):
+        return (x[0],)
+
+
+@dataclass(frozen=True)
+class Exploding(System):
+    name = "exploding"
+    X = ((-1, 1),)
+    bounds = ((-1e6, 1e6),)
+
+    def f(self, x):
+        return (exp(x[0]) + sin(exp(x[0])),)
+
+    def rate(self, x):
+        return 0.0 * x[0]
+
+    def h(self, x):
+        return (x[0],)
+
+
+@functools.cache
+def reference(name, duration):
+    """100 seeded starts in 2X that stay within bounds, and their states every 0.1 s, by DOP853."""
+    system = get_system(name)
+    low, high = np.array(system.bounds).T[:, :, None]
+    x0 = np.random.default_rng(7).uniform(*system.box(2), (200 if name in ("rossler", "lorenz") else 100, system.nx)).T
+    stays = np.ones(x0.shape[1], bool)
+
+    def field(t, flat):  # those that have left stand still
+        x = flat.reshape(x0.shape)
+        stays[~((x >= low) & (x <= high)).all(0)] = False
+        return np.where(stays, np.array(system.f(np.where(stays, x, 0.0))), 0.0).ravel()
+
+    while True:  # a trial stage beyond the bounds is no departure, but leaving it out does no harm
+        before = stays.copy()
+        times = np.linspace(0, duration, round(duration / 0.1) + 1)
+        solution = solve_ivp(field, (0, duration), x0.ravel(), "DOP853", times, rtol=1e-10, atol=1e-12)
+        if (stays == before).all():
+            break
+    assert solution.success
+    kept = np.flatnonzero(stays)[:100]
+    return x0[:, kept].T, solution.y.reshape(*x0.shape, -1)[:, kept].transpose(2, 1, 0)
+
+
+@pytest.mark.parametrize(("name", "duration"), [
+    ("reverse_duffing", 10.0), ("van_der_pol", 10.0), ("rossler", 10.0), ("lorenz", 2.0),
+])  # fmt: skip
+def test_accuracy_from_twice_the_training_box(name, duration):
+    x0, expected = reference(name, duration)
+    assert x0.shape == (100, get_system(name).nx)
+    x = simulate(get_system(name), x0, round(duration / DT), DT)[:: round(0.1 / DT)]
+    error = np.abs(x - expected).max((0, 2)) / np.abs(expected).max((0, 2))
+    assert error.max() < 1e-5
+
+
+def test_accuracy_with_input_and_noise():
+    system, rng = Lorenz(), np.random.default_rng(8)
+    x0 = np.array([[1.0, 2.0, 20.0]])
+    u, w = rng.uniform(-10, 10, (20, 1, 1)), rng.uniform(-1, 1, (20, 1, 3))
+    x = x0[0]
+    for k in range(20):
+        drive = np.array(system.G) @ u[k, 0] + w[k, 0]
+        x = solve_ivp(lambda t, x, d=drive: system.f(x) + d, (0, 0.05), x, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+    assert np.allclose(simulate(system, x0, 20, 0.05, u, w)[-1, 0], x, rtol=1e-7)
+
+
+def test_order_six():
+    def error(n):
+        x = runge_kutta(2)(ReverseDuffing().f, (1.0, 1.0), (0.2, -0.1), 2.0 / n, n)
+        return np.abs(np.subtract(x, exact)).max()
+
+    exact = solve_ivp(
+        lambda t, x: np.add(ReverseDuffing().f(x), (0.2, -0.1)), (0, 2), [1, 1], "DOP853", rtol=1e-13, atol=1e-14
+    ).y[:, -1]
+    errors = [error(n) for n in (8, 16, 32)]
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert ((orders > 5.5) & (orders < 7.0)).all()
+
+
+def test_quadrature_is_exact_to_order_six():
+    """x' = 6 t^5 with t as a second state."""
+    t, x = runge_kutta(2)(lambda s: (1.0, 6.0 * s[0] ** 5), (0.0, 0.0), (0.0, 0.0), 1.0, 1)
+    assert (t, x) == pytest.approx((1.0, 1.0), rel=1e-13)
+
+
+def test_energy_is_conserved():
+    x0 = np.random.default_rng(3).uniform(*ReverseDuffing().box(2), (20, 2))
+    x = simulate(ReverseDuffing(), x0, 1000, DT)
+    energy = x[..., 1] ** 4 / 4 + x[..., 0] ** 2 / 2
+    assert np.allclose(energy, energy[0], rtol=1e-7)
+
+
+def one_by_one(system, x0, u, w, dt):
+    out = [x0]
+    for uk, wk in zip(u.tolist(), w.tolist(), strict=True):
+        rows = zip(out[-1].tolist(), uk, wk, strict=True)
+        out.append(np.array([advance(system, x, ui, wi, dt) for x, ui, wi in rows]))
+    return np.array(out)
+
+
+@pytest.mark.parametrize("system", [*(cls() for cls in SYSTEMS.values()), TwoInputs()], ids=lambda s: s.name)
+@pytest.mark.parametrize("dt", [0.003, 0.01, 0.1])
+def test_scalar_equals_batch_bit_for_bit(system, dt):
+    rng = np.random.default_rng(4)
+    n, steps = 30, 20
+    x0 = rng.uniform(*system.box(), (n, system.nx))
+    u = rng.uniform(-1, 1, (steps, n, system.nu)) * system.u_max
+    w = rng.uniform(-1, 1, (steps, n, system.nx))
+    batch, scalar = simulate(system, x0, steps, dt, u, w), one_by_one(system, x0, u, w, dt)
+    stays = np.isfinite(batch[-1]).all(-1)
+    assert stays.sum() >= n // 2
+    assert np.array_equal(batch[:, stays], scalar[:, stays])
+
+
+@settings(deadline=None, max_examples=200, derandomize=True)
+@given(k=st.integers(0, 9), above=st.integers(-2, 2), dt=st.floats(1e-4, 0.5))
+def test_scalar_and_batch_choose_the_same_substeps(k, above, dt):
+    """Also where rate * dt falls within rounding of the next power of two."""
+    rate = 2**k * RATE_STEP / dt
+    for _ in range(abs(above)):
+        rate = math.nextafter(rate, math.inf if above > 0 else 0.0)
+    system = fixed_rate(rate)
+    (batch,) = advance_batch(system, np.array([[1.0], [0.5]]), np.ones((1, 1)), np.zeros((2, 1)), dt).T
+    assert batch.tolist() == list(advance(system, (1.0, 0.5), (1.0,), (0.0, 0.0), dt))
+
+
+def fixed_rate(value):
+    class Fixed(ReverseDuffing):
+        def rate(self, x):
+            return value + 0.0 * x[0]
+
+    return Fixed()
+
+
+def test_each_row_takes_its_own_substeps():
+    system = get_system("van_der_pol")
+    slow, fast = [0.1, 0.1], [11.9, 20.0]
+    u, w = np.zeros((1, 2)), np.zeros((2, 2))
+    together = advance_batch(system, np.array([slow, fast]).T, u, w, DT)
+    for row, start in enumerate((slow, fast)):
+        assert together[:, row].tolist() == list(advance(system, start, (0.0,), (0.0, 0.0), DT))
+
+
+def test_escape_leaves_nan_rows_and_no_warning():
+    system = Rossler()
+    x0 = np.array([[43.5, 44.2, -3.6], [1.0, 1.0, 1.0], [-48.3, 43.9, 455.9], [5.0, 5.0, 5.0]])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        x = simulate(system, x0, 200, DT)
+    gone = np.isnan(x).any(-1)
+    assert np.isnan(x[gone]).all()
+    assert (np.diff(gone.astype(int), axis=0) >= 0).all()  # once gone, for good
+    assert gone[-1].tolist() == [True, False, True, False]
+    low, high = np.array(system.bounds).T
+    assert ((x[~gone] >= low) & (x[~gone] <= high)).all()
+
+
+@everyone
+def test_huge_states_and_steps_are_nan_without_warning(name):
+    system = get_system(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for x in ([1e200] * system.nx, [math.nan] * system.nx, [math.inf] * system.nx):
+            u, w = [0.0] * system.nu, [0.0] * system.nx
+            assert not np.isfinite(advance(system, x, u, w, DT)).any()
+            batch = advance_batch(system, np.array(x)[:, None], np.zeros((1, 1)), np.zeros((system.nx, 1)), DT)
+            assert not np.isfinite(batch).any()
+        assert np.isnan(advance(system, [1.0] * system.nx, [0.0], [0.0] * system.nx, 1e6)).all()
+
+
+def test_number_of_substeps_is_limited():
+    calls = []
+
+    class Counting(ReverseDuffing):
+        def f(self, x):
+            calls.append(x)
+            return super().f(x)
+
+    system = Counting()
+    rate = system.rate((1.0, 1.0))
+    dt = MAX_SUBSTEPS * RATE_STEP / rate
+    assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 0.999)).all()
+    assert len(calls) == 7 * MAX_SUBSTEPS
+    calls.clear()
+    assert np.isnan(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)).all()
+    assert not calls
+
+
+def test_overflow_in_a_users_functions_is_an_escape():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not np.isfinite(advance(Exploding(), (800.0,), (), (0.0,), 1.0)).any()
+        assert not np.isfinite(simulate(Exploding(), np.array([[800.0], [5.0]]), 3, 1.0)[-1]).any()
+
+
+@pytest.mark.parametrize("system", [Steered(), TwoInputs()], ids=lambda s: s.name)
+def test_several_inputs(system):
+    rng = np.random.default_rng(5)
+    x0 = rng.uniform(*system.box(), (3, system.nx))
+    u = rng.uniform(-1, 1, (30, 3, 2)) * system.u_max
+    w = rng.uniform(-0.1, 0.1, (30, 3, system.nx))
+    x = simulate(system, x0, 30, 0.05, u, w)
+    scalar = one_by_one(system, x0, u, w, 0.05)
+    assert np.allclose(x, scalar, rtol=1e-12, atol=1e-12)
+    for row in range(3):
+        state = x0[row]
+        for k in range(30):
+
+            def field(t, x, uk=u[k, row], wk=w[k, row]):
+                return system.f(x) + np.array(system.g(x.tolist())) @ uk + wk
+
+            state = solve_ivp(field, (0, 0.05), state, "DOP853", rtol=1e-11, atol=1e-12).y[:, -1]
+        assert np.allclose(x[-1, row], state, rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("system", [ConstantRate(), Drift()], ids=lambda s: s.name)
+def test_rates_that_do_not_depend_on_the_state(system):
+    x0 = np.array([[0.1] * system.nx, [-0.2] * system.nx])
+    u, w = np.ones((5, 2, system.nu)), np.zeros((5, 2, system.nx))
+    assert np.allclose(simulate(system, x0, 5, 0.1, u, w), one_by_one(system, x0, u, w, 0.1), rtol=1e-13)
+
+
+def test_drift_moves_at_its_speed():
+    assert np.allclose(simulate(Drift(), [[0.0]], 4, 0.5)[:, 0, 0], [0, 1, 2, 3, 4])
+
+
+def test_signals_left_out_are_zero():
+    system, x0 = Lorenz(), np.array([[1.0, 2.0, 3.0]])
+    zero = simulate(system, x0, 10, DT, np.zeros((10, 1, 1)), np.zeros((10, 1, 3)))
+    assert np.array_equal(simulate(system, x0, 10, DT), zero)
+
+
+def test_the_first_row_is_the_start_and_arguments_are_left_alone():
+    x0 = np.random.default_rng(6).uniform(-30, 30, (50, 3))
+    kept, x = x0.copy(), simulate(Rossler(), x0, 300, DT)
+    assert np.array_equal(x[0], kept)
+    assert np.array_equal(x0, kept)
+
+
+def test_no_starts_and_no_steps():
+    assert simulate(Lorenz(), np.empty((0, 3)), 2, DT).shape == (3, 0, 3)
+    assert simulate(Lorenz(), np.ones((4, 3)), 0, DT).shape == (1, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "match"),
+    [
+        ({"x0": np.zeros(3)}, r"x0 .* \(n, 3\)"),
+        ({"x0": np.zeros((2, 2))}, r"x0 .* \(2, 2\)"),
+        ({"x0": [[0.0, math.nan, 0.0]]}, "x0 must be finite"),
+        ({"u": np.zeros((5, 2))}, r"u must have shape \(5, 2, 1\), got \(5, 2\)"),
+        ({"u": np.zeros((4, 2, 1))}, "u must have shape"),
+        ({"w": np.zeros((5, 2, 1))}, r"w must have shape \(5, 2, 3\)"),
+        ({"dt": 0.0}, "dt must be"),
+    ],
+)
+def test_wrong_arguments_raise(wrong, match):
+    arguments = {"x0": np.zeros((2, 3)), "steps": 5, "dt": DT, **wrong}
+    with pytest.raises(ValueError, match=match):
+        simulate(Lorenz(), **arguments)
+
+
+@pytest.mark.parametrize("dt", [0, -0.01, math.nan, math.inf, "0.01", None])
+def test_check_dt(dt):
+    with pytest.raises(ValueError, match="dt must be a positive, finite number of seconds"):
+        check_dt(dt)
+
+
+def test_check_dt_takes_numbers():
+    check_dt(1)
+    check_dt(np.float64(0.01))
+    check_dt(np.float32(0.01))

@@ -1,0 +1,310 @@
+import copy
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import kkl_gym.wrappers
+from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation
+from observers import ArtifactError, KKLObserver
+
+checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
+everyone = pytest.mark.parametrize("name", ENV_IDS)
+ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler
+
+
+def actions(steps, nu=1, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, nu)).astype(np.float32)
+
+
+def wrapped(saved, name, estimate="x", env=None, **options):
+    kept = {key: options.pop(key) for key in ("ignore_input", "measurement_noise") if key in options}
+    env = gym.make(ENV_IDS[name], **(env or {}))
+    return KKLObservation(env, saved(system=name, **options), estimate, **kept)
+
+
+@everyone
+@pytest.mark.parametrize("observe", ["state", "output"])
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@checking_wrapped
+def test_checkers_are_content(name, observe, estimate, saved):
+    env = wrapped(saved, name, estimate, {"observe": observe})
+    check_env(env, skip_render_check=True)
+    check_env_sb3(env)
+    assert env.observation_space.shape == ((env.unwrapped.system.nx,) if estimate == "x" else env.observer.z.shape)
+
+
+@everyone
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+@pytest.mark.parametrize("inputs", [True, False])
+def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_artifact):
+    """The wrapper's x_hat, from y_k+1 and the u_k that led to it, equals the bare observer fed from the infos."""
+    env = wrapped(saved, name, env={"measurement_noise": noise}, inputs=inputs, ignore_input=True)
+    obs, info = env.reset(seed=1)
+    infos, shown = [info], [obs]
+    for action in actions(60):
+        obs, _, terminated, _, info = env.step(2 * action)  # some are clipped
+        assert not terminated
+        infos.append(info)
+        shown.append(obs)
+    y, x_hat, z = (np.array([info[key] for info in infos]) for key in ("y", "x_hat", "z"))
+    u = np.array([info["u"] for info in infos[1:]]) if inputs else None
+    bare = KKLObserver(make_artifact(name, inputs=inputs), noise)
+    expected = [bare.reset(y[0])]
+    expected_z = [bare.z]
+    for k in range(60):
+        expected.append(bare.step(y[k + 1], u[k] if inputs else None))
+        expected_z.append(bare.z)
+    assert np.array_equal(x_hat, expected)
+    assert np.array_equal(z, expected_z)
+    assert np.allclose(bare.estimate(y, u), x_hat, rtol=1e-5, atol=1e-4)
+    assert x_hat.dtype == z.dtype == np.float64
+    space = env.unwrapped.state_space
+    assert np.array_equal(shown, np.clip(x_hat, space.low, space.high).astype(np.float32))
+    if inputs:
+        assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), x_hat, rtol=1e-3)  # a shift by one would show
+
+
+def test_the_environment_is_left_as_it_was(saved):
+    bare, env = gym.make("KKLRossler-v0"), wrapped(saved, "rossler")
+    x0, x1 = bare.reset(seed=2)[1]["x"], env.reset(seed=2)[1]["x"]
+    assert np.array_equal(x0, x1)
+    for action in actions(20):
+        *_, r0, _, _, i0 = bare.step(action)
+        *_, r1, _, _, i1 = env.step(action)
+        assert r0 == r1
+        assert {*i1} - {*i0} == {"x_hat", "z"}
+        assert all(np.array_equal(i0[key], i1[key]) for key in i0)
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_reset_forgets_the_episode_before(estimate, saved):
+    env, fresh = (wrapped(saved, "lorenz", estimate) for _ in range(2))
+    env.reset(seed=9)
+    for action in actions(30):
+        env.step(action)
+    assert np.array_equal(env.reset(seed=3)[0], fresh.reset(seed=3)[0])
+    for action in actions(10, seed=1):
+        assert np.array_equal(env.step(action)[0], fresh.step(action)[0])
+
+
+def test_estimate_z_shows_the_filter(saved):
+    env = wrapped(saved, "lorenz", "z")
+    obs, info = env.reset(seed=0)
+    for action in actions(30):
+        assert np.allclose(obs, info["z"], rtol=1e-6)
+        assert np.array_equal(info["z"], env.observer.z)
+        obs, *_, info = env.step(action)
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_spec_round_trip(estimate, saved):
+    env = KKLObservation(
+        gym.make("KKLLorenz-v0", measurement_noise=0.2, max_episode_steps=40),
+        saved(system="lorenz"),
+        estimate,
+        measurement_noise=0.4,
+    )
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
+    assert isinstance(again, KKLObservation)
+    assert again.observer.measurement_noise == 0.4
+    assert again.observation_space == env.observation_space
+    assert np.array_equal(env.reset(seed=1)[0], again.reset(seed=1)[0])
+    for action in actions(20):
+        assert np.array_equal(env.step(action)[0], again.step(action)[0])
+
+
+def test_spec_of_a_stack_round_trips(saved):
+    env = ActionRepeat(wrapped(saved, "rossler", inputs=False, ignore_input=True), 5)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert isinstance(again, ActionRepeat)
+    assert again.repeat == 5
+    env.reset(seed=1), again.reset(seed=1)
+    assert np.array_equal(env.step([0.5])[0], again.step([0.5])[0])
+
+
+def test_a_copy_mid_episode_continues_identically(saved):
+    env = wrapped(saved, "rossler")
+    env.reset(seed=0)
+    for action in actions(10):
+        env.step(action)
+    twin = copy.deepcopy(env)
+    for action in actions(20, seed=1):
+        assert np.array_equal(env.step(action)[0], twin.step(action)[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "environment", "match"),
+    [
+        ({"system": "rossler"}, {}, "the system 'rossler', but the environment has 'lorenz'"),
+        ({"system": "lorenz"}, {"parameters": {"rho": 20.0}}, r"rho = 28\.0, but the environment has 20\.0"),
+        ({"system": "lorenz", "dt": 0.02}, {}, r"dt = 0\.02, but the environment has 0\.01"),
+        ({"system": "lorenz"}, {"dt": 0.005}, r"dt = 0\.01, but the environment has 0\.005"),
+    ],
+)
+def test_mismatches_name_both_values(options, environment, match, saved):
+    with pytest.raises(ArtifactError, match=match):
+        KKLObservation(KKLEnv("lorenz", **environment), saved(**options))
+
+
+def test_noise_beyond_the_maps_range(saved):
+    path = saved(system="lorenz")
+    with pytest.raises(ValueError, match=r"measurement_noise = 1\.5 is beyond the map's range, 0 to 1\.0"):
+        KKLObservation(KKLEnv("lorenz", measurement_noise=1.5), path)
+    env = KKLObservation(KKLEnv("lorenz", measurement_noise=1.5), path, measurement_noise=1.0)
+    assert env.observer.measurement_noise == 1.0
+    assert KKLObservation(KKLEnv("lorenz", measurement_noise=0.3), path).observer.measurement_noise == 0.3
+
+
+def test_wrong_arguments(saved, tmp_path):
+    with pytest.raises(ValueError, match="needs a kkl_gym environment"):
+        KKLObservation(gym.make("CartPole-v1"), saved(system="lorenz"))
+    with pytest.raises(ValueError, match=r"estimate must be .* 'y'"):
+        KKLObservation(KKLEnv("lorenz"), saved(system="lorenz"), "y")
+    with pytest.raises(ArtifactError, match="unknown observer 'nonsense'"):
+        KKLObservation(KKLEnv("lorenz"), "nonsense")
+    with pytest.raises(ArtifactError, match=r"there is no file .*none\.safetensors"):
+        KKLObservation(KKLEnv("lorenz"), str(tmp_path / "none.safetensors"))
+
+
+def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
+    asked = []
+
+    def load(name, noise):
+        asked.append((name, noise))
+        return KKLObserver(make_artifact(name), noise)
+
+    monkeypatch.setattr(kkl_gym.wrappers, "load", load)
+    KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7))
+    assert asked == [("van_der_pol", 0.7)]
+
+
+def test_blind_map_under_action(saved):
+    env = wrapped(saved, "lorenz", inputs=False)
+    env.reset(seed=0)
+    env.step(np.zeros(1, np.float32))
+    with pytest.raises(ValueError, match=r"'lorenz'.*knows no inputs, but the agent applied u = \[5\.\]"):
+        env.step(np.array([0.5], np.float32))
+    ignoring = wrapped(saved, "lorenz", inputs=False, ignore_input=True)
+    ignoring.reset(seed=0)
+    *_, info = ignoring.step(np.array([0.5], np.float32))
+    assert info["u"].tolist() == [5.0]
+
+
+def test_map_of_an_autonomous_system_is_not_blind(script, saved):
+    name = f"{script}:Pendulum"
+    env = KKLObservation(KKLEnv(name), saved(system=name))
+    env.reset(seed=0)
+    obs, *_, info = env.step(np.zeros(0, np.float32))
+    assert obs in env.observation_space
+    assert info["z"].shape == (5,)
+
+
+@everyone
+@pytest.mark.parametrize("pair", [False, True])
+def test_the_z_space_holds_z_under_the_worst_signals(name, pair, saved):
+    """For each component the outputs and inputs that drive it furthest, from the impulse response."""
+    env = wrapped(saved, name, "z", pair=pair)
+    linear, space, base = env.observer.artifact.filter, env.observation_space, env.unwrapped
+    y_max = np.maximum(-base.output_space.low, base.output_space.high).astype(float)
+    steps = 1500
+    powers = [np.eye(linear.size)]
+    for _ in range(steps):
+        powers.append(powers[-1] @ linear.transition)
+    reached = np.zeros(linear.size)
+    for i in range(linear.size):
+        # z_n,i = sum_k e_i' Phi^(n-1-k) (early y_k + late y_k+1 + held u_k)
+        rows = np.array([power[i] for power in powers[:steps]])[::-1]
+        y_weight = np.zeros((steps + 1, linear.B.shape[1]))
+        y_weight[:-1] += rows @ linear.early_y
+        y_weight[1:] += rows @ linear.late_y
+        y_weight[0] += powers[steps][i] @ linear.equilibrium
+        y = np.where(y_weight < 0, -y_max, y_max)
+        u = np.where(rows @ linear.held_u < 0, -1.0, 1.0) * base.system.u_max
+        z = linear.start(y[0])
+        for k in range(steps):
+            z = linear.advance(z, y[k], u[k], y[k + 1])
+            assert (np.abs(z) <= space.high).all()
+        reached[i] = abs(z[i])
+    assert (reached <= space.high).all()
+    assert (reached >= 0.99 * space.high).all()  # and no wider than it must be
+    assert np.array_equal(space.low, -space.high)
+
+
+def test_escape_under_the_wrapper(saved):
+    env = wrapped(saved, "rossler")
+    env.reset(seed=0, options={"x0": ESCAPING})
+    for _ in range(300):
+        obs, _, terminated, _, info = env.step(np.zeros(1, np.float32))
+        assert obs in env.observation_space
+        if terminated:
+            break
+    assert terminated
+    assert info["escaped"]
+
+
+@everyone
+@checking_wrapped
+def test_action_repeat_passes_the_checkers(name, saved):
+    for env in (ActionRepeat(gym.make(ENV_IDS[name]), 4), ActionRepeat(wrapped(saved, name), 4)):
+        check_env(env, skip_render_check=True)
+        check_env_sb3(env)
+
+
+def test_action_repeat_sums_rewards(saved):
+    slow, fast = ActionRepeat(wrapped(saved, "lorenz"), 7), wrapped(saved, "lorenz")
+    slow.reset(seed=0), fast.reset(seed=0)
+    for action in actions(5):
+        obs, reward, _, _, info = slow.step(action)
+        steps = [fast.step(action) for _ in range(7)]
+        assert reward == pytest.approx(sum(step[1] for step in steps), rel=1e-12)
+        assert type(reward) is float
+        assert np.array_equal(obs, steps[-1][0])
+        for key in ("x", "y", "u", "x_hat", "z"):  # the observer saw every sample
+            assert np.array_equal(info[key], steps[-1][-1][key])
+
+
+def test_action_repeat_stops_where_the_episode_is_cut(saved):
+    env = ActionRepeat(wrapped(saved, "lorenz", env={"max_episode_steps": 10}), 4)
+    env = RecordEpisodeStatistics(env)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(1, np.float32))[3] for _ in range(3)]
+    assert ends == [False, False, True]
+    assert env.unwrapped.system.name == "lorenz"
+    assert env.get_wrapper_attr("_elapsed_steps") == 10
+
+
+def test_action_repeat_stops_at_an_escape():
+    counted = []
+
+    class Counting(gym.Wrapper):
+        def step(self, action):
+            counted.append(action)
+            return self.env.step(action)
+
+    env = ActionRepeat(Counting(KKLEnv("rossler")), 1000)
+    env.reset(seed=0, options={"x0": ESCAPING})
+    _, reward, terminated, truncated, info = env.step(np.zeros(1))
+    assert terminated
+    assert info["escaped"]
+    assert not truncated
+    assert 100 < len(counted) < 300
+    assert 0 < reward < len(counted)
+
+
+def test_a_time_limit_outside_counts_the_agents_steps(saved):
+    env = TimeLimit(ActionRepeat(wrapped(saved, "lorenz"), 5), 3)
+    env.reset(seed=0)
+    assert [env.step(np.zeros(1, np.float32))[3] for _ in range(3)] == [False, False, True]
+
+
+@pytest.mark.parametrize("repeat", [0, -1, 1.5, "2", None])
+def test_wrong_repeats(repeat):
+    with pytest.raises(ValueError, match="repeat must be a positive integer"):
+        ActionRepeat(KKLEnv("lorenz"), repeat)
