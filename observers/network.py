@@ -1,8 +1,7 @@
 """Multilayer perceptrons, evaluated with NumPy alone."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -35,6 +34,7 @@ class MLP:
     weights: Sequence[np.ndarray]
     biases: Sequence[np.ndarray]
     activation: str
+    _layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.activation not in ACTIVATIONS:
@@ -68,7 +68,7 @@ class MLP:
         """(..., inputs) to (..., outputs), float32."""
         activation = ACTIVATIONS[self.activation]
         *hidden, (weight, bias) = self._layers
-        h = x.astype(np.float32, copy=False)
+        h: np.ndarray = x.astype(np.float32, copy=False)
         if h.ndim > 2:
             h = h.reshape(-1, h.shape[-1])
         for w, b in hidden:
@@ -77,4 +77,4 @@ class MLP:
             h = activation(h)
         h = np.dot(h, weight)
         h += bias
-        return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], -1)
+        return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))

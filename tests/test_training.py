@@ -391,7 +391,7 @@ def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monke
     assert path.exists()
     assert (path.parent / "report.png").stat().st_size > 10_000
     csv = tmp_path / "errors.csv"
-    main(["evaluate", str(path), "--trajectories", "3", "--duration", "2", "--csv", str(csv)])
+    main(["evaluate", str(path), "--trajectories", "3", "--duration", "8", "--csv", str(csv)])
     assert "2X" in capsys.readouterr().out
     assert len(csv.read_text().splitlines()) == 1 + 3 * 3 * 2
     for wrong in (["train", "nonsense"], ["evaluate", "nonsense"], ["train", "lorenz", "--dt", "0"]):

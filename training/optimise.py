@@ -45,7 +45,9 @@ class Stage:
 def optimise(
     stage: Stage, module: nn.Module, loss: Loss, progress: Progress, writer: SummaryWriter, resume: bool
 ) -> list[tuple[int, float]]:
-    """Minimise ``loss()["loss"]`` over the parameters of ``module``; returns the smoothed loss by step.
+    """Minimise ``loss()["loss"]`` over the parameters of ``module``; returns its course by step.
+
+    The course is that of ``loss()["error"]`` where there is one, else of the loss, averaged over LOG_EVERY steps.
 
     Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
 
@@ -74,18 +76,18 @@ def optimise(
         terms["loss"].backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
-        total += terms["loss"].detach()
+        total += terms.get("error", terms["loss"]).detach()
         if (step + 1) % LOG_EVERY == 0 or step + 1 == stage.steps:
             mean = float(total) / ((step % LOG_EVERY) + 1)
             if mean != mean:
-                raise FloatingPointError(f"the loss of stage {stage.name!r} is not a number at step {step + 1}")
+                raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {step + 1}")
             total.zero_()
             history.append((step + 1, mean))
             for name, value in terms.items():
-                writer.add_scalar(f"{stage.name}/{name}", mean if name == "loss" else float(value), step + 1)
-            progress.update(task, completed=step + 1, description=f"{stage.name} (loss {mean:.3g})")
+                writer.add_scalar(f"{stage.name}/{name}", float(value), step + 1)
+            progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
             if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
-                progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, loss {mean:.3g}")
+                progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, error {mean:.3g}")
             if time.monotonic() - saved_at > CHECKPOINT_SECONDS or step + 1 == stage.steps:
                 _save(checkpoint, stage, module, optimiser, generator, step + 1, history)
                 saved_at = time.monotonic()

@@ -15,7 +15,7 @@ from training.pipeline import Result
 
 
 def write_report(path: Path, result: Result, system: System, seed: int = 0) -> None:
-    """Losses, PDE residual over the domain (or error by noise level, where no T was learned), estimate against truth.
+    """Errors in training, PDE residual over the domain (or error by noise level, where no T was learned), estimate against truth.
 
     The trajectories shown are training's own kind, from ``seed``, without input.
     """
@@ -30,7 +30,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 0) -> N
     losses = figure.add_subplot(grid[0, 0])
     for name, history in result.losses.items():
         losses.semilogy(*np.array(history).T, label=name)
-    losses.set(xlabel="batch", ylabel="loss", title=f"{system.name}, {artifact.training['method']}")
+    losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {artifact.training['method']}")
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
     if result.forward is None:
