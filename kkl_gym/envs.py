@@ -1,6 +1,7 @@
 """Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -10,6 +11,7 @@ import numpy as np
 from kkl_gym.simulate import advance, check_dt
 from kkl_gym.systems import System, get_system
 
+TRAIL = 1000  # samples that a rendered phase portrait shows
 NOISE_BLOCK = 64  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
 
@@ -96,7 +98,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self._nu,), np.float32)
         self._noise: list[tuple[list[float], list[float]]] = []
         self._x: tuple[float, ...] | None = None
-        self._trail: list[tuple[float, ...]] = []
+        self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Any = None
 
     def reset(
@@ -122,7 +124,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._x = tuple(start.tolist())
         self._y = self._measure(self._next_noise()[1])
         self._u = [0.0] * self._nu
-        self._trail = [self._x]
+        self._trail.clear()
+        self._trail.append(self._x)
         return self._observation(), {"y": np.array(self._y), "x": np.array(self._x)}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

@@ -1,12 +1,11 @@
 """The phase portrait that ``render_mode="rgb_array"`` shows."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from kkl_gym.systems import System
-
-TRAIL = 1000  # samples shown
 
 
 class Canvas:
@@ -35,9 +34,9 @@ class Canvas:
         (self._head,) = ax.plot([], [], "o", color="C0", label="state")
         ax.legend(loc="upper right")
 
-    def draw(self, trail: list[tuple[float, ...]]) -> np.ndarray:
-        """The last samples of ``trail`` (states) as an RGB image, uint8, shape (height, width, 3)."""
-        points = np.array(trail[-TRAIL:])[:, self._axes]
+    def draw(self, trail: Iterable[tuple[float, ...]]) -> np.ndarray:
+        """The states of ``trail`` as an RGB image, uint8, shape (height, width, 3)."""
+        points = np.array(list(trail))[:, self._axes]
         self._line.set_data(*points.T)
         self._head.set_data(*points[-1:].T)
         self._canvas.draw()

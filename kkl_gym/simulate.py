@@ -14,7 +14,7 @@ import numpy as np
 from kkl_gym.systems import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
-# motion's size from anywhere in twice its training box (tests/test_simulate.py); it is a third of that.
+# motion's size from anywhere in twice its training box (tests/test_simulate.py); it is half of that.
 RATE_STEP = 0.4
 MAX_SUBSTEPS = 1024
 

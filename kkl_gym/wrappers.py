@@ -1,5 +1,6 @@
 """Wrappers: a learned observer inside the environment, and an agent that acts more slowly than it samples."""
 
+import os
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -36,11 +37,12 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        observer: str | None = None,
+        observer: str | os.PathLike[str] | None = None,
         estimate: Literal["x", "z"] = "x",
         measurement_noise: float | None = None,
         ignore_input: bool = False,
     ) -> None:
+        observer = None if observer is None else os.fspath(observer)
         RecordConstructorArgs.__init__(
             self,
             observer=observer,
@@ -105,7 +107,7 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], repeat: int) -> None:
         RecordConstructorArgs.__init__(self, repeat=repeat)
         gym.Wrapper.__init__(self, env)
-        if not isinstance(repeat, int) or repeat < 1:
+        if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
             raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
         self.repeat = repeat
 

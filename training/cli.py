@@ -147,7 +147,9 @@ class Evaluate:
                     system, artifact.filter.dt, self.trajectories, self.duration, self.seed, domain, driven
                 )
                 for level in self.noise:
-                    found = errors(artifact, system, runs, level, self.seed, skip=min(5.0, self.duration / 2) if driven else None)
+                    found = errors(
+                        artifact, system, runs, level, self.seed, skip=min(5.0, self.duration / 2) if driven else None
+                    )
                     table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
                     lines += [
                         f'{name},"{label}",{level:g},{i},{full:.6g},{late:.6g}'

@@ -84,7 +84,7 @@ def optimise(
             total.zero_()
             history.append((step + 1, mean))
             for name, value in terms.items():
-                writer.add_scalar(f"{stage.name}/{name}", float(value), step + 1)
+                writer.add_scalar(f"{stage.name}/{name}", float(value.detach()), step + 1)
             progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
             if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
                 progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, error {mean:.3g}")
