@@ -115,6 +115,7 @@ class Artifact:
     system : name of the system.
     parameters : its physical parameters.
     forward : T, where one was learned.
+    C : (ny, nx) where the output is linear, h(x) = C x: what coasting needs.
     training : how it was made: method, preset, configuration, seed, measures.
     versions : of the libraries that made it.
     """
@@ -124,6 +125,7 @@ class Artifact:
     system: str
     parameters: Mapping[str, float]
     forward: ForwardMap | None = None
+    C: np.ndarray | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -133,6 +135,8 @@ class Artifact:
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
                 f"a filter of {self.filter.size} values and {self.filter.nu} inputs"
             )
+        if self.C is not None and self.C.shape != (self.ny, self.nx):
+            raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
 
     @property
     def nx(self) -> int:
@@ -171,6 +175,8 @@ class Artifact:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the artifact; the file appears whole or not at all."""
         tensors: dict[str, np.ndarray] = {"A": self.filter.A, "B": self.filter.B}
+        if self.C is not None:
+            tensors["C"] = np.ascontiguousarray(self.C, dtype=float)
         _put_mlp(tensors, "inverse", self.inverse.mlp)
         for name in ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale"):
             tensors[f"inverse.{name}"] = np.ascontiguousarray(getattr(self.inverse, name), dtype=float)
@@ -255,6 +261,7 @@ class Artifact:
             system=meta["system"]["name"],
             parameters=meta["system"]["parameters"],
             forward=forward,
+            C=tensors.get("C"),
             training=meta["training"],
             versions=meta["versions"],
         )

@@ -72,8 +72,9 @@ class KKLObserver:
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the sample y, (..., ny), that followed the input u, (..., nu); returns the estimate, (..., nx).
 
-        Without a sample (``y=None``) the observer coasts: the filter takes the output as unchanged since the
-        last one. ``u=None`` is zero.
+        Without a sample (``y=None``) the observer coasts on its own prediction of the output, C x_hat, which makes
+        z' = A z + B C T_inv(z) a model of the system; where the output is not linear (the artifact holds no C) it
+        takes the last sample as still valid. ``u=None`` is zero.
 
         Raises ValueError on a wrong shape, NaN or infinity, or a nonzero input that the map does not know of;
         the observer is then as it was. Raises RuntimeError before :meth:`reset`.
@@ -81,15 +82,25 @@ class KKLObserver:
         if self._z is None:
             raise RuntimeError("call reset(y0) before step(y)")
         batch = self._z.shape[:-1]
+        u = self._input(u, batch)
         if y is None:
-            y = self._y
+            y = self._predicted_output(self._z, u)
         else:
             y = np.array(y, dtype=float)
             self._check_output(y, batch)
-        self._z = self.artifact.filter.advance(self._z, self._y, self._input(u, batch), y)
+        self._z = self.artifact.filter.advance(self._z, self._y, u, y)
         self._y = y
         self._age += 1
         return self._invert(self._z, self._age * self.artifact.filter.dt)
+
+    def _predicted_output(self, z: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """The next output by the observer's own estimate: predicted as it is now, corrected once."""
+        C, linear = self.artifact.C, self.artifact.filter
+        if C is None:
+            return self._y
+        y = self._invert(z, self._age * linear.dt) @ C.T
+        z_next = linear.advance(z, self._y, u, y)
+        return np.asarray(self._invert(z_next, (self._age + 1) * linear.dt) @ C.T)
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimates for a whole record, the same as :meth:`reset` and :meth:`step` would give row by row.

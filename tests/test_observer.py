@@ -116,7 +116,7 @@ def test_reset_forgets(make_artifact):
     assert np.array_equal(step_by_step(observer, y, u), first)
 
 
-def test_a_missing_sample_holds_the_last(make_artifact):
+def test_a_missing_sample_holds_the_last_where_the_output_is_not_linear(make_artifact):
     coasting, told = KKLObserver(make_artifact()), KKLObserver(make_artifact())
     y, u = record(told, 4)
     step_by_step(coasting, y, u)

@@ -4,6 +4,7 @@ import pytest
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
+from training.data import output
 from training.evaluate import errors, unseen_runs
 
 # Medians of the paper's SMAPE over all steps, in percent, over 100 unseen runs of 50 s from X, that the default maps
@@ -50,6 +51,21 @@ def test_spinn_maps_recover_states_from_their_own_forward_map(name):
     modes = (artifact.forward(x) - artifact.inverse.z_offset) @ artifact.inverse.whiten.T
     x_hat = artifact.inverse.x_offset + artifact.inverse.x_scale * artifact.inverse.mlp(modes)
     assert np.median(np.linalg.norm(x_hat - x, axis=1) / np.linalg.norm(x, axis=1)) < 0.1
+
+
+@pytest.mark.parametrize(("name", "seconds", "error"), [("van_der_pol", 1.0, 0.02), ("lorenz", 0.3, 0.02)])
+def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
+    system, observer = get_system(name), observers.load(name, measurement_noise=0.0)
+    runs = unseen_runs(system, 0.01, 20, 15.0, seed=0)
+    y = output(system, runs.x)
+    lost = round(seconds / 0.01)
+    x_hat = observer.reset(y[0])
+    for k in range(1, 1501 - lost):
+        x_hat = observer.step(y[k])
+    for _ in range(lost):
+        x_hat = observer.step(None)
+    relative = np.linalg.norm(x_hat - runs.x[-1], axis=-1) / np.linalg.norm(runs.x[-1], axis=-1)
+    assert np.median(relative) < error
 
 
 def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():

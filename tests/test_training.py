@@ -20,6 +20,7 @@ from training.forward import ForwardProblem, on_tensors, truncation_time
 from training.inverse import TrajectorySampler, coordinates
 from training.networks import Network
 from training.noise import noise_covariance, root, stationary_covariance
+from training.pipeline import output_matrix
 from training.signals import random_inputs
 
 CPU = torch.device("cpu")
@@ -313,6 +314,18 @@ def test_artifact_of_a_run_records_what_made_it(tmp_path):
     assert json.loads((tmp_path / "config.json").read_text())["forward_steps"] == 200
     x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
     np.testing.assert_allclose(read.forward(x), artifact.forward(x))
+
+
+def test_output_matrix_of_linear_and_other_outputs():
+    @dataclass(frozen=True)
+    class Squared(Oscillator):
+        name: ClassVar[str] = "squared"
+
+        def h(self, x):
+            return (x[0] * x[0],)
+
+    np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
+    assert output_matrix(Squared()) is None
 
 
 def test_two_outputs_train_and_run(tmp_path):

@@ -19,7 +19,7 @@ from torch.utils.tensorboard import SummaryWriter
 from kkl_gym.systems import System
 from observers import Artifact, LinearFilter
 from training.config import Config
-from training.data import record, recording_ages
+from training.data import output, record, recording_ages
 from training.forward import ForwardProblem, truncation_time
 from training.inverse import ForwardMapSampler, InverseProblem, TrajectorySampler
 from training.networks import Network
@@ -119,6 +119,7 @@ def train(
         system=system.name,
         parameters=system.parameters,
         forward=forward.forward_map() if forward else None,
+        C=output_matrix(system),
         training={
             **dataclasses.asdict(config),
             "seconds": round(time.monotonic() - started),
@@ -130,6 +131,13 @@ def train(
         | {"python": platform.python_version()},
     )
     return Result(artifact, losses, forward)
+
+
+def output_matrix(system: System) -> np.ndarray | None:
+    """C if the output is h(x) = C x, else None."""
+    C = output(system, np.eye(system.nx)).T
+    x = np.random.default_rng(0).uniform(*system.box(), (100, system.nx))
+    return C if np.allclose(output(system, x), x @ C.T, rtol=1e-9, atol=1e-12) else None
 
 
 def make_filter(eigenvalues: tuple[float, ...], ny: int, dt: float, nu: int) -> LinearFilter:

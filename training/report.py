@@ -15,7 +15,9 @@ from training.pipeline import Result
 
 
 def write_report(path: Path, result: Result, system: System, seed: int = 0) -> None:
-    """Errors in training, PDE residual over the domain (or error by noise level, where no T was learned), estimate against truth.
+    """Errors in training, PDE residual over the domain, estimate against truth.
+
+    Where no T was learned, the error by noise level takes the place of the residual.
 
     The trajectories shown are training's own kind, from ``seed``, without input.
     """
