@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 
-.PHONY: demo test test-slow lint format maps speed clean
+.PHONY: demo test test-slow lint format maps results speed clean
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -24,10 +24,15 @@ format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The commands that made the shipped maps, version 1. About an hour on two cores.
+# The commands that made the shipped maps, version 1: about an hour on two cores, into runs/; resumable.
 maps: $(VENV)/ready
 	for system in $(SYSTEMS); do for method in input-aware spinn; do \
-		$(BIN)/kkl-gym train $$system --method $$method || exit 1; done; done
+		$(BIN)/kkl-gym train $$system --method $$method --resume || exit 1; done; done
+
+# The figures in the README and in docs/.
+results: $(VENV)/ready
+	$(BIN)/kkl-gym demo --out docs/figures
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
 
 speed: $(VENV)/ready  ## single environments against Pendulum-v1
 	$(BIN)/kkl-gym speed

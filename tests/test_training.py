@@ -293,8 +293,10 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
     assert resumed.losses["inverse"][-1][0] == 400
-    with pytest.raises(ValueError, match="another configuration"):
+    with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
         train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
+    with pytest.raises(ValueError, match="--resume"):
+        train(system, config, tmp_path / "cut")
     checkpoint = tmp_path / "cut" / "inverse.checkpoint.safetensors"
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):

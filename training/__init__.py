@@ -1,8 +1,13 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
-from training.config import Config, preset
-from training.evaluate import errors, unseen_runs
-from training.metrics import smape
-from training.pipeline import Result, train
+try:
+    from training.config import Config, preset
+    from training.evaluate import errors, unseen_runs
+    from training.metrics import smape
+    from training.pipeline import Result, train
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f'{error}: training and the kkl-gym command need pip install "kkl-gym[train]"', name=error.name
+    ) from None
 
 __all__ = ["Config", "Result", "errors", "preset", "smape", "train", "unseen_runs"]

@@ -165,21 +165,16 @@ class Maps:
 
     def run(self, console: Console) -> None:
         """Print the list."""
-        table = Table("name", "file", "system", "method", "inputs", "modes", "noise up to", "MB")
-        for name, full in shipped().items():
-            if name == full:
-                continue
-            path = resolve(full)
+        table = Table("name", "method", "inputs", "modes", "noise up to", "MB")
+        for name in shipped():
+            path = resolve(name)
             artifact = Artifact.read(path)
-            knows_noise = "measurement_noise" in artifact.inverse.features
             table.add_row(
                 name,
-                path.name,
-                artifact.system,
                 str(artifact.training.get("method")),
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
-                f"{artifact.inverse.noise_max:g}" if knows_noise else "not told",
+                f"{artifact.inverse.noise_max:g}" if "measurement_noise" in artifact.inverse.features else "not told",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
         console.print(table)

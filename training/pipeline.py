@@ -53,13 +53,14 @@ def train(
     system : any system.
     config : how.
     folder : where checkpoints and TensorBoard scalars go; created if missing.
-    resume : go on from the checkpoints in ``folder``; without it they are ignored and overwritten.
+    resume : go on from the checkpoints in ``folder`` if there are any; without it they are an error.
     device : of the networks; None takes a GPU if there is one.
     console : for the progress bars; None prints none.
 
     Raises
     ------
-    ValueError : if the checkpoints belong to another configuration, or the system's trajectories leave its bounds.
+    ValueError : if there are checkpoints, but not ``resume`` or not of this configuration, or if the system's
+        trajectories leave its bounds.
     FloatingPointError : if the loss stops being a number.
     """
     if config.method == "spinn" and not system.ny:
@@ -69,7 +70,7 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     identity = json.dumps([system.name, system.parameters, dataclasses.asdict(config)], sort_keys=True)
     fingerprint = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    (folder / "config.json").write_text(json.dumps(dataclasses.asdict(config), indent=2) + "\n")
+    _claim(folder, {"system": system.name, "parameters": system.parameters, **dataclasses.asdict(config)}, resume)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng([TRAINING_SEED, config.seed])
 
@@ -131,6 +132,26 @@ def train(
         | {"python": platform.python_version()},
     )
     return Result(artifact, losses, forward)
+
+
+def _claim(folder: Path, described: dict[str, Any], resume: bool) -> None:
+    """Write the run's configuration, unless the folder holds a run that this one would spoil."""
+    file = folder / "config.json"
+    described = json.loads(json.dumps(described))
+    if any(folder.glob("*.checkpoint.safetensors")) and file.exists():
+        if not resume:
+            raise ValueError(
+                f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, "
+                "or take another folder (--out)"
+            )
+        before = json.loads(file.read_text())
+        changed = [name for name in sorted({*before, *described}) if before.get(name) != described.get(name)]
+        if changed:
+            differences = ", ".join(
+                f"{name} = {before.get(name)} there, {described.get(name)} here" for name in changed
+            )
+            raise ValueError(f"{folder} holds a run of another configuration: {differences}")
+    file.write_text(json.dumps(described, indent=2) + "\n")
 
 
 def output_matrix(system: System) -> np.ndarray | None:
