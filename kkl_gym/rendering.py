@@ -9,7 +9,7 @@ from kkl_gym.systems import System
 
 
 class Canvas:
-    """A phase portrait of a system's first and last state, with a target and a fading trail.
+    """A phase portrait of a system's first and last state, with its target and its trail.
 
     Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not installed.
     """
