@@ -95,11 +95,12 @@ def test_signals_are_bounded_and_of_three_kinds():
 
 
 def test_recording_ages_cover_start_transient_and_end():
-    ages = recording_ages(5000, 200)
+    ages = recording_ages(0, 5000, 200)
     assert ages[0] == 0
     assert ages[-1] == 5000
     assert (np.diff(ages) > 0).all()
     assert (ages < 50).sum() > 20
+    np.testing.assert_array_equal(recording_ages(1000, 5000, 5001), np.arange(1000, 5001))
 
 
 def test_recorded_filter_states_are_those_of_the_observer_at_run_time():
@@ -171,7 +172,7 @@ def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
 def test_batches_hold_the_noise_that_they_say():
     system = VanDerPol()
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    data = record(system, linear, 50, 500, recording_ages(500, 40), np.random.default_rng(0))
+    data = record(system, linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0))
     sampler = TrajectorySampler(data, linear, 1.0, 4096, CPU)
     inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
     assert inputs.shape == (4096, len(sampler.coordinates.noise_gain) + 2)

@@ -28,7 +28,7 @@ class Config:
     duration: float = 50.0
     """Their length in seconds."""
     samples: int = 200
-    """Points recorded along each trajectory (spinn: before truncation)."""
+    """Points recorded along each trajectory (spinn: after t*)."""
     width: int = 128
     """Neurons in each hidden layer."""
     depth: int = 3
@@ -60,9 +60,11 @@ class Config:
         for name in ("dt", "duration", "learning_rate", "noise_max", "truncation"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
-        for name in ("trajectories", "samples", "width", "depth", "inverse_steps"):
+        for name in ("trajectories", "width", "depth", "inverse_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
+        if self.samples < 2:
+            raise ValueError(f"samples must be at least 2, got {self.samples}")
         if self.batch < 64:
             raise ValueError(f"batch must be at least 64, got {self.batch}")
         if (self.method == "spinn") != (self.forward_steps > 0):
@@ -103,9 +105,16 @@ def preset(system: System, method: Method, name: Preset) -> Config:
         if name == "paper":
             return paper
         return replace(
-            paper, samples=500, width=128, depth=3, batch=2048, forward_steps=8000, inverse_steps=8000,
-            learning_rate=2e-3, physics_weight=1.0,
-        )  # fmt: skip
+            paper,
+            samples=500,
+            width=128,
+            depth=3,
+            activation="tanh",
+            batch=2048,
+            forward_steps=8000,
+            inverse_steps=6000,
+            learning_rate=5e-3,
+        )
     fast = Config(
         method="input-aware",
         eigenvalues=spectrum(system),

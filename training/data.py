@@ -32,11 +32,16 @@ def output(system: System, x: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(yi, x.shape[:-1]) for yi in system.h(np.moveaxis(x, -1, 0))], axis=-1)
 
 
-def recording_ages(steps: int, n: int) -> np.ndarray:
-    """About n ages: half of them even in the logarithm, to catch the transient, half even in time."""
+def recording_ages(first: int, steps: int, n: int) -> np.ndarray:
+    """At most n ages from ``first`` to ``steps``, even in time; from 0, half of them even in the logarithm instead.
+
+    Those catch the transient.
+    """
+    if first > 0:
+        return np.unique(np.linspace(first, steps, n).round()).astype(int)
     early = np.geomspace(1, steps, n // 2).round()
     late = np.linspace(0, steps, n - n // 2).round()
-    return np.unique(np.concatenate([[0], early, late])).astype(int)
+    return np.unique(np.concatenate([early, late])).astype(int)
 
 
 def record(

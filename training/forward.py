@@ -90,6 +90,13 @@ class ForwardProblem(nn.Module):
         z: torch.Tensor = self._zo + self._zs * self.network((x - self._xo) / self._xs)
         return z
 
+    @torch.no_grad()
+    def error(self, n: int = 100_000) -> np.ndarray:
+        """z - T(x) on up to n of the data pairs, (n, nz)."""
+        rows = np.random.default_rng(0).permutation(len(self._x))[:n]
+        difference = self._zs * (self._z[rows] - self.network(self._x[rows]))
+        return np.asarray(difference.cpu().numpy(), dtype=float)
+
     def forward_map(self) -> ForwardMap:
         """The learned map for NumPy."""
         return ForwardMap(self.network.export(), self.x_offset, self.x_scale, self.z_offset, self.z_scale)

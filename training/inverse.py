@@ -150,13 +150,25 @@ class TrajectorySampler:
 
 
 class ForwardMapSampler:
-    """The paper's second data set S_2: x' uniform in the training box, z' = T(x') by the learned map (sec. 5.2)."""
+    """The paper's second data set S_2: x' uniform in the training box, z' = T(x') by the learned map (sec. 5.2).
+
+    The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
+    Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
+    error, measured on the forward map's own data, and each coordinate is shrunk to its linear conditional mean.
+
+    Parameters
+    ----------
+    forward : T on tensors, (n, nx) to (n, nz).
+    error : samples of z - T(x), (n, nz).
+    box : low and high corner of the training box.
+    """
 
     cells = 1
 
     def __init__(
         self,
         forward: Callable[[torch.Tensor], torch.Tensor],
+        error: np.ndarray,
         box: tuple[np.ndarray, np.ndarray],
         batch: int,
         device: torch.device,
@@ -166,12 +178,12 @@ class ForwardMapSampler:
         self._forward, self._batch = forward, batch
         x = self._draw(torch.Generator(device).manual_seed(0), 100_000)
         z = forward(x).cpu().numpy().astype(float)
-        self.coordinates = coordinates(z, np.zeros((z.shape[1], z.shape[1])))
+        self.coordinates = coordinates(z, error.T @ error / len(error))
         self.x_offset, self.x_scale = (low + high) / 2, (high - low) / 2
         self._offset, self._scale = tensor(self.x_offset, device), tensor(self.x_scale, device)
-        # z' is evaluated in float64: its small modes lie below the rounding of float32.
         self._z_offset = torch.as_tensor(self.coordinates.offset, device=device)
         self._whiten = torch.as_tensor(self.coordinates.whiten, device=device)
+        self._blur = tensor(self.coordinates.noise_gain, device)
 
     def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
         return self._low + self._span * torch.rand((n, len(self._low)), generator=generator, device=generator.device)
@@ -180,17 +192,20 @@ class ForwardMapSampler:
         """One batch."""
         x = self._draw(generator, self._batch)
         modes = ((self._forward(x).double() - self._z_offset) @ self._whiten.T).float()
+        modes = modes + self._blur * torch.randn(modes.shape, generator=generator, device=x.device)
+        modes = modes / (1.0 + self._blur**2)
         ones = torch.ones(len(x), device=x.device)
         return modes, (x - self._offset) / self._scale, ones, torch.zeros(len(x), dtype=torch.long, device=x.device)
 
     def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
         """The map that a network trained on these batches makes: the paper's, of z alone."""
+        found = self.coordinates
         return InverseMap(
             mlp=network.export(),
             features=("z_y",),
-            z_offset=self.coordinates.offset,
-            whiten=self.coordinates.whiten,
-            noise_gain=self.coordinates.noise_gain,
+            z_offset=found.offset,
+            whiten=found.whiten / (1.0 + found.noise_gain**2)[:, None],
+            noise_gain=np.zeros(len(found.noise_gain)),
             x_offset=self.x_offset,
             x_scale=self.x_scale,
         )

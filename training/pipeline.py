@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import math
 import platform
 import time
 from dataclasses import dataclass
@@ -88,8 +89,9 @@ def train(
             stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed)
             losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)
 
+        first = 0 if config.method == "input-aware" else truncation_step(system, linear, steps, config.truncation)
+        ages = recording_ages(first, steps, config.samples)
         task = progress.add_task(f"simulating {system.name}", total=config.trajectories)
-        ages = recording_ages(steps, config.samples)
         data = record(
             system, linear, config.trajectories, steps, ages, rng, lambda done: progress.update(task, completed=done)
         )
@@ -98,18 +100,11 @@ def train(
         if config.method == "input-aware":
             sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
         else:
-            z0 = float(np.linalg.norm(data.z[0], axis=-1).max())
-            kept = ages * config.dt >= truncation_time(linear, z0, config.truncation)
-            if not kept.any():
-                raise ValueError(
-                    f"trajectories of {config.duration:g} s end before the filter has forgotten its start, "
-                    f"t* = {truncation_time(linear, z0, config.truncation):.3g} s; make them longer"
-                )
-            x, z = data.x[kept].reshape(-1, system.nx), data.z[kept].reshape(-1, linear.size)
+            x, z = data.x.reshape(-1, system.nx), data.z.reshape(-1, linear.size)
             network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
             forward = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
             run("forward", forward, config.forward_steps)
-            sampler = ForwardMapSampler(forward.T, system.box(), config.batch, device)
+            sampler = ForwardMapSampler(forward.T, forward.error(), system.box(), config.batch, device)
         inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
         inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
         run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)
@@ -152,6 +147,19 @@ def _claim(folder: Path, described: dict[str, Any], resume: bool) -> None:
             )
             raise ValueError(f"{folder} holds a run of another configuration: {differences}")
     file.write_text(json.dumps(described, indent=2) + "\n")
+
+
+def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:
+    """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
+    x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
+    z0 = float(np.linalg.norm(linear.start(output(system, x0)), axis=-1).max())
+    t = truncation_time(linear, z0, epsilon)
+    if t >= steps * linear.dt:
+        raise ValueError(
+            f"trajectories of {steps * linear.dt:g} s end before the filter has forgotten its start, t* = {t:.3g} s; "
+            "make them longer"
+        )
+    return math.ceil(t / linear.dt)
 
 
 def output_matrix(system: System) -> np.ndarray | None:
