@@ -55,7 +55,7 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
     system = Pendulum()
     sizes = {"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 20.0, "noise_max": 0.5}
     config = override(preset(system, "input-aware", "fast"), sizes)
-    artifact = train(system, config, out, console=Console()).artifact
+    artifact = train(system, config, out, resume=True, console=Console()).artifact
     path = out / "pendulum.safetensors"
     artifact.save(path)
 

@@ -3,7 +3,8 @@
 import gymnasium as gym
 
 from kkl_gym.envs import KKLEnv
-from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
+from kkl_gym.system import System
+from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.wrappers import ActionRepeat, KKLObservation
 
 __version__ = "0.1.0"

@@ -3,13 +3,15 @@
 import math
 from collections import deque
 from collections.abc import Mapping
+from numbers import Real
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from kkl_gym.simulate import advance, check_dt
-from kkl_gym.systems import System, get_system
+from kkl_gym.system import System
+from kkl_gym.systems import get_system
 
 TRAIL = 1000  # samples that a rendered phase portrait shows
 NOISE_BLOCK = 64  # noise is drawn for so many samples at once, because single draws cost more than the simulation
@@ -32,7 +34,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     deviations of the noise).
 
     **Info.** ``y`` the noisy output, ``x`` the true state and, after a step, ``u`` the physical input that acted;
-    float64, never clipped.
+    float64, never clipped. ``sample`` counts the sampling intervals since reset.
 
     **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
 
@@ -74,7 +76,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         check_dt(dt)
         process_noise = self.system.process_noise if process_noise is None else process_noise
         for name, level in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
-            if not 0 <= level < math.inf:
+            if isinstance(level, bool) or not isinstance(level, Real) or not 0 <= level < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {level!r}")
         if observe not in ("state", "output"):
             raise ValueError(f'observe must be "state" or "output", got {observe!r}')
@@ -123,23 +125,30 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             start = self.np_random.uniform(*self.system.box())
         self._x = tuple(start.tolist())
         self._y = self._measure(self._next_noise()[1])
-        self._u = [0.0] * self._nu
+        self._sample = 0
         self._trail.clear()
         self._trail.append(self._x)
-        return self._observation(), {"y": np.array(self._y), "x": np.array(self._x)}
+        return self._observation(), {"y": np.array(self._y), "x": np.array(self._x), "sample": 0}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold the input over one sampling interval; raises ValueError on an action of wrong shape or with NaN."""
         if self._x is None:
             raise gym.error.ResetNeeded("call reset() before step()")
-        self._u = self._input(action)
+        u = self._input(action)
         w, v = self._next_noise()
-        x = advance(self.system, self._x, self._u, w, self.dt)
+        x = advance(self.system, self._x, u, w, self.dt)
         escaped = not self._inside(x)
         if not escaped:
             self._x = tuple(x)
             self._y = self._measure(v)
-        info = {"y": np.array(self._y), "x": np.array(self._x), "u": np.array(self._u), "escaped": escaped}
+        self._sample += 1
+        info = {
+            "y": np.array(self._y),
+            "x": np.array(self._x),
+            "u": np.array(u),
+            "sample": self._sample,
+            "escaped": escaped,
+        }
         if self.render_mode is not None:
             self._trail.append(self._x)
         cost = 0.0

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.systems import System
+from kkl_gym.system import System
 
 
 class Canvas:
@@ -25,9 +25,9 @@ class Canvas:
         self._canvas: Any = FigureCanvasAgg(figure)
         ax = figure.add_subplot()
         names = [system.state_names[i] for i in self._axes]
-        (low, high), (bottom, top) = ((1.5 * np.array(system.X[i])).tolist() for i in self._axes)
-        pad_x, pad_y = 0.05 * (high - low), 0.05 * (top - bottom)
-        ax.set(xlim=(low - pad_x, high + pad_x), ylim=(bottom - pad_y, top + pad_y), xlabel=names[0], ylabel=names[1])
+        (left, right), (bottom, top) = (system.X[i] for i in self._axes)
+        wide, tall = 0.3 * (right - left), 0.3 * (top - bottom)  # driven or not, motions leave the training box
+        ax.set(xlim=(left - wide, right + wide), ylim=(bottom - tall, top + tall), xlabel=names[0], ylabel=names[1])
         ax.set_title(system.name.replace("_", " "))
         ax.plot(*(system.target[i] for i in self._axes), "+", color="C2", markersize=12, label="target")
         (self._line,) = ax.plot([], [], color="0.4", lw=1.0)

@@ -7,11 +7,12 @@ the same order, so that both give the same numbers.
 import functools
 import math
 from collections.abc import Callable, Iterable
+from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from kkl_gym.systems import Components, System
+from kkl_gym.system import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
 # motion's size from anywhere in twice its training box (tests/test_simulate.py); it is half of that.
@@ -194,5 +195,5 @@ def simulate(
 
 def check_dt(dt: float) -> None:
     """Raise ValueError unless ``dt`` is a positive, finite number of seconds."""
-    if not (isinstance(dt, int | float | np.floating) and 0 < dt < math.inf):
+    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
         raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")

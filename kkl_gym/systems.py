@@ -1,139 +1,20 @@
-"""Nonlinear systems x' = f(x) + g(x) u + w with a measured output y = h(x) + v.
-
-Every equation is written once, on components, in plain arithmetic. The same method therefore takes Python
-floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) and sympy symbols (formulas).
-"""
+"""The four benchmark systems, and finding a system by its name."""
 
 # ruff: noqa: D102 - what each system overrides is documented on System
 
+import contextlib
+import hashlib
 import importlib
 import importlib.util
 import inspect
 import math
 import sys
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
-Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
-Box = tuple[tuple[float, float], ...]  # (low, high) of each component
-
-
-@dataclass(frozen=True)
-class System:
-    """A system; its physical parameters are the fields of a frozen dataclass, all of them floats.
-
-    A subclass is decorated with ``@dataclass(frozen=True)``, sets the class variables below and defines
-    :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one.
-
-    Class variables
-    ---------------
-    name : identifies the system in artifacts and error messages.
-    state_names : names of the states with their units, for plots and documentation.
-    X : training box, (low, high) of each state: where starts are drawn and observers are trained.
-    bounds : declared bounds, (low, high) of each state: an episode ends where the state leaves them.
-    u_max : bound of each input; the default, none, makes an autonomous system.
-    G : constant input matrix, ``nx`` rows of ``nu`` numbers; override :meth:`g` where it depends on the state.
-    scale : typical size of each state, for the reward and the process noise; default: the training box's half-width.
-    process_noise : default bound of the process noise as a multiple of ``scale`` per second.
-    """
-
-    name: ClassVar[str]
-    state_names: ClassVar[tuple[str, ...]] = ()
-    X: ClassVar[Box]
-    bounds: ClassVar[Box]
-    u_max: ClassVar[tuple[float, ...]] = ()
-    G: ClassVar[tuple[tuple[float, ...], ...]] = ()
-    scale: ClassVar[tuple[float, ...]] = ()
-    process_noise: ClassVar[float] = 0.05
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if not hasattr(cls, "X") or not hasattr(cls, "bounds") or not hasattr(cls, "name"):
-            raise TypeError(f"{cls.__name__} must set the class variables name, X and bounds")
-        nx, nu = len(cls.X), len(cls.u_max)
-        if len(cls.bounds) != nx:
-            raise TypeError(f"{cls.__name__}: X has {nx} states and bounds has {len(cls.bounds)}")
-        for (low, high), (lower, upper) in zip(cls.X, cls.bounds, strict=True):
-            if not (math.isfinite(lower) and math.isfinite(upper) and lower <= low < high <= upper):
-                raise TypeError(f"{cls.__name__}: X = {cls.X} must lie within finite bounds = {cls.bounds}")
-        if any(not 0 < u < math.inf for u in cls.u_max):
-            raise TypeError(f"{cls.__name__}: u_max = {cls.u_max} must be positive and finite")
-        if cls.g is System.g and nu and (len(cls.G) != nx or any(len(row) != nu for row in cls.G)):
-            raise TypeError(f"{cls.__name__}: G = {cls.G} must have {nx} rows of {nu} numbers, or override g(x)")
-        cls.scale = cls.scale or tuple((high - low) / 2 for low, high in cls.X)
-        cls.state_names = cls.state_names or tuple(f"x{i + 1}" for i in range(nx))
-
-    def __post_init__(self) -> None:
-        for name, value in self.parameters.items():
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {value!r}")
-            object.__setattr__(self, name, float(value))
-
-    @property
-    def nx(self) -> int:
-        """Number of states."""
-        return len(self.X)
-
-    @property
-    def nu(self) -> int:
-        """Number of inputs."""
-        return len(self.u_max)
-
-    @property
-    def ny(self) -> int:
-        """Number of outputs."""
-        return len(self.h([0.0] * self.nx))
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The physical parameters by name."""
-        return asdict(self)
-
-    @property
-    def target(self) -> tuple[float, ...]:
-        """The equilibrium that a controller should hold, shape (nx,); default: the origin."""
-        return (0.0,) * self.nx
-
-    def f(self, x: Components) -> Components:
-        """Drift: ``nx`` components of the state in, ``nx`` components of f(x) out."""
-        raise NotImplementedError(f"{type(self).__name__} does not define f")
-
-    def g(self, x: Components) -> Sequence[Components]:
-        """Input matrix g(x): ``nx`` rows of ``nu`` entries; default: the constant ``G``."""
-        return self.G or ((),) * self.nx
-
-    def h(self, x: Components) -> Components:
-        """Output map: ``ny`` components of h(x)."""
-        raise NotImplementedError(f"{type(self).__name__} does not define h")
-
-    def rate(self, x: Components) -> Any:
-        """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
-
-        The default differentiates f numerically; override it with a formula where single steps must be fast.
-        """
-        fx, eps = self.f(x), 1e-6
-        total = 0.0
-        for j in range(self.nx):
-            moved = [*x[:j], x[j] + eps, *x[j + 1 :]]
-            total = total + sum(((b - a) / eps) ** 2 for a, b in zip(fx, self.f(moved), strict=True))
-        return total**0.5
-
-    def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high corner, each (nx,), of the training box multiplied by ``factor``."""
-        low, high = np.array(self.X).T * factor
-        return low, high
-
-    def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed; raises ValueError on an unknown name."""
-        known = self.parameters
-        for name in parameters:
-            if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
-        return type(self)(**{**known, **parameters})
+from kkl_gym.system import Box, Components, System
 
 
 @dataclass(frozen=True)
@@ -307,7 +188,7 @@ def _find(name: str) -> type[System]:
         )
     try:
         found = getattr(_module(where), class_name)
-    except (ImportError, AttributeError, OSError) as error:
+    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
         raise ValueError(f"cannot load the system {name!r}: {error}") from error
     if not (inspect.isclass(found) and issubclass(found, System) and found is not System):
         raise ValueError(f"{name!r} is {found!r}, not a subclass of kkl_gym.System")
@@ -318,20 +199,34 @@ def _module(where: str) -> Any:
     if not where.endswith(".py"):
         if not where or where.startswith("."):
             raise ImportError(f"{where!r} is no absolute module name")
-        return importlib.import_module(where)
+        with _importing_from(Path.cwd()):
+            return importlib.import_module(where)
     path = Path(where).resolve()
-    key = f"kkl_gym user script {path}"
+    key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
     if key not in sys.modules:
         spec = importlib.util.spec_from_file_location(key, path)
         if spec is None or spec.loader is None or not path.is_file():
             raise ImportError(f"no file {where}")
-        sys.modules[key] = importlib.util.module_from_spec(spec)
+        module = importlib.util.module_from_spec(spec)
+        module.__dict__["__kkl_gym_script__"] = str(path)
+        sys.modules[key] = module
         try:
-            spec.loader.exec_module(sys.modules[key])
+            with _importing_from(path.parent):
+                spec.loader.exec_module(module)
         except BaseException:
             del sys.modules[key]
             raise
     return sys.modules[key]
+
+
+@contextlib.contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Let imports find modules beside the one imported, as python does for a script it runs."""
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
 
 
 __all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from kkl_gym.envs import KKLEnv
-from observers import KKLObserver, load
+from observers import KKLObserver, load, shipped
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -57,6 +57,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         if estimate not in ("x", "z"):
             raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
         system = base.system
+        if observer is None and system.name not in shipped():
+            raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         self.observer: KKLObserver = load(
             system.name if observer is None else observer,
             base.measurement_noise if measurement_noise is None else measurement_noise,
@@ -74,11 +76,18 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Reset the environment, and the observer to its first sample."""
         _, info = self.env.reset(seed=seed, options=options)
+        self._sample = info["sample"]
         return self._show(self.observer.reset(info["y"]), info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Step the environment, and the observer with the new sample and the input that led to it."""
         _, reward, terminated, truncated, info = self.env.step(action)
+        self._sample += 1
+        if info["sample"] != self._sample:
+            raise ValueError(
+                f"the observer was to see sample {self._sample} and was shown sample {info['sample']}: put wrappers "
+                "that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation"
+            )
         u = info["u"]
         if self._blind:
             if not self._ignore_input and u.any():

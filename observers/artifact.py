@@ -157,7 +157,10 @@ class Artifact:
         """Raise ArtifactError, naming both values, unless the observer was made for this system, dt and sizes."""
 
         def differ(what: str, here: Any, there: Any) -> None:
-            raise ArtifactError(f"the observer was made for {what} {here!r}, but the environment has {there!r}")
+            raise ArtifactError(
+                f"the observer was made for {what} {here!r}, but the environment has {there!r}; change the "
+                "environment, or train an observer for it (kkl-gym train) and pass its path"
+            )
 
         if self.system != system:
             differ("the system", self.system, system)

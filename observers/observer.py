@@ -8,6 +8,7 @@ import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, resolve
 
+_LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
@@ -157,7 +158,7 @@ class KKLObserver:
         if y.shape != (*batch, self.artifact.ny):
             raise ValueError(f"y must have shape {(*batch, self.artifact.ny)}, got {y.shape}")
         if not _finite(y):
-            raise ValueError("y holds NaN or infinity; a missing sample is step(None, u)")
+            raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
 
     def _input(self, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
         nu = self.artifact.nu
@@ -180,8 +181,8 @@ class KKLObserver:
 
 def _finite(values: np.ndarray) -> bool:
     if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
-        return all(map(math.isfinite, values.tolist()))
-    return bool(np.isfinite(values).all())
+        return all(-_LARGEST <= value <= _LARGEST for value in values.tolist())  # false for NaN too
+    return bool((np.abs(values) <= _LARGEST).all())
 
 
 def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5) -> KKLObserver:

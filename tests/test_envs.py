@@ -134,7 +134,7 @@ def test_any_start_and_any_actions(name, observe, data, seed):
     obs, info = env.reset(seed=seed, options={"x0": x0})
     assert info["x"].tolist() == list(x0)
     assert obs in env.observation_space
-    assert set(info) == {"y", "x"}
+    assert set(info) == {"y", "x", "sample"}
     for action in actions:
         obs, reward, terminated, truncated, info = env.step(np.array([action], np.float32))
         assert obs.dtype == np.float32
@@ -145,7 +145,7 @@ def test_any_start_and_any_actions(name, observe, data, seed):
         assert type(terminated) is bool
         assert truncated is False
         assert info["escaped"] is terminated
-        assert set(info) == {"y", "x", "u", "escaped"}
+        assert set(info) == {"y", "x", "u", "sample", "escaped"}
         for key, size in (("y", env.system.ny), ("x", env.system.nx), ("u", env.system.nu)):
             assert info[key].dtype == np.float64
             assert info[key].shape == (size,)

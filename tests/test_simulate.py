@@ -241,6 +241,8 @@ def test_number_of_substeps_is_limited():
     calls = []
 
     class Counting(ReverseDuffing):
+        name = "counting"
+
         def f(self, x):
             calls.append(x)
             return super().f(x)

@@ -17,7 +17,7 @@ from training.config import Config, override, spectrum
 from training.data import output, record, recording_ages, run_filter
 from training.evaluate import starts
 from training.forward import ForwardProblem, on_tensors, truncation_time
-from training.inverse import TrajectorySampler, coordinates
+from training.inverse import AGE_UNIT, NOISE_UNIT, TrajectorySampler, coordinates
 from training.networks import Network
 from training.noise import noise_covariance, root, stationary_covariance
 from training.pipeline import output_matrix
@@ -169,11 +169,15 @@ def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
     assert len(flat.noise_gain) == 1  # two modes hold nothing but rounding
 
 
-def test_batches_hold_the_noise_that_they_say():
-    system = VanDerPol()
+@pytest.fixture(scope="module")
+def sampler():
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    data = record(system, linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0))
-    sampler = TrajectorySampler(data, linear, 1.0, 4096, CPU)
+    data = record(VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0))
+    return TrajectorySampler(data, linear, 1.0, 4096, CPU), data, linear
+
+
+def test_batches_cover_quiet_and_loud(sampler):
+    sampler, _, _ = sampler
     inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
     assert inputs.shape == (4096, len(sampler.coordinates.noise_gain) + 2)
     assert x.shape == (4096, 2)
@@ -183,6 +187,45 @@ def test_batches_hold_the_noise_that_they_say():
     assert 0.15 < quiet.float().mean() < 0.25
     assert ((cell % 7 == 0) == quiet).all()
     assert cell.max() < sampler.cells
+
+
+def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypatch):
+    sampler, data, linear = sampler
+    monkeypatch.setattr(sampler, "QUIET", 0.0)
+    zeros, generator = torch.zeros_like(sampler._modes), torch.Generator().manual_seed(0)
+    monkeypatch.setattr(sampler, "_modes", zeros)  # what is left in the inputs is noise
+    gain = sampler.coordinates.noise_gain
+    whiten = sampler.coordinates.whiten
+    expected = whiten @ noise_covariance(linear, data.ages) @ whiten.T
+    sums, counts = np.zeros_like(expected), np.zeros(len(data.ages))
+    for _ in range(150):
+        inputs, _, _, _ = sampler(generator)
+        level = NOISE_UNIT * torch.expm1(inputs[:, -2:-1]).double().numpy()
+        age = AGE_UNIT * np.expm1(inputs[:, -1].double().numpy())
+        noise = inputs[:, :-2].double().numpy() * (1 + (level * gain) ** 2) / level
+        slot = np.abs(age[:, None] - data.ages * linear.dt).argmin(1)
+        np.add.at(sums, slot, noise[:, :, None] * noise[:, None, :])
+        np.add.at(counts, slot, 1)
+    measured = sums / counts[:, None, None]
+    size = np.sqrt(np.einsum("aii,ajj->aij", expected, expected))
+    loud = np.ix_(range(len(data.ages)), gain > 1e-3, gain > 1e-3)
+    assert np.abs((measured - expected)[loud] / size[loud]).max() < 0.1
+
+
+def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
+    sampler, data, linear = sampler
+    monkeypatch.setattr(sampler, "QUIET", 1.0 - 1e-6)
+    inputs, x, _, _ = sampler(torch.Generator().manual_seed(0))
+    network = Network(inputs.shape[1], 2, 8, 1, "tanh")
+    artifact = Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
+    with torch.no_grad():
+        x_hat = network(inputs).numpy() * sampler.x_scale + sampler.x_offset
+    observer = KKLObserver(artifact, measurement_noise=0.0)
+    for row in (torch.nonzero(inputs[:, -2] == 0)[::500, 0]).tolist():
+        state = x[row].numpy() * sampler.x_scale + sampler.x_offset
+        slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
+        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
 
 
 # Forward map
@@ -304,6 +347,19 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
         train(system, config, tmp_path / "cut", resume=True)
 
 
+def test_resuming_notices_a_changed_equation(tmp_path):
+    @dataclass(frozen=True)
+    class Changed(Oscillator):
+        name: ClassVar[str] = "oscillator"
+
+        def f(self, x):
+            return x[1], -2.0 * x[0]
+
+    train(Oscillator(), toy(Oscillator()), tmp_path)
+    with pytest.raises(ValueError, match="equations"):
+        train(Changed(), toy(Oscillator()), tmp_path, resume=True)
+
+
 def test_artifact_of_a_run_records_what_made_it(tmp_path):
     system = Oscillator()
     artifact = train(system, toy(system, "spinn", duration=20.0), tmp_path).artifact
@@ -353,6 +409,12 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"forward_steps": 5}, "forward_steps"),
         ({"width": 0}, "width"),
         ({"batch": 2}, "batch"),
+        ({"batch": 100}, "batch"),
+        ({"samples": 1}, "samples"),
+        ({"method": "bogus"}, "method"),
+        ({"activation": "relu"}, "activation"),
+        ({"trajectories": 2.5}, "trajectories"),
+        ({"seed": -1}, "seed"),
         ({"noise_max": float("nan")}, "noise_max"),
     ],
 )
@@ -380,6 +442,12 @@ def test_starts_outside_lie_outside():
     low, high = system.box()
     assert ((x0 < low) | (x0 > high)).any(-1).all()
     assert (np.abs(x0) <= 2 * high).all()
+
+
+@pytest.mark.parametrize("wrong", [{"n": 0}, {"duration": 0.0}, {"domain": "3X"}, {"seed": -1}])
+def test_impossible_evaluations(wrong):
+    with pytest.raises(ValueError, match=r"cannot run|domain"):
+        unseen_runs(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 
 def test_escapes_are_counted():
@@ -410,7 +478,15 @@ def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monke
     main(["evaluate", str(path), "--trajectories", "3", "--duration", "8", "--csv", str(csv)])
     assert "2X" in capsys.readouterr().out
     assert len(csv.read_text().splitlines()) == 1 + 3 * 3 * 2
-    for wrong in (["train", "nonsense"], ["evaluate", "nonsense"], ["train", "lorenz", "--dt", "0"]):
+    for wrong in (
+        ["train", "nonsense"],
+        ["evaluate", "nonsense"],
+        ["evaluate"],
+        ["train", "lorenz", "--dt", "0"],
+        ["train", "lorenz", "--parameters", "rh", "30"],
+        ["train", "lorenz", "--threads", "0"],
+        ["train", "lorenz", "--out", "/dev/null/x", *toy_sizes.split()],
+    ):
         with pytest.raises(SystemExit, match="kkl-gym: "):
             main(wrong)
 
@@ -432,10 +508,3 @@ def test_speed_measures_every_environment(capsys):
     ratios = Speed(steps=20, turns=1).run(Console())
     assert len(ratios) == 9
     assert all(ratio > 0 for ratio in ratios.values())
-
-
-def test_every_seed_of_evaluation_differs_from_training():
-    from training.evaluate import EVALUATION_SEED
-    from training.pipeline import TRAINING_SEED
-
-    assert EVALUATION_SEED != TRAINING_SEED

@@ -308,3 +308,18 @@ def test_a_time_limit_outside_counts_the_agents_steps(saved):
 def test_wrong_repeats(repeat):
     with pytest.raises(ValueError, match="repeat must be a positive integer"):
         ActionRepeat(KKLEnv("lorenz"), repeat)
+
+
+def test_a_wrapper_inside_that_skips_samples_is_noticed(saved):
+    env = KKLObservation(ActionRepeat(gym.make("KKLVanDerPol-v0"), 5), saved(system="van_der_pol"))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="outside KKLObservation"):
+        env.step(np.zeros(1, np.float32))
+
+
+def test_a_system_without_shipped_map_says_so():
+    class Mine(kkl_gym.VanDerPol):
+        name = "mine"
+
+    with pytest.raises(ValueError, match="no map ships for 'mine'"):
+        KKLObservation(KKLEnv(Mine()))

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +35,9 @@ class Train:
     out: Path | None = None
     """The run's folder."""
     resume: bool = False
-    """Go on from the checkpoints in the run's folder."""
+    """Go on from the checkpoints in the run's folder, if there are any."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
     threads: int = 2
     """CPU threads."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -74,11 +76,15 @@ class Train:
         from training.pipeline import train
         from training.report import write_report
 
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
         torch.set_num_threads(self.threads)
-        system = get_system(self.system)
+        system = get_system(self.system, self.parameters)
         name = system.name if self.method == "input-aware" else f"{system.name}-{self.method}"
         folder = self.out or Path("runs") / name
-        names = {field.name for field in fields(Config)}
+        names = {entry.name for entry in fields(Config)}
         config = override(
             preset(system, self.method, self.preset),
             {key: value for key, value in vars(self).items() if key in names and key != "method"},
@@ -99,8 +105,8 @@ class Evaluate:
 
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
     after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines. Observers are
-    told the noise level if they can use it. Trajectories that leave the system's declared bounds are counted, and
-    left out.
+    told the noise level if they can use it. There is no process noise. Trajectories that leave the system's declared
+    bounds are counted, and left out.
     """
 
     observers: tyro.conf.Positional[tuple[str, ...]]
@@ -193,6 +199,8 @@ def system_of(artifact: Artifact, given: str | None) -> System:
 
 def spread(values: np.ndarray) -> str:
     """Median and interquartile range as text."""
+    if not len(values):
+        return "–"
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.2f} ({low:.2f} – {high:.2f})"
 
@@ -218,7 +226,8 @@ def main(arguments: list[str] | None = None) -> None:
     )
     try:
         command.run(console)
-    except (ValueError, FloatingPointError) as error:
+    except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"kkl-gym: {error}")
     except KeyboardInterrupt:
-        sys.exit("kkl-gym: interrupted; train --resume goes on from the last checkpoint")
+        hint = "; --resume goes on from the last checkpoint" if isinstance(command, Train) else ""
+        sys.exit(f"kkl-gym: interrupted{hint}")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -53,6 +53,9 @@ class Config:
     """Of everything random."""
 
     def __post_init__(self) -> None:
+        for name, allowed in (("method", get_args(Method)), ("activation", ("tanh", "silu"))):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if not self.eigenvalues or any(not value < 0 for value in self.eigenvalues):
             raise ValueError(f"eigenvalues must be negative, got {self.eigenvalues}")
         if len(set(self.eigenvalues)) < len(self.eigenvalues):
@@ -61,12 +64,14 @@ class Config:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
         for name in ("trajectories", "width", "depth", "inverse_steps"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)!r}")
+            if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
+                raise ValueError(f"{name} must be a positive integer, got {getattr(self, name)!r}")
         if self.samples < 2:
             raise ValueError(f"samples must be at least 2, got {self.samples}")
-        if self.batch < 64:
-            raise ValueError(f"batch must be at least 64, got {self.batch}")
+        if self.batch < 64 or self.batch % 32:
+            raise ValueError(f"batch must be a multiple of 32 and at least 64, got {self.batch}")
+        if self.seed < 0 or self.physics_weight < 0:
+            raise ValueError(f"seed = {self.seed} and physics_weight = {self.physics_weight} must not be negative")
         if (self.method == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"method {self.method!r} does not go with forward_steps = {self.forward_steps}")
 
@@ -89,6 +94,8 @@ def preset(system: System, method: Method, name: Preset) -> Config:
     The paper leaves open the batch (here 4,096), the spacing of the eigenvalues (even) and the decay of
     the learning rate (a cosine). "fast" is what ships: at most ten minutes on two CPU cores.
     """
+    if method not in get_args(Method) or name not in get_args(Preset):
+        raise ValueError(f"no preset {name!r} for method {method!r}; there are {get_args(Preset)}, {get_args(Method)}")
     if method == "spinn":
         paper = Config(
             method="spinn",

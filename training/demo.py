@@ -53,12 +53,13 @@ class Demo:
 
 def episode(env_id: str, noise: float, duration: float, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     """States and estimates (steps + 1, nx) of one undriven episode, and the seconds that its steps took."""
-    env = kkl_gym.KKLObservation(gym.make(env_id, measurement_noise=noise))
+    steps = round(duration / 0.01)
+    env = kkl_gym.KKLObservation(gym.make(env_id, measurement_noise=noise, max_episode_steps=steps))
     _, info = env.reset(seed=seed)
     action = np.zeros(env.action_space.shape or (), np.float32)
     x, x_hat = [info["x"]], [info["x_hat"]]
     started = time.perf_counter()
-    for _ in range(round(duration / 0.01)):
+    for _ in range(steps):
         _, _, terminated, truncated, info = env.step(action)
         x.append(info["x"])
         x_hat.append(info["x_hat"])

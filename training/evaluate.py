@@ -1,7 +1,7 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -43,7 +43,7 @@ class Runs:
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts (n, nx), uniform in the training box X, or in 2X without X."""
+    """Starts (n, nx), uniform in the training box X, or in 2X (X multiplied by two, as in the paper) without X."""
     if domain == "X":
         return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
     low, high = system.box()
@@ -60,16 +60,18 @@ def unseen_runs(
 ) -> Runs:
     """Test trajectories without noise; driven ones alternate random bounded steps and sines.
 
-    Raises ValueError if every trajectory leaves the declared bounds.
+    Raises ValueError on an unknown domain, or unless n, duration and seed make sense.
     """
+    if n < 1 or seed < 0 or not duration >= dt:
+        raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
+    if domain not in get_args(Domain):
+        raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
     rng = np.random.default_rng([EVALUATION_SEED, seed])
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
     x = simulate(system, x0, steps, dt, u=u if driven else None)
     inside = np.isfinite(x[-1]).all(-1)
-    if not inside.any():
-        raise ValueError(f"all {n} trajectories from {domain} left the bounds of {system.name}")
     return Runs(x[:, inside], u[:, inside], int(n - inside.sum()))
 
 

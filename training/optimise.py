@@ -119,10 +119,11 @@ def _restore(
     try:
         with safe_open(path, framework="pt") as opened:
             meta = json.loads(opened.metadata()["checkpoint"])
+            fingerprint = meta["fingerprint"]
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"the checkpoint {path} is damaged, remove it to train that stage anew: {error}") from error
-    if meta["fingerprint"] != stage.fingerprint:
+    if fingerprint != stage.fingerprint:
         raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
     module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
     blank = optimiser.state_dict()
@@ -132,5 +133,5 @@ def _restore(
             _, i, name = key.split(".", 2)
             state.setdefault(int(i), {})[name] = value
     optimiser.load_state_dict({**blank, "state": state})
-    generator.set_state(tensors["generator"])
+    generator.set_state(tensors["generator"].cpu())
     return int(meta["step"]), [(int(step), float(value)) for step, value in meta["history"]]

@@ -26,7 +26,7 @@ from training.inverse import ForwardMapSampler, InverseProblem, TrajectorySample
 from training.networks import Network
 from training.optimise import Stage, optimise
 
-# Random numbers of different purposes never meet: seeds are sequences (purpose, seed).
+# First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
 TRAINING_SEED = 1
 
 
@@ -69,9 +69,9 @@ def train(
     started = time.monotonic()
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     folder.mkdir(parents=True, exist_ok=True)
-    identity = json.dumps([system.name, system.parameters, dataclasses.asdict(config)], sort_keys=True)
+    identity = json.dumps([describe(system), dataclasses.asdict(config)], sort_keys=True)
     fingerprint = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    _claim(folder, {"system": system.name, "parameters": system.parameters, **dataclasses.asdict(config)}, resume)
+    _claim(folder, {**describe(system), **dataclasses.asdict(config)}, resume)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng([TRAINING_SEED, config.seed])
 
@@ -127,6 +127,22 @@ def train(
         | {"python": platform.python_version()},
     )
     return Result(artifact, losses, forward)
+
+
+def describe(system: System) -> dict[str, Any]:
+    """What identifies a system, its equations included: they are sampled at points of the training box."""
+    x = np.random.default_rng(0).uniform(*system.box(), (20, system.nx))
+    g = [[np.broadcast_to(entry, 20).tolist() for entry in row] for row in system.g(x.T)]
+    f = [np.broadcast_to(component, 20).tolist() for component in system.f(x.T)]
+    equations = json.dumps([f, g, output(system, x).tolist()])
+    return {
+        "system": system.name,
+        "parameters": system.parameters,
+        "X": system.X,
+        "bounds": system.bounds,
+        "u_max": system.u_max,
+        "equations": hashlib.sha256(equations.encode()).hexdigest()[:16],
+    }
 
 
 def _claim(folder: Path, described: dict[str, Any], resume: bool) -> None:

@@ -14,12 +14,12 @@ from training.forward import ForwardProblem
 from training.pipeline import Result
 
 
-def write_report(path: Path, result: Result, system: System, seed: int = 0) -> None:
+def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
     """Errors in training, PDE residual over the domain, estimate against truth.
 
     Where no T was learned, the error by noise level takes the place of the residual.
 
-    The trajectories shown are training's own kind, from ``seed``, without input.
+    The trajectories shown are unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
     """
     import matplotlib
 
@@ -40,17 +40,18 @@ def write_report(path: Path, result: Result, system: System, seed: int = 0) -> N
     else:
         _draw_residual(figure, right, result.forward, system)
 
-    runs = unseen_runs(system, artifact.filter.dt, 1, 20.0, seed)
+    runs = unseen_runs(system, artifact.filter.dt, 20, _seconds(result), seed)
+    x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
-    t = np.arange(len(runs.x)) * artifact.filter.dt
+    t = np.arange(len(x)) * artifact.filter.dt
     for column, noise in enumerate((0.0, 0.5)):
         level = min(noise, artifact.inverse.noise_max)
-        y = output(system, runs.x) + level * rng.standard_normal((*runs.x.shape[:2], system.ny))
+        y = output(system, x) + level * rng.standard_normal((*x.shape[:2], system.ny))
         x_hat = KKLObserver(artifact, level).estimate(y)
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])
-            ax.plot(t, runs.x[:, 0, i], "k", lw=1.2, label="true")
-            ax.plot(t, x_hat[:, 0, i], "m--", lw=1.2, label="estimated")
+            ax.plot(t, x[..., i], "k", lw=1.2, label="true")
+            ax.plot(t, x_hat[..., i], "m--", lw=1.2, label="estimated")
             ax.set_ylabel(system.state_names[i])
             if i == 0:
                 ax.set_title(f"measurement noise {level:g}")
@@ -62,7 +63,10 @@ def write_report(path: Path, result: Result, system: System, seed: int = 0) -> N
 
 def _draw_noise_levels(ax: Any, result: Result, system: System, seed: int) -> None:
     artifact = result.artifact
-    runs = unseen_runs(system, artifact.filter.dt, 20, 20.0, seed)
+    runs = unseen_runs(system, artifact.filter.dt, 20, _seconds(result), seed)
+    if not runs.x.shape[1]:
+        ax.set_title("every trajectory left the declared bounds")
+        return
     levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.noise_max]
     medians = [np.median(errors(artifact, system, runs, level, seed).late) for level in levels]
     ax.plot(range(len(levels)), medians, "o-")
@@ -82,3 +86,7 @@ def _draw_residual(figure: Any, ax: Any, forward: ForwardProblem, system: System
     image = ax.pcolormesh(first, last, np.log10(size + 1e-12), shading="auto")
     figure.colorbar(image, ax=ax, label="log10 |PDE residual|")
     ax.set(xlabel=system.state_names[0], ylabel=system.state_names[-1], title="PDE residual over X")
+
+
+def _seconds(result: Result) -> float:
+    return float(min(20.0, result.artifact.training["duration"]))
