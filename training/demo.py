@@ -39,62 +39,77 @@ class Demo:
         )
         runs = []
         with Progress(console=console, transient=True) as progress:
-            for name, env_id in progress.track(kkl_gym.ENV_IDS.items(), description="running"):
-                x, x_hat, seconds = episode(env_id, self.noise, self.duration, self.seed)
-                full, late = (smape(x[:, None], x_hat[:, None], skip)[0] for skip in (0, len(x) // 5))
-                table.add_row(env_id, f"{full:.2f}", f"{late:.2f}", f"{1e6 * seconds / (len(x) - 1):.0f}")
-                runs.append((name, x, x_hat))
+            for env_id in progress.track(kkl_gym.ENV_IDS.values(), description="running"):
+                run = episode(env_id, self.noise, self.duration, self.seed)
+                full, late = (smape(run.x[:, None], run.x_hat[:, None], skip)[0] for skip in (0, len(run.x) // 5))
+                table.add_row(env_id, f"{full:.2f}", f"{late:.2f}", f"{1e6 * run.seconds / (len(run.x) - 1):.0f}")
+                runs.append(run)
         console.print(table)
         path = self.out / "estimates.png"
-        draw(path, runs, dt=0.01, noise=self.noise)
-        console.print(f"wrote {path}: true states in black, estimates in magenta")
+        draw(path, runs, self.noise)
+        console.print(f"wrote {path}: true states in black, estimates in magenta, the measured output in grey")
         return path
 
 
-def episode(env_id: str, noise: float, duration: float, seed: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """States and estimates (steps + 1, nx) of one undriven episode, and the seconds that its steps took."""
+@dataclass(frozen=True)
+class Run:
+    """One episode: states and estimates (steps + 1, nx), outputs (steps + 1, ny), and the seconds its steps took."""
+
+    env: kkl_gym.KKLObservation
+    x: np.ndarray
+    x_hat: np.ndarray
+    y: np.ndarray
+    seconds: float
+
+
+def episode(env_id: str, noise: float, duration: float, seed: int) -> Run:
+    """Run one undriven episode with the shipped observer."""
     steps = round(duration / 0.01)
     env = kkl_gym.KKLObservation(gym.make(env_id, measurement_noise=noise, max_episode_steps=steps))
     _, info = env.reset(seed=seed)
+    infos = [info]
     action = np.zeros(env.action_space.shape or (), np.float32)
-    x, x_hat = [info["x"]], [info["x_hat"]]
     started = time.perf_counter()
     for _ in range(steps):
-        _, _, terminated, truncated, info = env.step(action)
-        x.append(info["x"])
-        x_hat.append(info["x_hat"])
-        if terminated or truncated:
+        _, _, terminated, _, info = env.step(action)
+        infos.append(info)
+        if terminated:
             break
-    return np.array(x), np.array(x_hat), time.perf_counter() - started
+    seconds = time.perf_counter() - started
+    x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
+    return Run(env, x, x_hat, y, seconds)
 
 
-def draw(path: Path, runs: list[tuple[str, np.ndarray, np.ndarray]], dt: float, noise: float) -> None:
+def draw(path: Path, runs: list[Run], noise: float) -> None:
     """True and estimated states over time, a column for each run (like the paper's fig. 2)."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows = max(x.shape[1] for _, x, _ in runs)
-    figure, axes = plt.subplots(
-        rows, len(runs), figsize=(4.5 * len(runs), 2.2 * rows), squeeze=False, layout="constrained"
-    )
-    for column, (name, x, x_hat) in enumerate(runs):
-        t = np.arange(len(x)) * dt
+    rows = max(run.x.shape[1] for run in runs)
+    size = (4.5 * len(runs), 2.2 * rows)
+    figure, axes = plt.subplots(rows, len(runs), figsize=size, squeeze=False, layout="constrained")
+    for column, run in enumerate(runs):
+        system, C = run.env.unwrapped.system, run.env.observer.artifact.C  # type: ignore[attr-defined]
+        t = np.arange(len(run.x)) * run.env.unwrapped.dt  # type: ignore[attr-defined]
         for i in range(rows):
             ax: Any = axes[i, column]
-            if i >= x.shape[1]:
+            if i >= system.nx:
                 ax.set_visible(False)
                 continue
-            ax.plot(t, x[:, i], "k", lw=1.2, label="true")
-            ax.plot(t, x_hat[:, i], "m--", lw=1.0, label="estimated")
-            low, high = x[:, i].min(), x[:, i].max()
+            if C is not None and np.array_equal(C[0], np.eye(system.nx)[i]):
+                ax.plot(t, run.y[:, 0], color="0.75", lw=0.6, label="measured")
+            ax.plot(t, run.x[:, i], "k", lw=1.2, label="true")
+            ax.plot(t, run.x_hat[:, i], "m--", lw=1.0, label="estimated")
+            low, high = run.x[:, i].min(), run.x[:, i].max()
             ax.set_ylim(low - 0.25 * (high - low), high + 0.25 * (high - low))  # the first estimates may be far off
-            ax.set_ylabel(kkl_gym.SYSTEMS[name].state_names[i])
-        axes[0, column].set_title(name.replace("_", " "))
-        axes[x.shape[1] - 1, column].set_xlabel("t in s")
-    axes[0, 0].legend(loc="upper right")
-    figure.suptitle(f"State estimates from the noisy output alone, measurement noise {noise:g} per sample")
+            ax.set_ylabel(system.state_names[i])
+        axes[0, column].set_title(system.name.replace("_", " "))
+        axes[system.nx - 1, column].set_xlabel("t in s")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower left", ncols=len(labels))
+    figure.suptitle(f"Hidden states estimated from one noisy output (standard deviation {noise:g} on every sample)")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
