@@ -24,7 +24,8 @@ format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The commands that made the shipped maps, version 1: about an hour on two cores, into runs/; resumable.
+# The commands that made the shipped maps, version 1: about an hour on two cores, into runs/; resumable. A new version ships
+# as observers/maps/NAME-vN.safetensors, beside the old ones.
 maps: $(VENV)/ready
 	for system in $(SYSTEMS); do for method in input-aware spinn; do \
 		$(BIN)/kkl-gym train $$system --method $$method --resume || exit 1; done; done

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -12,11 +12,15 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from kkl_gym.systems import SYSTEMS, System, get_system
+from kkl_gym.system import System
+from kkl_gym.systems import SYSTEMS, get_system
 from observers import Artifact, shipped
 from observers.artifact import resolve
 from training.config import Config, Method, Preset, override, preset
 from training.evaluate import Domain, errors, unseen_runs
+
+Value = TypeVar("Value")
+Override = Annotated[Value | None, tyro.conf.arg(help_behavior_hint="(default: the preset's)")]
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class Train:
     """input-aware: fitted along driven, noisy trajectories. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
     """fast: at most ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
-    out: Path | None = None
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
@@ -42,34 +46,34 @@ class Train:
     """CPU threads."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
-    eigenvalues: tuple[float, ...] | None = None
-    """Of the diagonal A, in 1/s, instead of the preset's."""
-    dt: float | None = None
-    """Sampling interval in seconds, instead of 0.01."""
-    trajectories: int | None = None
+    eigenvalues: Override[tuple[float, ...]] = None
+    """Of the diagonal A, in 1/s."""
+    dt: Override[float] = None
+    """Sampling interval in seconds."""
+    trajectories: Override[int] = None
     """Number of simulated trajectories."""
-    duration: float | None = None
+    duration: Override[float] = None
     """Their length in seconds."""
-    samples: int | None = None
+    samples: Override[int] = None
     """Points recorded along each trajectory."""
-    width: int | None = None
+    width: Override[int] = None
     """Neurons in each hidden layer."""
-    depth: int | None = None
+    depth: Override[int] = None
     """Number of hidden layers."""
-    batch: int | None = None
+    batch: Override[int] = None
     """Samples in a batch."""
-    learning_rate: float | None = None
+    learning_rate: Override[float] = None
     """At its highest."""
-    forward_steps: int | None = None
+    forward_steps: Override[int] = None
     """Batches for the forward map (spinn)."""
-    inverse_steps: int | None = None
+    inverse_steps: Override[int] = None
     """Batches for the inverse map."""
-    physics_weight: float | None = None
+    physics_weight: Override[float] = None
     """Weight nu of the PDE residual (spinn)."""
-    noise_max: float | None = None
+    noise_max: Override[float] = None
     """Largest measurement noise to train for (input-aware)."""
-    seed: int | None = None
-    """Of everything random; 0 by default."""
+    seed: Override[int] = None
+    """Of everything random."""
 
     def run(self, console: Console) -> Path:
         """Train; returns the artifact's path."""

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from kkl_gym.systems import System
+from kkl_gym.system import System
 
 Method = Literal["input-aware", "spinn"]
 Preset = Literal["fast", "paper"]

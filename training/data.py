@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kkl_gym.simulate import simulate
-from kkl_gym.systems import System
+from kkl_gym.system import System
 from observers import LinearFilter
 from training.signals import random_inputs
 

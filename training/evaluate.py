@@ -6,7 +6,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from kkl_gym.simulate import simulate
-from kkl_gym.systems import System
+from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.data import output
 from training.metrics import smape

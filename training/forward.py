@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from kkl_gym.systems import System
+from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
 from training.networks import Network, tensor
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import importlib.metadata
 import json
 import math
 import platform
@@ -17,7 +16,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from torch.utils.tensorboard import SummaryWriter
 
-from kkl_gym.systems import System
+import kkl_gym
+from kkl_gym.system import System
 from observers import Artifact, LinearFilter
 from training.config import Config
 from training.data import output, record, recording_ages
@@ -64,8 +64,6 @@ def train(
         trajectories leave its bounds.
     FloatingPointError : if the loss stops being a number.
     """
-    if config.method == "spinn" and not system.ny:
-        raise ValueError(f"{system.name} has no output")
     started = time.monotonic()
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     folder.mkdir(parents=True, exist_ok=True)
@@ -123,8 +121,12 @@ def train(
             "threads": torch.get_num_threads(),
             "resumed": resume,
         },
-        versions={name: importlib.metadata.version(name) for name in ("kkl-gym", "torch", "numpy", "scipy")}
-        | {"python": platform.python_version()},
+        versions={
+            "kkl-gym": kkl_gym.__version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
     )
     return Result(artifact, losses, forward)
 
@@ -132,16 +134,15 @@ def train(
 def describe(system: System) -> dict[str, Any]:
     """What identifies a system, its equations included: they are sampled at points of the training box."""
     x = np.random.default_rng(0).uniform(*system.box(), (20, system.nx))
-    g = [[np.broadcast_to(entry, 20).tolist() for entry in row] for row in system.g(x.T)]
-    f = [np.broadcast_to(component, 20).tolist() for component in system.f(x.T)]
-    equations = json.dumps([f, g, output(system, x).tolist()])
+    rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *output(system, x).T]
+    equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {
         "system": system.name,
         "parameters": system.parameters,
         "X": system.X,
         "bounds": system.bounds,
         "u_max": system.u_max,
-        "equations": hashlib.sha256(equations.encode()).hexdigest()[:16],
+        "equations": hashlib.sha256(json.dumps(equations.tolist()).encode()).hexdigest()[:16],
     }
 
 

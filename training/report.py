@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from kkl_gym.systems import System
+from kkl_gym.system import System
 from observers import KKLObserver
 from training.data import output
 from training.evaluate import errors, unseen_runs

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kkl_gym.systems import System
+from kkl_gym.system import System
 
 KINDS = ("zero", "steps", "zero", "sine")
 
