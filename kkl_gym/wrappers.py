@@ -31,7 +31,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ------
     ValueError : (ArtifactError where the file is at fault) if the observer does not exist, was made for another
         system, other parameters, another dt, or not for this noise level; or, at a step, if the agent acts on a map
-        that knows no inputs and ``ignore_input`` is false.
+        that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
     """
 
     def __init__(

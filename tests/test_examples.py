@@ -32,5 +32,7 @@ def test_own_system_from_the_command_line(tmp_path, capsys):
         main(["evaluate", path])
 
 
-def test_sb3_agent(capsys):
-    assert 0.0 <= example("sb3_agent")(steps=1024) <= 2000.0
+def test_sb3_agent():
+    reward = example("sb3_agent")(steps=1024)
+    assert example("sb3_agent")(steps=1024) == reward  # everything random is seeded
+    assert example("sb3_agent")(steps=1024, seed=1) != reward

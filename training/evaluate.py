@@ -24,7 +24,7 @@ class Errors:
     """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
 
     full : over all steps (the paper's), (n,).
-    late : after the first 20 % of the steps, (n,).
+    late : after the transient, (n,): what :func:`errors` was told to skip, else the first 20 % of the steps.
     escaped : number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
     """
 

@@ -9,7 +9,7 @@ import torch
 from kkl_gym.system import System
 from observers import KKLObserver
 from training.data import output
-from training.evaluate import errors, unseen_runs
+from training.evaluate import Runs, errors, unseen_runs
 from training.forward import ForwardProblem
 from training.pipeline import Result
 
@@ -27,6 +27,8 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     import matplotlib.pyplot as plt
 
     artifact = result.artifact
+    seconds = min(20.0, artifact.training["duration"])
+    runs = unseen_runs(system, artifact.filter.dt, 20, seconds, seed)
     figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
@@ -36,11 +38,10 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
     if result.forward is None:
-        _draw_noise_levels(right, result, system, seed)
+        _draw_noise_levels(right, result, system, runs, seed)
     else:
         _draw_residual(figure, right, result.forward, system)
 
-    runs = unseen_runs(system, artifact.filter.dt, 20, _seconds(result), seed)
     x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
@@ -61,9 +62,8 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     plt.close(figure)
 
 
-def _draw_noise_levels(ax: Any, result: Result, system: System, seed: int) -> None:
+def _draw_noise_levels(ax: Any, result: Result, system: System, runs: Runs, seed: int) -> None:
     artifact = result.artifact
-    runs = unseen_runs(system, artifact.filter.dt, 20, _seconds(result), seed)
     if not runs.x.shape[1]:
         ax.set_title("every trajectory left the declared bounds")
         return
@@ -86,7 +86,3 @@ def _draw_residual(figure: Any, ax: Any, forward: ForwardProblem, system: System
     image = ax.pcolormesh(first, last, np.log10(size + 1e-12), shading="auto")
     figure.colorbar(image, ax=ax, label="log10 |PDE residual|")
     ax.set(xlabel=system.state_names[0], ylabel=system.state_names[-1], title="PDE residual over X")
-
-
-def _seconds(result: Result) -> float:
-    return float(min(20.0, result.artifact.training["duration"]))
