@@ -49,7 +49,7 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
     low, high = system.box()
     found: list[np.ndarray] = []
     while len(found) < n:
-        x = rng.uniform(2 * low, 2 * high)
+        x = rng.uniform(*system.box(2))
         if ((x < low) | (x > high)).any():
             found.append(x)
     return np.array(found)
