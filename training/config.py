@@ -141,7 +141,7 @@ def spectrum(system: System) -> tuple[float, ...]:
         points = np.random.default_rng(0).uniform(low, high, (1000, system.nx)).T
         rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
         if not 0 < rate < np.inf:
-            raise ValueError(f"{system.name}.rate(x) is {rate} in the training box, override it to say how fast f changes")
+            raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
         n, fastest, slowest = 4 * system.nx + 3, -1.5 * rate, -rate / 15
     return tuple((-np.geomspace(-slowest, -fastest, n)).round(6).tolist())
 
