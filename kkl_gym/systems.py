@@ -2,18 +2,12 @@
 
 # ruff: noqa: D102 - what each system overrides is documented on System
 
-import contextlib
-import hashlib
-import importlib
-import importlib.util
-import inspect
 import math
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
+from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
 
 
@@ -181,52 +175,11 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
 def _find(name: str) -> type[System]:
     if name in SYSTEMS:
         return SYSTEMS[name]
-    where, colon, class_name = name.rpartition(":")
-    if not colon:
+    if ":" not in name:
         raise ValueError(
             f"unknown system {name!r}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or 'script.py:Class'"
         )
-    try:
-        found = getattr(_module(where), class_name)
-    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
-        raise ValueError(f"cannot load the system {name!r}: {error}") from error
-    if not (inspect.isclass(found) and issubclass(found, System) and found is not System):
-        raise ValueError(f"{name!r} is {found!r}, not a subclass of kkl_gym.System")
-    return found
-
-
-def _module(where: str) -> Any:
-    if not where.endswith(".py"):
-        if not where or where.startswith("."):
-            raise ImportError(f"{where!r} is no absolute module name")
-        with _importing_from(Path.cwd()):
-            return importlib.import_module(where)
-    path = Path(where).resolve()
-    key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
-    if key not in sys.modules:
-        spec = importlib.util.spec_from_file_location(key, path)
-        if spec is None or spec.loader is None or not path.is_file():
-            raise ImportError(f"no file {where}")
-        module = importlib.util.module_from_spec(spec)
-        module.__dict__["__kkl_gym_script__"] = str(path)
-        sys.modules[key] = module
-        try:
-            with _importing_from(path.parent):
-                spec.loader.exec_module(module)
-        except BaseException:
-            del sys.modules[key]
-            raise
-    return sys.modules[key]
-
-
-@contextlib.contextmanager
-def _importing_from(folder: Path) -> Iterator[None]:
-    """Let imports find modules beside the one imported, as python does for a script it runs."""
-    sys.path.insert(0, str(folder))
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
+    return load_class(name, System)
 
 
 __all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]

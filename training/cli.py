@@ -72,6 +72,8 @@ class Train:
     """Weight nu of the PDE residual (spinn)."""
     noise_max: Override[float] = None
     """Largest measurement noise to train for (input-aware)."""
+    cap: Override[float] = None
+    """CPU seconds after which training ends, steps done or not."""
     seed: Override[int] = None
     """Of everything random."""
 
@@ -211,12 +213,14 @@ def spread(values: np.ndarray) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the ``kkl-gym`` command."""
+    from training.benchmark.command import Benchmark
     from training.demo import Demo
     from training.speed import Speed
 
     commands: dict[str, Callable[..., Any]] = {
         "train": Train,
         "evaluate": Evaluate,
+        "benchmark": Benchmark,
         "maps": Maps,
         "demo": Demo,
         "speed": Speed,
@@ -234,4 +238,5 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(f"kkl-gym: {error}")
     except KeyboardInterrupt:
         hint = "; --resume goes on from the last checkpoint" if isinstance(command, Train) else ""
+        hint = "; the same command goes on" if isinstance(command, Benchmark) else hint
         sys.exit(f"kkl-gym: interrupted{hint}")

@@ -49,6 +49,8 @@ class Config:
     """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
     truncation: float = 1e-6
     """epsilon in t*: what may be left of z0 where the forward map's data begins (paper, sec. 5.2)."""
+    cap: float | None = None
+    """CPU seconds for all networks together, if they must end before their steps are done."""
     seed: int = 0
     """Of everything random."""
 
@@ -63,6 +65,8 @@ class Config:
         for name in ("dt", "duration", "learning_rate", "noise_max", "truncation"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
+        if self.cap is not None and not 0 < self.cap < np.inf:
+            raise ValueError(f"cap must be positive and finite, or None, got {self.cap!r}")
         for name in ("trajectories", "width", "depth", "inverse_steps"):
             if not isinstance(getattr(self, name), int) or getattr(self, name) < 1:
                 raise ValueError(f"{name} must be a positive integer, got {getattr(self, name)!r}")

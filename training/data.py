@@ -1,6 +1,6 @@
 """Pairs of state and filter state, along simulated trajectories."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,29 +57,37 @@ def record(
 
     Trajectories that leave the declared bounds are replaced by new ones; ``report`` is told how many there are so far.
     """
-    low, high = system.box()
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
+    for x, u in trajectories(system, n, steps, linear.dt, rng, driven=linear.nu > 0):
+        xs.append(x[ages])
+        zs.append(run_filter(linear, output(system, x), u, ages))
+        report(sum(x.shape[1] for x in xs))
+    return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1))
+
+
+def trajectories(
+    system: System, n: int, steps: int, dt: float, rng: np.random.Generator, driven: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """n trajectories from starts uniform in the training box, in chunks: states and inputs, (steps (+ 1), CHUNK, ...).
+
+    Those that leave the declared bounds are replaced by new ones.
+    """
     kept = tried = 0
     while kept < n:
         count = min(CHUNK, n - kept)
-        x0 = rng.uniform(low, high, (count, system.nx))
-        u = random_inputs(system, count, steps, linear.dt, rng) if linear.nu else np.zeros((steps, count, 0))
-        x = simulate(system, x0, steps, linear.dt, u=u if linear.nu else None)
+        x0 = rng.uniform(*system.box(), (count, system.nx))
+        u = random_inputs(system, count, steps, dt, rng) if driven else np.zeros((steps, count, 0))
+        x = simulate(system, x0, steps, dt, u=u if driven else None)
         inside = np.isfinite(x[-1]).all(-1)
         kept += int(inside.sum())
         tried += count
         if tried > 20 * n:
             raise ValueError(
-                f"of {tried} trajectories of {steps * linear.dt:g} s only {kept} stayed within bounds = "
+                f"of {tried} trajectories of {steps * dt:g} s only {kept} stayed within bounds = "
                 f"{system.bounds}; widen the bounds, shrink X or shorten the trajectories"
             )
-        x, u = x[:, inside], u[:, inside]
-        z = run_filter(linear, output(system, x), u, ages)
-        xs.append(x[ages])
-        zs.append(z)
-        report(kept)
-    return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1))
+        yield x[:, inside], u[:, inside]
 
 
 def run_filter(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:

@@ -14,9 +14,11 @@ from training.signals import random_inputs
 
 # First entry of every evaluation seed; training's is another (training.pipeline.TRAINING_SEED).
 EVALUATION_SEED = 2
+# First entry of the seeds of validation trajectories, on which the benchmark chooses configurations.
+VALIDATION_SEED = 3
 TRANSIENT = 0.2  # part of a run that is left out of the errors "after the transient"
 
-Domain = Literal["X", "2X"]
+Domain = Literal["X", "1.5X", "2X"]
 
 
 @dataclass(frozen=True)
@@ -35,30 +37,50 @@ class Errors:
 
 @dataclass(frozen=True)
 class Runs:
-    """Noise-free test trajectories: states (steps + 1, n, nx), inputs (steps, n, nu), and how many escaped."""
+    """Noise-free test trajectories.
+
+    x : states, (steps + 1, n, nx).
+    u : inputs, (steps, n, nu).
+    inside : which of the trajectories drawn stayed within the system's declared bounds; the others are not in x and u.
+    """
 
     x: np.ndarray
     u: np.ndarray
-    escaped: int
+    inside: np.ndarray
+
+    @property
+    def escaped(self) -> int:
+        """Number of trajectories that left the bounds."""
+        return int((~self.inside).sum())
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts (n, nx), uniform in the training box X, or in 2X (X multiplied by two, as in the paper) without X."""
+    """Starts (n, nx), uniform in the training box X, or in a multiple of X (as in the paper) without X itself."""
     if domain == "X":
         return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
     low, high = system.box()
+    larger = system.box(float(domain.removesuffix("X")))
     found: list[np.ndarray] = []
     while len(found) < n:
-        x = rng.uniform(*system.box(2))
+        x = rng.uniform(*larger)
         if ((x < low) | (x > high)).any():
             found.append(x)
     return np.array(found)
 
 
 def unseen_runs(
-    system: System, dt: float, n: int, duration: float, seed: int, domain: Domain = "X", driven: bool = False
+    system: System,
+    dt: float,
+    n: int,
+    duration: float,
+    seed: int,
+    domain: Domain = "X",
+    driven: bool = False,
+    first: int = EVALUATION_SEED,
 ) -> Runs:
     """Test trajectories without noise; driven ones alternate random bounded steps and sines.
+
+    ``first`` is the first entry of the seed: of evaluation or of validation.
 
     Raises ValueError on an unknown domain, or unless n, duration and seed make sense.
     """
@@ -66,13 +88,13 @@ def unseen_runs(
         raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
     if domain not in get_args(Domain):
         raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
-    rng = np.random.default_rng([EVALUATION_SEED, seed])
+    rng = np.random.default_rng([first, seed])
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
     x = simulate(system, x0, steps, dt, u=u if driven else None)
     inside = np.isfinite(x[-1]).all(-1)
-    return Runs(x[:, inside], u[:, inside], int(n - inside.sum()))
+    return Runs(x[:, inside], u[:, inside], inside)
 
 
 def errors(

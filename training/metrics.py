@@ -1,25 +1,54 @@
-"""Measures of an estimate against the truth."""
+"""Measures of an estimate against the truth, one for each trajectory.
+
+States and estimates have shape (steps, n, nx), results (n,). ``skip`` is the number of first steps left out.
+An estimate that is not finite counts as one infinitely far away.
+"""
 
 import numpy as np
 
+SETTLED = 0.1  # of a trajectory's root mean square size
+
 
 def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Symmetric mean absolute percentage error of each trajectory (paper, sec. 8.3), in percent.
+    """Symmetric mean absolute percentage error (paper, sec. 8.3), in percent, between 0 and 200.
 
-    mean over the steps of 2 |x - x_hat| / (|x| + |x_hat|) with Euclidean norms.
-
-    Parameters
-    ----------
-    x, x_hat : (steps, n, nx).
-    skip : number of first steps left out.
-
-    Returns
-    -------
-    (n,), between 0 and 200.
+    Mean over the steps of 2 |x - x_hat| / (|x| + |x_hat|) with Euclidean norms.
     """
+    x, x_hat = _compared(x, x_hat, skip)
+    size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
+    return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size).mean(0))
+
+
+def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
+    """The same with absolute values of the components in place of norms, averaged over steps and components.
+
+    This is what the notebooks released with the paper print, after the first 20 % of the steps.
+    """
+    x, x_hat = _compared(x, x_hat, skip)
+    return np.asarray(_percentage(np.abs(x - x_hat), np.abs(x) + np.abs(x_hat)).mean((0, 2)))
+
+
+def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
+    """Root of the mean over the steps of |x - x_hat|^2, in units of the state."""
+    x, x_hat = _compared(x, x_hat, skip)
+    return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
+
+
+def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
+    """Time in seconds from which |x - x_hat| stays below a tenth of the root mean square of |x|; infinite if never."""
+    x, x_hat = _compared(x, x_hat, 0)
+    limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
+    outside = np.linalg.norm(x - x_hat, axis=-1) > limit
+    last = len(x) - 1 - outside[::-1].argmax(0)
+    return np.where(outside.any(0), np.where(last == len(x) - 1, np.inf, (last + 1) * dt), 0.0)
+
+
+def _compared(x: np.ndarray, x_hat: np.ndarray, skip: int) -> tuple[np.ndarray, np.ndarray]:
     if x.shape != x_hat.shape or not 0 <= skip < len(x):
         raise ValueError(f"cannot compare {x.shape} with {x_hat.shape} after {skip} steps")
-    x, x_hat = x[skip:], x_hat[skip:]
-    size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
-    error = 2.0 * np.linalg.norm(x - x_hat, axis=-1)
-    return np.asarray(100.0 * np.mean(np.divide(error, size, out=np.zeros_like(size), where=size > 0), axis=0))
+    return x[skip:], np.where(np.isfinite(x_hat), x_hat, np.inf)[skip:]
+
+
+def _percentage(error: np.ndarray, size: np.ndarray) -> np.ndarray:
+    ratio = np.divide(error, size, out=np.zeros_like(size), where=(size > 0) & np.isfinite(size))
+    return np.where(np.isfinite(size), 200.0 * ratio, 200.0)

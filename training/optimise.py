@@ -32,6 +32,7 @@ class Stage:
     folder : where checkpoints go.
     fingerprint : identifies the run's configuration; a checkpoint of another one is refused.
     seed : of the batches.
+    cap : CPU seconds after which the stage ends if its steps are not done; the learning rate then follows the clock.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Stage:
     folder: Path
     fingerprint: str
     seed: int
+    cap: float = math.inf
 
 
 def optimise(
@@ -56,19 +58,24 @@ def optimise(
     device = next(module.parameters()).device
     generator = torch.Generator(device).manual_seed(stage.seed)
     optimiser = torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
-    warmup = max(1, stage.steps // 100)
+    warmup = max(1, min(300, stage.steps // 100))
+    began = time.process_time()
+
+    def seconds() -> float:
+        return spent + time.process_time() - began
 
     def rate(step: int) -> float:
-        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + math.cos(math.pi * step / stage.steps))
+        done = max(step / stage.steps, min(1.0, seconds() / stage.cap))
+        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + math.cos(math.pi * done))
 
     checkpoint = stage.folder / f"{stage.name}.checkpoint.safetensors"
-    start = 0
+    start, spent = 0, 0.0
     history: list[tuple[int, float]] = []
     if resume and checkpoint.exists():
-        start, history = _restore(checkpoint, stage, module, optimiser, generator)
+        start, spent, history = _restore(checkpoint, stage, module, optimiser, generator)
     task = progress.add_task(stage.name, total=stage.steps, completed=start)
     total, saved_at = torch.zeros((), device=device), time.monotonic()
-    for step in range(start, stage.steps):
+    for step in range(start, stage.steps if spent < stage.cap else start):
         for group in optimiser.param_groups:
             group["lr"] = stage.learning_rate * rate(step)
         terms = loss(generator)
@@ -77,7 +84,8 @@ def optimise(
         nn.utils.clip_grad_norm_(module.parameters(), 1.0)
         optimiser.step()
         total += terms.get("error", terms["loss"]).detach()
-        if (step + 1) % LOG_EVERY == 0 or step + 1 == stage.steps:
+        last = step + 1 == stage.steps or seconds() >= stage.cap
+        if (step + 1) % LOG_EVERY == 0 or last:
             mean = float(total) / ((step % LOG_EVERY) + 1)
             if mean != mean:
                 raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {step + 1}")
@@ -88,9 +96,11 @@ def optimise(
             progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
             if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
                 progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, error {mean:.3g}")
-            if time.monotonic() - saved_at > CHECKPOINT_SECONDS or step + 1 == stage.steps:
-                _save(checkpoint, stage, module, optimiser, generator, step + 1, history)
+            if time.monotonic() - saved_at > CHECKPOINT_SECONDS or last:
+                _save(checkpoint, stage, module, optimiser, generator, step + 1, seconds(), history)
                 saved_at = time.monotonic()
+        if last:
+            break
     return history
 
 
@@ -101,13 +111,14 @@ def _save(
     optimiser: torch.optim.Optimizer,
     generator: torch.Generator,
     step: int,
+    seconds: float,
     history: list[tuple[int, float]],
 ) -> None:
     tensors = {f"module.{name}": value.contiguous() for name, value in module.state_dict().items()}
     for i, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{i}.{name}": value.contiguous() for name, value in state.items()}
     tensors["generator"] = generator.get_state()
-    meta = {"fingerprint": stage.fingerprint, "step": step, "history": history}
+    meta = {"fingerprint": stage.fingerprint, "step": step, "seconds": seconds, "history": history}
     temporary = path.with_name(f".{path.name}.new")
     save_file(tensors, temporary, metadata={"checkpoint": json.dumps(meta)})
     os.replace(temporary, path)
@@ -115,7 +126,7 @@ def _save(
 
 def _restore(
     path: Path, stage: Stage, module: nn.Module, optimiser: torch.optim.Optimizer, generator: torch.Generator
-) -> tuple[int, list[tuple[int, float]]]:
+) -> tuple[int, float, list[tuple[int, float]]]:
     try:
         with safe_open(path, framework="pt") as opened:
             meta = json.loads(opened.metadata()["checkpoint"])
@@ -134,4 +145,5 @@ def _restore(
             state.setdefault(int(i), {})[name] = value
     optimiser.load_state_dict({**blank, "state": state})
     generator.set_state(tensors["generator"].cpu())
-    return int(meta["step"]), [(int(step), float(value)) for step, value in meta["history"]]
+    history = [(int(step), float(value)) for step, value in meta["history"]]
+    return int(meta["step"]), float(meta.get("seconds", 0.0)), history

@@ -1,0 +1,1 @@
+"""The comparison of observers: protocol, jobs, tables and figure."""

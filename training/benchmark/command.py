@@ -1,0 +1,179 @@
+"""``kkl-gym benchmark``."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import pandas as pd
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from kkl_gym.systems import SYSTEMS, get_system
+from training.benchmark.jobs import Job, run_all, write
+from training.benchmark.protocol import Protocol, step_time
+from training.benchmark.tables import draw, write_table
+from training.methods import METHODS, Budget, get_method
+
+BUDGETS = {
+    "cpu": Budget(trajectories=2000, duration=50.0, samples=200, seconds=300.0),
+    "quick": Budget(trajectories=200, duration=20.0, samples=50, seconds=5.0, width=64, depth=2),
+    # 8 million points, as in the paper
+    "paper": Budget(
+        trajectories=1600, duration=50.0, samples=5000, seconds=3600.0, width=512, depth=4, activation="silu"
+    ),
+}
+PROTOCOL = Protocol()
+QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
+VALIDATION = Protocol(trajectories=20, duration=20.0)
+SEARCH = 0.1  # of the budget's seconds, for each configuration that is compared
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Compare observers: train every method on every system, measure all on the same unseen trajectories.
+
+    Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
+    OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
+    trained observer; a run that was interrupted goes on where it stopped, and jobs may be spread over several runs by
+    --systems and --methods. What is missing from the full set is said in table and figure.
+    """
+
+    budget: Literal["cpu", "paper"] = "cpu"
+    """cpu: 400,000 points and 300 CPU seconds for each training. paper: 8 million points, networks of 4 x 512 and
+    an hour each; wants a GPU."""
+    quick: bool = False
+    """A version of minutes in place of the budget: short trainings, no search, few and short test trajectories."""
+    systems: tuple[str, ...] = tuple(SYSTEMS)
+    """Names, or classes of yours as script.py:Class or module:Class."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Names, or classes of yours as script.py:Class or module:Class."""
+    noise: tuple[float, ...] = (0.0, 0.5)
+    """Standard deviations of the measurement noise."""
+    out: Path | None = None
+    """Folder of results (default: benchmark/BUDGET)."""
+    jobs: int = 2
+    """Worker processes, of one thread each."""
+    seed: int = 0
+    """Of the test trajectories; training's is always 0."""
+    report: bool = False
+    """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
+
+    def run(self, console: Console) -> Path:
+        """Run what is missing; returns the folder."""
+        name = "quick" if self.quick else self.budget
+        out = self.out or Path("benchmark") / name
+        if self.report:
+            _report(out, console)
+            return out
+        if self.jobs < 1 or not self.systems or not self.methods:
+            raise ValueError("name at least one system, one method and one worker process")
+        jobs = self._jobs(name, out)
+        for job in jobs:
+            job.claim()
+        failures = []
+        todo = [job for job in jobs if not job.done]
+        with _progress(console) as progress:
+            task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
+            for job, failure, running in run_all(todo, min(self.jobs, max(1, len(todo)))):
+                if failure:
+                    failures.append(f"{job.name}: {failure}")
+                    progress.console.print(f"[red]failed[/red] {failures[-1]}")
+                else:
+                    progress.console.print(f"finished {job.name}")
+                text = f"observers (now {', '.join(running)})" if running else "observers"
+                progress.update(task, advance=1, description=text)
+            self._time(jobs, progress)
+        _collect(out, name, jobs)
+        _report(out, console)
+        if failures:
+            raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
+        return out
+
+    def _jobs(self, name: str, out: Path) -> list[Job]:
+        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, noise=self.noise, seed=self.seed)
+        budget = BUDGETS[name]
+        search = None if self.quick else SEARCH * budget.seconds
+        return [
+            Job(
+                system=system,
+                method=method,
+                folder=out / "jobs" / get_system(system).name / get_method(method).name,
+                budget=budget,
+                protocol=protocol,
+                search=search,
+                validation=replace(VALIDATION, noise=self.noise),
+            )
+            for system in self.systems
+            for method in self.methods
+        ]
+
+    def _time(self, jobs: list[Job], progress: Progress) -> None:
+        """Time steps when nothing else runs."""
+        torch.set_num_threads(1)
+        todo = [job for job in jobs if job.done and not (job.folder / "speed.json").exists()]
+        for job in progress.track(todo, description="timing steps"):
+            method, system = get_method(job.method), get_system(job.system)
+            trained = method.load(job.folder / "trained.safetensors")
+            times = {
+                f"us_batch_{batch}": step_time(method, trained, system, job.budget.dt, batch) for batch in (1, 1000)
+            }
+            write(job.folder / "speed.json", json.dumps(times) + "\n")
+
+
+@contextmanager
+def _progress(console: Console) -> Iterator[Progress]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+        yield progress
+
+
+def _collect(out: Path, name: str, jobs: list[Job]) -> None:
+    """One CSV of all errors and one of all costs, from every job found in the folder."""
+    errors, costs = [], []
+    order = {job.folder: i for i, job in enumerate(jobs)}
+    found = {path.parent for path in (out / "jobs").glob("*/*/errors.csv")}
+    for folder in sorted(found, key=lambda folder: (order.get(folder, len(order)), folder)):
+        errors.append(pd.read_csv(folder / "errors.csv"))
+        info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
+        speed = folder / "speed.json"
+        costs.append(
+            {
+                "system": folder.parent.name,
+                "method": folder.name,
+                "label": info["label"],
+                "budget": name,
+                "configuration": json.dumps(info["configuration"]),
+                "validation": json.dumps(info["validation"]),
+                "train_seconds": info["train_seconds"],
+                **(json.loads(speed.read_text()) if speed.exists() else {}),
+                "trajectories": job["protocol"]["trajectories"],
+                "seed": job["protocol"]["seed"],
+            }
+        )
+    if not errors:
+        raise ValueError(f"no job in {out} has finished")
+    write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
+    write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
+
+
+def _report(out: Path, console: Console) -> None:
+    """Table and figure from the CSV files."""
+    for name in ("results.csv", "methods.csv"):
+        if not (out / name).exists():
+            raise ValueError(f"{out / name} does not exist; run the benchmark first")
+    results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
+    systems, names = set(methods.system) | set(SYSTEMS), set(methods.method) | set(METHODS)
+    whole = len(systems) * len(names)
+    note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
+    if len(methods) < whole:
+        note += f" Partial: {len(methods)} of {whole} observers."
+    write_table(out / "table.md", results, methods, note)
+    draw(out / "heatmap.png", results, methods, note)
+    console.print(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}")
+
+
+__all__ = ["Benchmark"]

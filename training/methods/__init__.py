@@ -1,0 +1,33 @@
+"""The methods of the benchmark, by name."""
+
+from typing import Any
+
+from kkl_gym.loading import load_class
+from training.methods.autoencoder import AE
+from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task
+from training.methods.dmf import DMF, DMFNoise
+from training.methods.gru import GRU
+from training.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
+from training.methods.kkl import SPINN, Default
+from training.methods.node import NODE, NODENoise
+
+METHODS: dict[str, type[Method[Any]]] = {
+    cls.name: cls for cls in (Default, SPINN, AE, DMF, DMFNoise, NODE, NODENoise, GRU, EKF, UKF, WrongEKF, UntunedEKF)
+}
+
+
+def get_method(name: str) -> Method[Any]:
+    """The method of this name, or of a class of the user's as ``"module:Class"`` or ``"path/to/script.py:Class"``.
+
+    Raises ValueError if there is none.
+    """
+    if name in METHODS:
+        return METHODS[name]()
+    if ":" not in name:
+        raise ValueError(
+            f"unknown method {name!r}; there are {', '.join(METHODS)}; your own: 'module:Class' or 'script.py:Class'"
+        )
+    return load_class(name, Method)()  # type: ignore[type-abstract]
+
+
+__all__ = ["METHODS", "Budget", "CausalObserver", "Configuration", "Data", "Method", "Task", "get_method"]

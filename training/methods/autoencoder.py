@@ -1,0 +1,181 @@
+"""Encoder T and decoder T_inv trained together on the PDE residual (Buisson-Fenet et al., 2023)."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from scipy.linalg import solve_continuous_lyapunov
+from scipy.signal import bessel
+from torch import nn
+
+from kkl_gym.system import System
+from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+from training.forward import on_tensors
+from training.methods.base import Configuration, Task
+from training.methods.kkl import KKLMethod
+from training.networks import Network, tensor
+from training.pipeline import output_matrix
+
+BATCH = 2048
+RECONSTRUCTION = 0.1  # weight of |x - T_inv(T(x))|^2 beside the PDE residual, the authors'
+TUNING = 0.3  # share of the CPU time in which the maps are learned for every cutoff
+CUTOFFS = (0.1, 1.0)  # range of the cutoff, in multiples of the system's median rate over X
+
+
+class AE(KKLMethod):
+    """Joint autoencoder with a Bessel spectrum and its gain tuning.
+
+    M. Buisson-Fenet, L. Bahr, V. Morgenthaler and F. Di Meglio, "Towards gain tuning for numerical KKL observers", IFAC
+    World Congress 2023. A = w D with the poles of a Bessel filter of order nx + 1 for each output, B = w, so that z
+    stays of the size of y for every cutoff w. T and T_inv are first learned with w as an input; the cutoff is the one
+    with the least "sensitivity of T_inv x (H-infinity gain from noise to z + H2 norm of the transient)". Training
+    then goes on at that cutoff alone.
+    """
+
+    name: ClassVar[str] = "ae"
+    label: ClassVar[str] = "AE"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """The cutoff that the criterion gives, its half and its double."""
+        return tuple({"cutoff_factor": factor} for factor in (1.0, 0.5, 2.0))
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """Learn for every cutoff, choose one, learn on."""
+        torch.manual_seed(task.seed)
+        system, budget = task.system, task.budget
+        low, high = system.box()
+        rate = float(np.median(np.broadcast_to(system.rate(task.rng.uniform(low, high, (1000, system.nx)).T), 1000)))
+        problem = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
+        task.fit("every-cutoff", problem, problem.loss, learning_rate=5e-3, share=TUNING)
+        chosen = configuration["cutoff_factor"] * problem.best_cutoff()
+        problem.fix(chosen)
+        task.fit("one-cutoff", problem, problem.loss, learning_rate=5e-3, share=1 - TUNING)
+        z_offset, z_scale = problem.z_offset.cpu().numpy().astype(float), problem.z_scale.cpu().numpy().astype(float)
+        scaling = (problem.x_offset, problem.x_scale, z_offset, z_scale)
+        told = float(problem.feature(torch.tensor(chosen)))
+        return Artifact(
+            filter=LinearFilter(chosen * problem.D, chosen * problem.F, budget.dt),
+            inverse=InverseMap(
+                mlp=_without_last_input(problem.decoder.export(), told),
+                features=("z_y",),
+                z_offset=z_offset,
+                whiten=np.diag(1.0 / z_scale),
+                noise_gain=np.zeros(len(z_offset)),
+                x_offset=problem.x_offset,
+                x_scale=problem.x_scale,
+            ),
+            system=system.name,
+            parameters=system.parameters,
+            forward=ForwardMap(_without_last_input(problem.encoder.export(), told), *scaling),
+            C=output_matrix(system),
+            training={"method": self.name, **configuration, "cutoff": chosen, "seed": task.seed},
+        )
+
+
+def bessel_filter(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
+    """D in real blocks with the poles of a Bessel filter of order nx + 1 at cutoff 1, and F = 1, for each output."""
+    _, poles, _ = bessel(nx + 1, 1.0, analog=True, output="zpk")
+    D, i = np.zeros((nx + 1, nx + 1)), 0
+    for pole in poles[poles.imag >= -1e-9]:
+        if abs(pole.imag) < 1e-9:
+            D[i, i], i = pole.real, i + 1
+        else:
+            D[i : i + 2, i : i + 2], i = [[pole.real, pole.imag], [-pole.imag, pole.real]], i + 2
+    return np.kron(np.eye(ny), D), np.kron(np.eye(ny), np.ones((nx + 1, 1)))
+
+
+class _Problem(nn.Module):
+    """T(x, w) and T_inv(z, w) with their losses; w is drawn evenly in the logarithm until :meth:`fix`."""
+
+    def __init__(self, task: Task, slowest: float, fastest: float) -> None:
+        super().__init__()
+        system, budget, data, device = task.system, task.budget, task.data, task.device
+        self.D, self.F = bessel_filter(system.nx, system.ny)
+        self.system, self.slowest, self.fastest = system, slowest, fastest
+        low, high = system.box()
+        states = data.x.reshape(-1, system.nx)
+        lowest, highest = np.minimum(low, states.min(0)), np.maximum(high, states.max(0))
+        self.x_offset, self.x_scale = (lowest + highest) / 2, (highest - lowest) / 2
+        size = (len(self.D), budget.width, budget.depth, budget.activation)
+        self.encoder = Network(system.nx + 1, *size).to(device)
+        self.decoder = Network(len(self.D) + 1, system.nx, *size[1:]).to(device)
+        gain = -np.linalg.solve(self.D, self.F)
+        outputs = data.y.reshape(-1, system.ny)
+        self.z_offset = tensor(gain @ outputs.mean(0, dtype=float), device)
+        self.z_scale = tensor(np.abs(gain) @ outputs.std(0, dtype=float), device)
+        self._D, self._F = tensor(self.D, device), tensor(self.F, device)
+        self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
+        self._states = tensor(states, device)
+        self._low, self._span = tensor(low, device), tensor(high - low, device)
+
+    def fix(self, cutoff: float) -> None:
+        """From now on this cutoff only."""
+        self.slowest = self.fastest = cutoff
+
+    def feature(self, w: torch.Tensor) -> torch.Tensor:
+        """What the networks are told of the cutoff."""
+        return torch.log10(w)
+
+    def encode(self, scaled: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+        """Scaled z (n, nz) from scaled x (n, nx) and cutoffs (n, 1)."""
+        z: torch.Tensor = self.encoder(torch.cat([scaled, self.feature(w)], -1))
+        return z
+
+    def decode(self, z: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+        """Scaled x from scaled z."""
+        x: torch.Tensor = self.decoder(torch.cat([z, self.feature(w)], -1))
+        return x
+
+    def draw(self, n: int, generator: torch.Generator) -> torch.Tensor:
+        """States, half of them along the trajectories and half uniform in X."""
+        device = self._states.device
+        rows = torch.randint(len(self._states), (n // 2,), generator=generator, device=device)
+        uniform = torch.rand((n - n // 2, len(self._low)), generator=generator, device=device)
+        return torch.cat([self._states[rows], self._low + self._span * uniform])
+
+    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Reconstruction and PDE residual, the latter relative to the local speed as in :mod:`training.forward`."""
+        x = self.draw(BATCH, generator)
+        position = torch.rand((BATCH, 1), generator=generator, device=x.device)
+        w = self.slowest * (self.fastest / self.slowest) ** position
+        scaled, f = (x - self._xo) / self._xs, on_tensors(self.system.f, x) / self._xs
+
+        def at(s: torch.Tensor) -> torch.Tensor:
+            return self.encode(s, w)
+
+        z, derivative = torch.func.jvp(at, (scaled,), (f,))  # type: ignore[misc]
+        h = on_tensors(self.system.h, x)
+        steady = (self.z_offset + self.z_scale * z) @ self._D.T + h @ self._F.T
+        residual = (derivative - w * steady / self.z_scale) / (f.norm(dim=-1, keepdim=True) + w)
+        reconstruction = ((self.decode(z, w) - scaled) ** 2).mean()
+        physics = (residual**2).mean()
+        return {
+            "loss": RECONSTRUCTION * reconstruction + physics,
+            "reconstruction": reconstruction.detach(),
+            "physics": physics.detach(),
+        }
+
+    def best_cutoff(self, n: int = 1000, candidates: int = 25) -> float:
+        """The cutoff that minimises sensitivity x (noise gain + transient gain) over the range."""
+        x = self.draw(n, torch.Generator(self._states.device).manual_seed(0))
+        frequencies = np.geomspace(1e-3, 1e3, 400)
+        eye = np.eye(len(self.D))
+        noise_gain = max(float(np.linalg.norm(np.linalg.solve(1j * s * eye - self.D, self.F), 2)) for s in frequencies)
+        energy = float(np.trace(solve_continuous_lyapunov(self.D, -eye)))
+        jacobian: Callable[..., Any] = torch.func.vmap(torch.func.jacrev(self.decode))
+        scores = {}
+        for cutoff in np.geomspace(self.slowest, self.fastest, candidates).tolist():
+            w = torch.full((n, 1), cutoff, dtype=x.dtype, device=x.device)
+            with torch.no_grad():
+                z = self.encode((x - self._xo) / self._xs, w)
+                sensitivity = torch.linalg.matrix_norm(jacobian(z, w) / self.z_scale, 2).square().mean().sqrt()
+            scores[cutoff] = float(sensitivity) * (noise_gain + np.sqrt(energy / cutoff))
+        return float(min(scores, key=scores.__getitem__))
+
+
+def _without_last_input(mlp: MLP, value: float) -> MLP:
+    """The network with its last input held at a value."""
+    first, *weights = mlp.weights
+    bias, *biases = mlp.biases
+    return MLP([np.ascontiguousarray(first[:, :-1]), *weights], [bias + value * first[:, -1], *biases], mlp.activation)

@@ -1,0 +1,170 @@
+"""What a method of the benchmark is: trained from a system and a budget, it makes observers that step causally."""
+
+import json
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+import torch
+from rich.progress import Progress
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+from torch import nn
+from torch.utils.tensorboard import SummaryWriter
+
+from kkl_gym.system import System
+from training.data import output, recording_ages, trajectories
+from training.optimise import Loss, Stage, optimise
+from training.pipeline import TRAINING_SEED, describe
+
+Trained = TypeVar("Trained")
+Configuration = Mapping[str, Any]
+Arrays = dict[str, np.ndarray]
+
+
+class CausalObserver(Protocol):
+    """x_hat_0 = reset(y_0), x_hat_k+1 = step(y_k+1); outputs (n, ny) in, estimates (n, nx) out."""
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Forget the past, take in the first sample, return the first estimate."""
+        ...
+
+    def step(self, y: np.ndarray) -> np.ndarray:
+        """Take in the next sample, return the next estimate."""
+        ...
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What every method is given for a training.
+
+    trajectories, duration, samples : data: noise-free trajectories of this length in seconds from starts in X, and the
+        points along each at which the state is recorded. The output is recorded at every step.
+    seconds : CPU time of the optimisation.
+    width, depth, activation : hidden layers of every multilayer perceptron.
+    dt : sampling interval in seconds.
+    steps : batches after which a training ends in any case.
+    """
+
+    trajectories: int
+    duration: float
+    samples: int
+    seconds: float
+    width: int = 128
+    depth: int = 3
+    activation: str = "tanh"
+    dt: float = 0.01
+    steps: int = 10**9
+
+
+@dataclass(frozen=True)
+class Data:
+    """Noise-free training trajectories.
+
+    ages : samples since the start at which x is recorded, sorted, (m,).
+    x : states at ``ages``, (m, n, nx).
+    y : outputs at every step, (steps + 1, n, ny), float32.
+    """
+
+    ages: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+
+@lru_cache(maxsize=1)
+def simulated(system: System, budget: Budget, seed: int) -> Data:
+    """The training data of a system; the same for every method."""
+    rng = np.random.default_rng([TRAINING_SEED, seed])
+    steps = max(1, round(budget.duration / budget.dt))
+    ages = recording_ages(0, steps, budget.samples)
+    xs, ys = [], []
+    for x, _ in trajectories(system, budget.trajectories, steps, budget.dt, rng, driven=False):
+        xs.append(x[ages])
+        ys.append(output(system, x).astype(np.float32))
+    return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training: the system, the budget, the seed, and a folder for checkpoints and scalars."""
+
+    system: System
+    budget: Budget
+    folder: Path
+    seed: int = 0
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @cached_property
+    def data(self) -> Data:
+        """Training trajectories, simulated when first asked for."""
+        return simulated(self.system, self.budget, self.seed)
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """A fresh generator; the same one at every call."""
+        return np.random.default_rng([TRAINING_SEED, self.seed, 1])
+
+    def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
+        """Minimise a loss by Adam within ``share`` of the budget's CPU time; goes on from a checkpoint if there is one.
+
+        Raises FloatingPointError if the loss stops being a number.
+        """
+        self.folder.mkdir(parents=True, exist_ok=True)
+        seconds = self.budget.seconds * share
+        identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
+        stage = Stage(name, self.budget.steps, learning_rate, self.folder, identity, self.seed, seconds)
+        with SummaryWriter(self.folder) as writer, Progress(disable=True) as progress:
+            optimise(stage, module, loss, progress, writer, resume=True)
+
+
+class Method(ABC, Generic[Trained]):
+    """A way to make observers; see docs/benchmark.md for how to add one.
+
+    Class variables
+    ---------------
+    name : identifies the method in commands, folders and tables.
+    label : how tables and figures call it.
+    trajectories : the largest number of test trajectories, for methods too slow for all of them.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    trajectories: ClassVar[int | None] = None
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """At most three; the benchmark takes the one that does best on validation trajectories."""
+        return ({},)
+
+    @abstractmethod
+    def train(self, task: Task, configuration: Configuration) -> Trained:
+        """Learn what the observer needs; may raise FloatingPointError if training fails."""
+
+    @abstractmethod
+    def observer(self, trained: Trained, system: System, dt: float, noise: float) -> CausalObserver:
+        """An observer for outputs with this standard deviation of measurement noise (many need not be told)."""
+
+    def save(self, trained: Trained, path: Path) -> None:
+        """Write what was trained, whole or not at all; by default a dictionary of arrays."""
+        if not isinstance(trained, dict):
+            raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
+        temporary = path.with_name(f".{path.name}.new")
+        arrays = {name: np.ascontiguousarray(value) for name, value in trained.items()}
+        save_file(arrays, temporary, metadata={"kkl-gym-method": self.name})
+        os.replace(temporary, path)
+
+    def load(self, path: Path) -> Trained:
+        """Read what :meth:`save` wrote; raises ValueError if the file is damaged or of another method."""
+        try:
+            with safe_open(path, framework="numpy") as opened:
+                name = (opened.metadata() or {}).get("kkl-gym-method")
+                arrays = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
+        except (SafetensorError, OSError, TypeError) as error:
+            raise ValueError(f"{path} is damaged, remove it to train anew: {error}") from error
+        if name != self.name:
+            raise ValueError(f"{path} was written by method {name!r}, not {self.name!r}")
+        return arrays  # type: ignore[return-value]

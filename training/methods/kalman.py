@@ -1,0 +1,251 @@
+"""Kalman filters that know the equations of motion: what a control engineer would try first."""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import sympy
+from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+from kkl_gym.simulate import advance, advance_batch
+from kkl_gym.system import Box, Components, System
+from training.data import output
+from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+
+# Process noise, in multiples of each state's scale per square root of a second: what stands for the filters'
+# own errors of linearisation, for there is none in the trajectories.
+PROCESS_NOISE = (1e-3, 1e-2, 1e-1)
+NOISE_FLOOR = 0.01  # the least standard deviation of measurement noise that a filter assumes
+
+
+class EKF(Method[Arrays]):
+    """Extended Kalman filter with the exact model and noise level; its process noise is chosen on validation.
+
+    The start is unknown to it: the centre of X, with the covariance of a uniform draw from X.
+    """
+
+    name: ClassVar[str] = "ekf"
+    label: ClassVar[str] = "EKF"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Three levels of process noise."""
+        return tuple({"process_noise": level} for level in PROCESS_NOISE)
+
+    def train(self, task: Task, configuration: Configuration) -> Arrays:
+        """Nothing to learn."""
+        return {"process_noise": np.array([configuration["process_noise"]])}
+
+    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+        """The filter, told the noise level."""
+        Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
+        R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
+        return ExtendedKalmanFilter(self.model(system), dt, Q, R, *unknown_start(system))
+
+    def model(self, system: System) -> System:
+        """The equations that the filter believes in."""
+        return system
+
+
+class WrongEKF(EKF):
+    """The same filter, tuned the same way, with a model that is 10 % wrong."""
+
+    name: ClassVar[str] = "ekf-wrong"
+    label: ClassVar[str] = "EKF, model 10 % off"
+
+    def model(self, system: System) -> System:
+        """Every parameter 10 % too large; a system without parameters runs 10 % too fast."""
+        if system.parameters:
+            return system.replace({name: 1.1 * value for name, value in system.parameters.items()})
+        return faster(system, 1.1)
+
+
+class UntunedEKF(EKF):
+    """The exact model with the covariances that filterpy starts from: P, Q (per sample) and R are the identity."""
+
+    name: ClassVar[str] = "ekf-untuned"
+    label: ClassVar[str] = "EKF, untuned"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """The one that nobody chose."""
+        return ({},)
+
+    def train(self, task: Task, configuration: Configuration) -> Arrays:
+        """Nothing to learn."""
+        return {"process_noise": np.array([1.0])}
+
+    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+        """The filter."""
+        x0, _ = unknown_start(system)
+        eye = np.eye(system.nx)
+        return ExtendedKalmanFilter(system, dt, eye / dt, np.eye(system.ny), x0, eye)
+
+
+class UKF(EKF):
+    """filterpy's unscented Kalman filter with the exact model and noise level, tuned as the EKF is."""
+
+    name: ClassVar[str] = "ukf"
+    label: ClassVar[str] = "UKF"
+    trajectories: ClassVar[int | None] = 10
+
+    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+        """One filter for each trajectory."""
+        Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
+        R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
+        return UnscentedFilters(system, dt, Q, R, *unknown_start(system))
+
+
+def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (nx,) and covariance (nx, nx) of a start uniform in X."""
+    low, high = system.box()
+    return (low + high) / 2, np.diag((high - low) ** 2 / 12)
+
+
+def faster(system: System, factor: float) -> System:
+    """The system with time running faster."""
+
+    class Faster(type(system)):  # type: ignore[misc]
+        name = f"{system.name}-faster"
+
+        def f(self, x: Components) -> Components:
+            return [factor * fi for fi in system.f(x)]
+
+        def rate(self, x: Components) -> Any:
+            return factor * system.rate(x)
+
+    return Faster()
+
+
+def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of f or h from its own equations: for each component, those that are not zero by state."""
+    x = sympy.symbols(f"x:{nx}", real=True)
+    rows = []
+    for value in equations(list(x)):
+        derivatives = {j: sympy.diff(sympy.sympify(value), x[j]) for j in range(nx)}
+        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
+    return rows
+
+
+def with_sensitivity(system: System) -> System:
+    """The system beside its variational equation: states (x, Phi row by row), x' = f(x), Phi' = df/dx Phi."""
+    nx, rows = system.nx, jacobian(system.f, system.nx)
+
+    class Sensitivity(System):
+        name = f"{system.name}-sensitivity"
+        X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
+        bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+
+        def f(self, x: Components) -> Components:
+            state, Phi = x[:nx], x[nx:]
+            out = list(system.f(state))
+            for row in rows:
+                at = {k: derivative(*state) for k, derivative in row.items()}
+                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
+            return out
+
+        def rate(self, x: Components) -> Any:
+            return system.rate(x[:nx])
+
+    return Sensitivity()
+
+
+class ExtendedKalmanFilter:
+    """A batch of continuous-discrete extended Kalman filters in NumPy (Jazwinski, 1970, sec. 8.3).
+
+    Mean and sensitivity Phi are integrated together over each sample, P = Phi P Phi^T + Q dt. A filter whose
+    mean leaves the system's declared bounds starts anew.
+
+    Parameters
+    ----------
+    system : the model.
+    dt : sampling interval in seconds.
+    Q : intensity of the process noise, (nx, nx), per second.
+    R : covariance of the measurement noise, (ny, ny).
+    x0, P0 : mean (nx,) and covariance (nx, nx) of the start.
+    """
+
+    def __init__(self, system: System, dt: float, Q: np.ndarray, R: np.ndarray, x0: np.ndarray, P0: np.ndarray) -> None:
+        self._system, self._dt, self._Q, self._R, self._start = system, dt, Q, R, (x0, P0)
+        self._joint = with_sensitivity(system)
+        self._outputs = jacobian(system.h, system.nx)
+        self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """The start, corrected by the first sample."""
+        x0, P0 = self._start
+        self.x, self.P = np.tile(x0, (len(y0), 1)), np.tile(P0, (len(y0), 1, 1))
+        return self._correct(y0)
+
+    def step(self, y: np.ndarray) -> np.ndarray:
+        """Predict over one sample and correct."""
+        n, nx = self.x.shape
+        Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
+        joint = np.concatenate([self.x.T, Phi0])
+        joint = advance_batch(self._joint, joint, np.empty((0, n)), np.zeros_like(joint), self._dt)
+        self.x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
+        self.P = Phi @ self.P @ Phi.mT + self._Q * self._dt
+        return self._correct(y)
+
+    def _correct(self, y: np.ndarray) -> np.ndarray:
+        inside = np.isfinite(self.P).all((1, 2)) & (self.x >= self._low).all(-1) & (self.x <= self._high).all(-1)
+        if not inside.all():
+            self.x, self.P = self.x.copy(), self.P.copy()
+            self.x[~inside], self.P[~inside] = self._start
+        n, nx = self.x.shape
+        H = np.zeros((n, self._system.ny, nx))
+        for i, row in enumerate(self._outputs):
+            for j, derivative in row.items():
+                H[:, i, j] = derivative(*self.x.T)
+        S = H @ self.P @ H.mT + self._R
+        K = np.linalg.solve(S, H @ self.P).mT
+        self.x = self.x + (K @ (y - output(self._system, self.x))[..., None])[..., 0]
+        I_KH = np.eye(nx) - K @ H
+        self.P = I_KH @ self.P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
+        return self.x.copy()
+
+
+class UnscentedFilters:
+    """filterpy's filter for each row of a batch; one that loses positive definiteness or its bounds starts anew."""
+
+    def __init__(self, system: System, dt: float, Q: np.ndarray, R: np.ndarray, x0: np.ndarray, P0: np.ndarray) -> None:
+        self._system, self._dt, self._Q, self._R, self._start = system, dt, Q, R, (x0, P0)
+        self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """The start, corrected by the first sample."""
+        self._filters = [self._fresh() for _ in y0]
+        return np.array([self._begin(one, y) for one, y in zip(self._filters, y0, strict=True)])
+
+    def step(self, y: np.ndarray) -> np.ndarray:
+        """Predict over one sample and correct."""
+        for i, (one, value) in enumerate(zip(self._filters, y, strict=True)):
+            try:
+                one.predict()
+                one.update(value)
+                lost = not ((one.x >= self._low) & (one.x <= self._high)).all()
+            except (np.linalg.LinAlgError, ValueError):  # the covariance is no longer positive definite or finite
+                lost = True
+            if lost:
+                self._filters[i] = one = self._fresh()
+                self._begin(one, value)
+        return np.array([one.x for one in self._filters])
+
+    def _begin(self, one: UnscentedKalmanFilter, y: np.ndarray) -> np.ndarray:
+        one.sigmas_f = one.points_fn.sigma_points(one.x, one.P)
+        one.update(y)
+        return np.asarray(one.x)
+
+    def _fresh(self) -> UnscentedKalmanFilter:
+        system = self._system
+        no_input, no_noise = [0.0] * system.nu, [0.0] * system.nx
+
+        def fx(x: np.ndarray, dt: float) -> np.ndarray:
+            return np.array(advance(system, x.tolist(), no_input, no_noise, dt))
+
+        def hx(x: np.ndarray) -> np.ndarray:
+            return np.array(system.h(x))
+
+        points = MerweScaledSigmaPoints(system.nx, alpha=1.0, beta=2.0, kappa=3.0 - system.nx)
+        one = UnscentedKalmanFilter(system.nx, system.ny, self._dt, hx, fx, points)
+        one.x, one.P = (value.copy() for value in self._start)
+        one.Q, one.R = self._Q * self._dt, self._R
+        return one

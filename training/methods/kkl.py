@@ -1,0 +1,89 @@
+"""The methods that make KKL observers in the package's own format: its default, and the paper's SPINN."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver
+from training.config import Config, preset
+from training.methods.base import Budget, CausalObserver, Configuration, Method, Task
+from training.pipeline import train
+
+# Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
+SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
+
+
+def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
+    """2 nx + 1 eigenvalues for each output, evenly spaced in the logarithm."""
+    return tuple((-np.geomspace(-slowest, -fastest, 2 * system.nx + 1)).tolist())
+
+
+class KKLMethod(Method[Artifact]):
+    """Whatever trains an artifact."""
+
+    def observer(self, trained: Artifact, system: System, dt: float, noise: float) -> CausalObserver:
+        """The observer of the package, told the noise level as far as it was trained for it."""
+        return KKLObserver(trained, min(noise, trained.inverse.noise_max))
+
+    def save(self, trained: Artifact, path: Path) -> None:
+        """As an artifact that ``observers.load`` reads."""
+        trained.save(path)
+
+    def load(self, path: Path) -> Artifact:
+        """The artifact."""
+        return Artifact.read(path)
+
+
+def within(config: Config, budget: Budget, seed: int) -> Config:
+    """A configuration of the package with the benchmark's data, networks and cap."""
+    return replace(
+        config,
+        dt=budget.dt,
+        trajectories=budget.trajectories,
+        duration=budget.duration,
+        samples=budget.samples,
+        width=budget.width,
+        depth=budget.depth,
+        activation=budget.activation,  # type: ignore[arg-type]
+        forward_steps=budget.steps if config.forward_steps else 0,
+        inverse_steps=budget.steps,
+        cap=budget.seconds,
+        seed=seed,
+    )
+
+
+class Default(KKLMethod):
+    """The package's own: T_inv(z_y, z_u, noise, age) along driven, noisy trajectories (``kkl-gym train``).
+
+    It simulates its own trajectories, as many as everyone gets, because half of its own are driven. One configuration:
+    the preset, which was chosen during the package's development.
+    """
+
+    name: ClassVar[str] = "default"
+    label: ClassVar[str] = "kkl-gym default"
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        config = within(preset(task.system, "input-aware", "fast"), task.budget, task.seed)
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class SPINN(KKLMethod):
+    """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --method spinn``)."""
+
+    name: ClassVar[str] = "spinn"
+    label: ClassVar[str] = "SPINN"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Three spectra."""
+        return tuple({"spectrum": list(interval)} for interval in SPECTRA)
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
+        fastest, slowest = configuration["spectrum"]
+        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest))
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact

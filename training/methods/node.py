@@ -1,0 +1,97 @@
+"""Learned diagonal spectrum, T_inv trained through the filter (Miao and Gatsis, 2023)."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import nn
+
+from kkl_gym.system import System
+from observers import Artifact, InverseMap
+from training.methods.base import Configuration, Task
+from training.methods.kkl import SPECTRA, KKLMethod, spectrum
+from training.methods.recurrent import Batches, Decoder, rollout
+from training.networks import Network
+from training.pipeline import make_filter, output_matrix
+
+
+class NODE(KKLMethod):
+    """z' = diag(theta) z + B y with theta < 0 learned together with T_inv, by the error of x_hat along trajectories.
+
+    K. Miao and K. Gatsis, "Learning robust state observers using neural ODEs", L4DC 2023. The filter is
+    linear and diagonal, so it is integrated exactly between samples instead of by an ODE solver.
+    """
+
+    name: ClassVar[str] = "node"
+    label: ClassVar[str] = "NODE"
+    noise: ClassVar[float] = 0.0
+    """Standard deviation of the noise added to y in training."""
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Three initial spectra."""
+        return tuple({"spectrum": list(interval)} for interval in SPECTRA)
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """Spectrum and inverse together."""
+        torch.manual_seed(task.seed)
+        system, budget = task.system, task.budget
+        fastest, slowest = configuration["spectrum"]
+        linear = make_filter(spectrum(system, fastest, slowest), system.ny, budget.dt, 0)
+        network = Network(linear.size, system.nx, budget.width, budget.depth, budget.activation)
+        decoder = Decoder(network, linear, task.data, task.device)
+        problem = _Problem(decoder, -linear.A.diagonal()[: linear.size // system.ny], system.ny, budget.dt, task.device)
+        batches = Batches(task.data, decoder, self.noise, task.device)
+        task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=5e-3)
+        eigenvalues = tuple(problem.theta().tolist())
+        return Artifact(
+            filter=make_filter(eigenvalues, system.ny, budget.dt, 0),
+            inverse=InverseMap(
+                mlp=network.export(),
+                features=("z_y",),
+                z_offset=decoder.z_offset,
+                whiten=decoder.whiten,
+                noise_gain=np.zeros(linear.size),
+                x_offset=decoder.x_offset,
+                x_scale=decoder.x_scale,
+            ),
+            system=system.name,
+            parameters=system.parameters,
+            C=output_matrix(system),
+            training={"method": self.name, **configuration, "seed": task.seed},
+        )
+
+
+class NODENoise(NODE):
+    """The variant made robust by noise on y in training."""
+
+    name: ClassVar[str] = "node-noise"
+    label: ClassVar[str] = "NODE, noise"
+    noise: ClassVar[float] = 0.5
+
+
+class _Problem(nn.Module):
+    """The decoder and the logarithms of the rates -theta, the same for each output."""
+
+    def __init__(self, decoder: Decoder, rates: np.ndarray, ny: int, dt: float, device: torch.device) -> None:
+        super().__init__()
+        self.decoder, self.ny, self.dt = decoder, ny, dt
+        self.log_rates = nn.Parameter(torch.as_tensor(np.log(rates), device=device))
+
+    def theta(self) -> torch.Tensor:
+        """Eigenvalues in 1/s, (nz / ny,)."""
+        return -self.log_rates.exp()
+
+    def loss(self, y: torch.Tensor, ages: np.ndarray, x: torch.Tensor) -> dict[str, Any]:
+        """Mean square error of the scaled estimate, from z0 = -A^-1 B y0."""
+        s = self.theta() * self.dt
+        eye = torch.eye(self.ny, dtype=s.dtype, device=s.device)
+
+        def block(values: torch.Tensor) -> torch.Tensor:
+            return torch.kron(eye, values[:, None])
+
+        hold = torch.expm1(s) / self.theta()  # as in observers.LinearFilter: first-order hold on y
+        late = (torch.expm1(s) - s) / (self.theta() * s)
+        z0 = y[:, 0] @ block(-1.0 / self.theta()).T
+        transition = torch.kron(eye, torch.diag(s.exp()))
+        z = rollout(transition, block(hold - late), block(late), z0, y, ages)
+        return {"loss": ((self.decoder(z) - x) ** 2).mean()}

@@ -1,0 +1,108 @@
+"""Linear filters whose spectrum is learned, differentiated through time."""
+
+import numpy as np
+import torch
+from torch import nn
+
+from observers import LinearFilter
+from training.data import run_filter
+from training.methods.base import Data
+from training.networks import Network, tensor
+
+TRAJECTORIES_PER_BATCH = 64
+AGES_PER_BATCH = 64
+SOFT_FLOOR = 1e-2
+
+
+def rollout(
+    transition: torch.Tensor,
+    early: torch.Tensor,
+    late: torch.Tensor,
+    z0: torch.Tensor,
+    y: torch.Tensor,
+    ages: np.ndarray,
+) -> torch.Tensor:
+    """States of z_k+1 = transition z_k + early y_k + late y_k+1 at some ages.
+
+    Between two ages the filter moves in one jump, by powers of the transition, so that fifty seconds of samples cost
+    no more operations than there are ages.
+
+    Parameters
+    ----------
+    transition : (nz, nz).
+    early, late : (nz, ny).
+    z0 : (n, nz).
+    y : (n, steps + 1, ny).
+    ages : sorted, not negative, (m,).
+
+    Returns
+    -------
+    (m, n, nz).
+    """
+    gaps = np.diff(ages, prepend=0)
+    powers = torch.eye(len(transition), dtype=transition.dtype, device=transition.device)[None]
+    square = transition
+    while len(powers) <= gaps.max():  # I, F, F^2, ... by doubling
+        powers = torch.cat([powers, powers @ square])
+        square = square @ square
+    n = len(y)
+    pairs = torch.cat([y[:, :-1], y[:, 1:]], -1)
+    response = (powers @ torch.cat([early, late], -1)).flip(0).transpose(1, 2)  # the oldest sample comes first
+    z, out, age = z0, [], 0
+    for gap in gaps.tolist():
+        if gap:
+            kernel = response[len(response) - gap :].reshape(-1, len(transition))
+            z = z @ powers[gap].T + pairs[:, age : age + gap].reshape(n, -1) @ kernel
+            age += gap
+        out.append(z)
+    return torch.stack(out)
+
+
+class Decoder(nn.Module):
+    """T_inv on z, in coordinates that the initial spectrum gives.
+
+    The components of z are nearly collinear. Its principal directions are scaled to unit variance down to
+    ``SOFT_FLOOR`` of the largest: full whitening would have to follow the spectrum as it is learned.
+    """
+
+    def __init__(self, network: Network, linear: LinearFilter, data: Data, device: torch.device) -> None:
+        super().__init__()
+        y = data.y[:, :500].astype(float)
+        z = run_filter(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
+        self.z_offset, scale = z.mean(0), np.maximum(z.std(0), 1e-12)
+        _, singular, directions = np.linalg.svd((z - self.z_offset) / scale, full_matrices=False)
+        gain = np.sqrt(len(z)) / np.hypot(singular, SOFT_FLOOR * singular[0])
+        self.whiten = gain[:, None] * directions / scale
+        self.x_offset, self.x_scale = data.x.mean((0, 1)), data.x.std((0, 1))
+        self.network = network.to(device)
+        self._offset = torch.as_tensor(self.z_offset, device=device)
+        self._whiten = torch.as_tensor(self.whiten, device=device)
+
+    def forward(self, z: torch.Tensor) -> torch.Tensor:
+        """Scaled state estimates (..., nx) from z (..., nz) in double precision."""
+        x: torch.Tensor = self.network(self.coordinates(z))
+        return x
+
+    def coordinates(self, z: torch.Tensor) -> torch.Tensor:
+        """What the network sees of z."""
+        return ((z - self._offset) @ self._whiten.T).float()
+
+
+class Batches:
+    """Random trajectories at random ages."""
+
+    def __init__(self, data: Data, decoder: Decoder, noise: float, device: torch.device) -> None:
+        self._ages, self._noise = data.ages, noise
+        self._y = tensor(data.y.transpose(1, 0, 2), device)
+        self._x = tensor((data.x - decoder.x_offset) / decoder.x_scale, device)
+
+    def __call__(self, generator: torch.Generator) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:
+        """Outputs (n, steps + 1, ny) in double precision, ages (m,), scaled states (m, n, nx)."""
+        device = self._y.device
+        rows = torch.randint(len(self._y), (TRAJECTORIES_PER_BATCH,), generator=generator, device=device)
+        chosen = torch.randperm(len(self._ages), generator=generator, device=device)[:AGES_PER_BATCH].sort().values
+        ages = self._ages[chosen.cpu().numpy()]
+        y = self._y[rows, : ages[-1] + 1]
+        if self._noise:
+            y = y + self._noise * torch.randn(y.shape, generator=generator, device=device)
+        return y.double(), ages, self._x[chosen[:, None], rows]
