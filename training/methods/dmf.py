@@ -116,7 +116,8 @@ class _Stage(nn.Module):
 
     def z0(self, known: torch.Tensor) -> torch.Tensor:
         """The start that the network gives for a scaled y0 or x0, in double precision."""
-        return self._offset + self.start(known.float()).double() @ self._unwhiten.T
+        z0: torch.Tensor = self._offset + self.start(known.float()).double() @ self._unwhiten.T
+        return z0
 
     def run(self, z0: torch.Tensor, y: torch.Tensor, ages: np.ndarray) -> torch.Tensor:
         """Filter states at ``ages``, (m, n, nz)."""
