@@ -5,12 +5,12 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from linear_system import Oscillator, sylvester
 from rich.console import Console
 from scipy.integrate import solve_ivp
-from scipy.linalg import solve_sylvester
 
 import training.optimise
-from kkl_gym import ReverseDuffing, System, VanDerPol, get_system
+from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from observers import Artifact, KKLObserver, LinearFilter
 from training import errors, preset, smape, train, unseen_runs
 from training.config import Config, override, spectrum
@@ -26,36 +26,12 @@ from training.signals import random_inputs
 CPU = torch.device("cpu")
 
 
-@dataclass(frozen=True)
-class Oscillator(System):
-    """x1' = x2, x2' = -x1 + u, y = x1: linear and neither growing nor decaying."""
-
-    name: ClassVar[str] = "oscillator"
-    X: ClassVar = ((-1, 1), (-1, 1))
-    bounds: ClassVar = ((-30, 30), (-30, 30))
-    u_max: ClassVar = (0.5,)
-    G: ClassVar = ((0.0,), (1.0,))
-
-    def f(self, x):
-        return x[1], -x[0]
-
-    def h(self, x):
-        return (x[0],)
-
-
 TOY = {"trajectories": 20, "duration": 5.0, "samples": 40, "width": 16, "depth": 2, "batch": 128}
 
 
 def toy(system, method="input-aware", **changes):
     steps = {"inverse_steps": 200} | ({"forward_steps": 200} if method == "spinn" else {})
     return override(preset(system, method, "fast"), TOY | steps | changes)
-
-
-def sylvester(eigenvalues):
-    """M with T(x) = M x for the oscillator: M F = A M + B C."""
-    n = len(eigenvalues)
-    F, C = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.array([[1.0, 0.0]])
-    return solve_sylvester(-np.diag(eigenvalues), F, np.ones((n, 1)) @ C)
 
 
 def backward_quadrature(x, eigenvalues):
@@ -273,7 +249,7 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     steps = {"forward_steps": 12000, "inverse_steps": 50, "learning_rate": 2e-3, "physics_weight": 1.0}
     config = replace(override(preset(system, "spinn", "fast"), sizes | steps), activation="silu")
     artifact = train(system, config, tmp_path).artifact
-    M = sylvester(config.eigenvalues)
+    M = sylvester(np.diag(config.eigenvalues), np.ones((len(config.eigenvalues), 1)))
     x = np.random.default_rng(0).uniform(*system.box(), (1000, 2))
     error = artifact.forward(x) - x @ M.T
     relative = np.sqrt((error**2).mean() / ((x @ M.T) ** 2).mean())

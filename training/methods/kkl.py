@@ -1,5 +1,6 @@
 """The methods that make KKL observers in the package's own format: its default, and the paper's SPINN."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -50,7 +51,7 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
         activation=budget.activation,  # type: ignore[arg-type]
         forward_steps=budget.steps if config.forward_steps else 0,
         inverse_steps=budget.steps,
-        cap=budget.seconds,
+        cap=budget.seconds if math.isfinite(budget.seconds) else None,
         seed=seed,
     )
 

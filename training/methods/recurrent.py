@@ -11,7 +11,7 @@ from training.networks import Network, tensor
 
 TRAJECTORIES_PER_BATCH = 64
 AGES_PER_BATCH = 64
-SOFT_FLOOR = 1e-2
+SOFT_FLOOR = 1e-3
 
 
 def rollout(

@@ -1,0 +1,310 @@
+"""Each method of the benchmark, where the truth is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
+from filterpy.kalman import KalmanFilter
+from linear_system import C, F, Oscillator, sylvester
+from scipy.linalg import expm
+
+from kkl_gym import get_system
+from kkl_gym.simulate import simulate
+from observers import Artifact, LinearFilter
+from training.benchmark.protocol import run
+from training.data import output, run_filter
+from training.methods import METHODS, Budget, Task, get_method
+from training.methods.autoencoder import bessel_filter
+from training.methods.base import simulated
+from training.methods.dmf import FORGET, Switching
+from training.methods.gru import Recurrent, _Network
+from training.methods.kalman import (
+    ExtendedKalmanFilter,
+    UnscentedFilters,
+    faster,
+    jacobian,
+    unknown_start,
+    with_sensitivity,
+)
+from training.methods.recurrent import rollout
+
+SMALL = Budget(trajectories=100, duration=30.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.02, steps=600)
+
+
+def trained_on_oscillator(name, tmp_path, configuration=0, **changes):
+    method, system = get_method(name), Oscillator()
+    budget = Budget(**{**vars(SMALL), **changes})
+    trained = method.train(Task(system, budget, tmp_path), method.configurations(system)[configuration])
+    return method, system, trained, budget.dt
+
+
+def oscillations(dt, seconds=30.0, n=8, seed=0):
+    system = Oscillator()
+    x0 = np.random.default_rng(seed).uniform(*system.box(), (n, 2))
+    return simulate(system, x0, round(seconds / dt), dt)
+
+
+@pytest.mark.parametrize("name", ["spinn", "ae"])
+def test_forward_map_of_a_linear_system_is_the_sylvester_solution(name, tmp_path):
+    _, system, artifact, _ = trained_on_oscillator(name, tmp_path, steps=1500 if name == "ae" else 1000)
+    M = sylvester(artifact.filter.A, artifact.filter.B)
+    x = np.random.default_rng(1).uniform(*system.box(), (1000, 2))
+    relative = np.sqrt(((artifact.forward(x) - x @ M.T) ** 2).mean() / ((x @ M.T) ** 2).mean())
+    assert relative < 0.02
+    back = artifact.inverse.x_offset + artifact.inverse.x_scale * artifact.inverse.mlp(
+        (x @ M.T - artifact.inverse.z_offset) @ artifact.inverse.whiten.T
+    )
+    assert np.sqrt(((back - x) ** 2).mean()) < 0.05
+
+
+def decay_rate(difference, dt, first, last):
+    """Of |difference| between two times in seconds, by a line through its logarithm, in 1/s."""
+    k = np.arange(round(first / dt), round(last / dt))
+    return -np.polyfit(k * dt, np.log(np.linalg.norm(difference[k], axis=-1).mean(-1)), 1)[0]
+
+
+def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
+    method, system, artifact, dt = trained_on_oscillator("node", tmp_path, configuration=1)
+    x = oscillations(dt)
+    y = output(system, x)
+    x_hat = run(method.observer(artifact, system, dt, 0.0), y)
+    assert np.abs(x_hat - x)[len(x) // 2 :].max() < 0.05
+    misled = y.copy()
+    misled[0] += 0.5  # only the start differs from here on
+    slowest = -artifact.filter.A.diagonal().max()
+    assert slowest != pytest.approx(1.0, abs=1e-4)  # it was learned, 1 is where it began
+    rate = decay_rate(run(method.observer(artifact, system, dt, 0.0), misled) - x_hat, dt, 3.0, 6.0)
+    assert rate == pytest.approx(slowest, rel=0.1)
+
+
+def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
+    method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, configuration=1)
+    for stage in ("transient", "asymptotic"):
+        assert np.abs(np.linalg.eigvals(arrays[f"{stage}.A"])).max() < 1
+    x = oscillations(dt)
+    y = output(system, x)
+    x_hat = run(method.observer(arrays, system, dt, 0.0), y)
+    assert np.abs(x_hat - x)[len(x) // 2 :].max() < 0.05
+    one_stage = {**arrays, **{k.replace("transient", "asymptotic"): v for k, v in arrays.items() if "transient" in k}}
+    misled = y.copy()
+    misled[0] += 0.5
+    rate = decay_rate(run(Switching(one_stage, system), misled) - run(Switching(one_stage, system), y), dt, 4.0, 6.0)
+    slowest = -np.log(np.abs(np.linalg.eigvals(arrays["transient.A"])).max()) / dt
+    assert rate == pytest.approx(slowest, rel=0.15)
+
+
+def test_dmf_switches_to_the_smaller_filtered_innovation(tmp_path):
+    method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, steps=5)
+    broken = {**arrays, "transient.x_offset": np.array([5.0, 5.0])}  # its innovation is about 5 from now on
+    y = output(system, oscillations(dt, 1.0))
+    observer = method.observer(broken, system, dt, 0.0)
+    first = run(observer, y)
+    assert np.abs(first[0] - 5).max() < 3  # the transient observer begins
+    asymptotic = {k: v for k, v in broken.items()}
+    asymptotic |= {k.replace("asymptotic", "transient"): v for k, v in broken.items() if "asymptotic" in k}
+    np.testing.assert_allclose(first[1:], run(Switching(asymptotic, system), y)[1:])
+    assert 0 < FORGET < 1
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+def test_rollout_is_the_filter_sample_by_sample(ny):
+    rng = np.random.default_rng(0)
+    A = -np.diag(rng.uniform(0.5, 5.0, 4)) + np.triu(rng.normal(size=(4, 4)), 1)
+    linear = LinearFilter(A, rng.normal(size=(4, ny)), 0.05)
+    y = rng.normal(size=(301, 3, ny))
+    ages = np.array([0, 1, 2, 7, 8, 150, 300])
+    expected = run_filter(linear, y, np.zeros((300, 3, 0)), ages)
+    parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y, expected[0]))
+    found = rollout(*parts, torch.as_tensor(y.swapaxes(0, 1)), ages)
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-10, atol=1e-12)
+
+
+def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
+    from training.methods import node
+
+    seen = {}
+    original = node.rollout
+
+    def spy(transition, early, late, z0, y, ages):
+        seen.update(transition=transition.detach().numpy(), early=early.detach().numpy(), late=late.detach().numpy())
+        return original(transition, early, late, z0, y, ages)
+
+    node.rollout = spy
+    try:
+        _, _, artifact, _ = trained_on_oscillator("node", tmp_path, steps=1)
+    finally:
+        node.rollout = original
+    linear = artifact.filter  # one step of Adam moves the rates by a relative 5e-3 / 1 at most
+    np.testing.assert_allclose(seen["transition"], linear.transition, rtol=1e-2)
+    np.testing.assert_allclose(seen["early"], linear.early_y, rtol=1e-2)
+    np.testing.assert_allclose(seen["late"], linear.late_y, rtol=1e-2)
+
+
+def test_gru_learns_and_steps_as_it_was_trained(tmp_path):
+    method, system, arrays, dt = trained_on_oscillator("gru", tmp_path, steps=400)
+    x = oscillations(dt)
+    y = output(system, x)
+    x_hat = run(method.observer(arrays, system, dt, 0.0), y)
+    late = slice(len(x) // 2, None)
+    assert np.sqrt(((x_hat - x)[late] ** 2).mean()) < 0.3 * np.sqrt((x[late] ** 2).mean())
+    network = _Network(1, 2, 64)
+    scaling = {"y_offset", "y_scale", "x_offset", "x_scale"}
+    network.load_state_dict({k: torch.as_tensor(v) for k, v in arrays.items() if k not in scaling})
+    scaled = torch.as_tensor((y - arrays["y_offset"]) / arrays["y_scale"], dtype=torch.float32)
+    with torch.no_grad():
+        whole = arrays["x_offset"] + arrays["x_scale"] * network.readout(network.gru(scaled)[0]).numpy()
+    np.testing.assert_allclose(run(Recurrent(arrays), y), whole, atol=1e-4)
+
+
+def test_default_estimates_the_oscillator(tmp_path):
+    method, system, artifact, dt = trained_on_oscillator("default", tmp_path, steps=600)
+    assert artifact.nu == 1
+    x = oscillations(dt)
+    x_hat = run(method.observer(artifact, system, dt, 0.0), output(system, x))
+    assert np.sqrt(((x_hat - x)[len(x) // 2 :] ** 2).mean()) < 0.05
+
+
+def kalman(dt, Q, R, x0, P0):
+    one = KalmanFilter(dim_x=2, dim_z=1)
+    one.F, one.H, one.Q, one.R = expm(F * dt), C, Q * dt, R
+    one.x, one.P = x0[:, None].copy(), P0.copy()
+    return one
+
+
+@pytest.mark.parametrize("filters", [ExtendedKalmanFilter, UnscentedFilters])
+def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters):
+    dt, Q, R = 0.02, np.diag([0.01, 0.02]), np.array([[0.3]])
+    x0, P0 = np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])
+    y = np.random.default_rng(0).normal(size=(200, 3, 1))
+    found = run(filters(Oscillator(), dt, Q, R, x0, P0), y)
+    for i in range(3):
+        one = kalman(dt, Q, R, x0, P0)
+        one.update(y[0, i])
+        expected = [one.x[:, 0]]
+        for value in y[1:, i]:
+            one.predict()
+            one.update(value)
+            expected.append(one.x[:, 0])
+        np.testing.assert_allclose(found[:, i], expected, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_ekf_against_filterpy(name):
+    system, dt = get_system(name), 0.01
+    x0, P0 = unknown_start(system)
+    Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
+    x = simulate(system, np.array([x0 + 0.1 * np.array(system.scale)]), 100, dt)
+    y = output(system, x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
+    found = run(ExtendedKalmanFilter(system, dt, Q, R, x0, P0), y)
+
+    def flow(state):
+        return simulate(system, state, 1, dt)[1]
+
+    one = FilterpyEKF(dim_x=system.nx, dim_z=1)
+    one.x, one.P, one.Q, one.R = x0.copy(), P0.copy(), Q * dt, R
+    rows = jacobian(system.h, system.nx)
+    H = np.array([[row[j](*x0) if j in row else 0.0 for j in range(system.nx)] for row in rows])
+    for k, value in enumerate(y[:, 0]):
+        if k:
+            around = one.x + 1e-5 * np.vstack([np.eye(system.nx), -np.eye(system.nx)])
+            moved = flow(around)
+            Phi = ((moved[: system.nx] - moved[system.nx :]) / 2e-5).T
+            one.x, one.P = flow(one.x[None])[0], Phi @ one.P @ Phi.T + one.Q
+        one.update(value, lambda _: H, lambda state: H @ state)
+        np.testing.assert_allclose(found[k, 0], one.x, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_sensitivity_is_the_derivative_of_the_flow(name):
+    system, dt, eps = get_system(name), 0.05, 1e-5
+    nx = system.nx
+    x = np.random.default_rng(0).uniform(*system.box(0.5), (4, nx))
+    start = np.concatenate([x, np.tile(np.eye(nx).ravel(), (4, 1))], 1)
+    Phi = simulate(with_sensitivity(system), start, 1, dt)[1][:, nx:].reshape(4, nx, nx)
+    for j in range(nx):
+        step = eps * np.eye(nx)[j]
+        difference = (simulate(system, x + step, 1, dt)[1] - simulate(system, x - step, 1, dt)[1]) / (2 * eps)
+        np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
+
+
+def test_a_filter_that_leaves_the_bounds_starts_anew():
+    system = get_system("van_der_pol")
+    x0, P0 = unknown_start(system)
+    for filters in (ExtendedKalmanFilter, UnscentedFilters):
+        observer = filters(system, 0.01, np.eye(2), 0.01 * np.eye(1), x0, P0)
+        observer.reset(np.array([[1.0]]))
+        for value in (1e9, 1e-9, 1e12, 0.5):
+            x_hat = observer.step(np.array([[value]]))
+        x_hat = run(observer, np.full((50, 1, 1), 0.5))
+        assert np.isfinite(x_hat).all()
+        assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
+
+
+def test_wrong_models_are_ten_percent_off():
+    believed = get_method("ekf-wrong").model(get_system("lorenz"))
+    assert believed.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
+    duffing = get_system("reverse_duffing")
+    np.testing.assert_allclose(
+        get_method("ekf-wrong").model(duffing).f([0.3, 0.5]), 1.1 * np.array(duffing.f([0.3, 0.5]))
+    )
+    quick = faster(duffing, 2.0)
+    x = np.array([[0.5, -0.3]])
+    np.testing.assert_allclose(simulate(quick, x, 10, 0.01)[-1], simulate(duffing, x, 20, 0.01)[-1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("nx", [2, 3])
+def test_bessel_filter_has_the_poles_of_a_bessel_filter(nx):
+    from scipy.signal import bessel
+
+    D, ones = bessel_filter(nx, 2)
+    assert D.shape == (2 * (nx + 1), 2 * (nx + 1))
+    assert ones.sum(0).tolist() == [nx + 1, nx + 1]
+    poles = np.sort_complex(np.linalg.eigvals(D[: nx + 1, : nx + 1]))
+    np.testing.assert_allclose(poles, np.sort_complex(bessel(nx + 1, 1.0, analog=True, output="zpk")[1]), atol=1e-9)
+
+
+def test_training_data_is_the_same_for_everyone_and_matches_the_states():
+    system = Oscillator()
+    data = simulated(system, SMALL, 0)
+    assert data is simulated(Oscillator(), SMALL, 0)
+    assert data.x.shape == (len(data.ages), 100, 2)
+    assert data.y.shape == (1501, 100, 1)
+    np.testing.assert_allclose(data.y[data.ages], output(system, data.x), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_saved_and_loaded_is_the_same_observer(name, tmp_path):
+    method, system = get_method(name), Oscillator()
+    budget = Budget(trajectories=10, duration=25.0, samples=20, seconds=math.inf, width=8, depth=1, dt=0.02, steps=2)
+    trained = method.train(Task(system, budget, tmp_path / "train"), method.configurations(system)[-1])
+    assert 1 <= len(method.configurations(system)) <= 3
+    path = tmp_path / "trained.safetensors"
+    method.save(trained, path)
+    y = output(system, oscillations(0.02, 1.0, n=3))
+    before, after = (run(method.observer(one, system, 0.02, 0.1), y) for one in (trained, method.load(path)))
+    np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-9)
+    assert before.shape == (51, 3, 2)
+    path.write_bytes(path.read_bytes()[:-7])
+    with pytest.raises(ValueError, match="damaged|trained.safetensors"):
+        method.load(path)
+
+
+def test_a_file_of_another_method_is_refused(tmp_path):
+    get_method("ekf").save({"process_noise": np.ones(1)}, tmp_path / "one.safetensors")
+    with pytest.raises(ValueError, match="'ekf', not 'gru'"):
+        get_method("gru").load(tmp_path / "one.safetensors")
+
+
+def test_methods_that_make_artifacts_make_files_for_everyone(tmp_path):
+    method, _, trained, _ = trained_on_oscillator("node", tmp_path / "train", steps=2)
+    method.save(trained, tmp_path / "node.safetensors")
+    assert Artifact.read(tmp_path / "node.safetensors").training["method"] == "node"
+
+
+def test_unknown_method():
+    with pytest.raises(ValueError, match="unknown method 'kalman'; there are default, spinn"):
+        get_method("kalman")
+    with pytest.raises(ValueError, match="not a subclass of training.Method"):
+        get_method("training.methods.gru:Recurrent")
