@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 
-.PHONY: demo test test-slow lint format maps results speed clean
+.PHONY: demo test test-slow lint format maps results benchmark speed clean
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -34,6 +34,11 @@ maps: $(VENV)/ready
 results: $(VENV)/ready
 	$(BIN)/kkl-gym demo --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
+
+benchmark: $(VENV)/ready  ## every method on every system, about three hours on two cores; resumable
+	$(BIN)/kkl-gym benchmark
+	mkdir -p docs/results/benchmark
+	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
 speed: $(VENV)/ready  ## single environments against Pendulum-v1
 	$(BIN)/kkl-gym speed

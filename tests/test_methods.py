@@ -30,7 +30,7 @@ from training.methods.kalman import (
 )
 from training.methods.recurrent import rollout
 
-SMALL = Budget(trajectories=100, duration=30.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.02, steps=600)
+SMALL = Budget(trajectories=100, duration=25.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.05, steps=600)
 
 
 def trained_on_oscillator(name, tmp_path, configuration=0, **changes):
@@ -46,17 +46,30 @@ def oscillations(dt, seconds=30.0, n=8, seed=0):
     return simulate(system, x0, round(seconds / dt), dt)
 
 
-@pytest.mark.parametrize("name", ["spinn", "ae"])
-def test_forward_map_of_a_linear_system_is_the_sylvester_solution(name, tmp_path):
-    _, system, artifact, _ = trained_on_oscillator(name, tmp_path, steps=1500 if name == "ae" else 1000)
+@pytest.mark.parametrize(
+    ("name", "steps", "tolerance"),
+    [
+        ("spinn", 1000, 0.1),
+        ("ae", 800, 0.05),
+        pytest.param("spinn", 8000, 0.01, marks=pytest.mark.slow),
+        pytest.param("ae", 8000, 0.01, marks=pytest.mark.slow),
+    ],
+)
+def test_forward_map_of_a_linear_system_is_the_sylvester_solution(name, steps, tolerance, tmp_path):
+    _, system, artifact, _ = trained_on_oscillator(name, tmp_path, steps=steps)
     M = sylvester(artifact.filter.A, artifact.filter.B)
     x = np.random.default_rng(1).uniform(*system.box(), (1000, 2))
-    relative = np.sqrt(((artifact.forward(x) - x @ M.T) ** 2).mean() / ((x @ M.T) ** 2).mean())
-    assert relative < 0.02
-    back = artifact.inverse.x_offset + artifact.inverse.x_scale * artifact.inverse.mlp(
-        (x @ M.T - artifact.inverse.z_offset) @ artifact.inverse.whiten.T
-    )
-    assert np.sqrt(((back - x) ** 2).mean()) < 0.05
+    z = x @ M.T
+    assert np.sqrt(((artifact.forward(x) - z) ** 2).mean() / (z**2).mean()) < tolerance
+    inverse = artifact.inverse
+    back = inverse.x_offset + inverse.x_scale * inverse.mlp((z - inverse.z_offset) @ inverse.whiten.T)
+    assert np.sqrt(((back - x) ** 2).mean() / (x**2).mean()) < 3 * tolerance
+
+
+def late_error(x, x_hat):
+    """Over the second half, relative to the size of the motion."""
+    late = slice(len(x) // 2, None)
+    return np.sqrt(((x_hat - x)[late] ** 2).mean() / (x[late] ** 2).mean())
 
 
 def decay_rate(difference, dt, first, last):
@@ -70,7 +83,7 @@ def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     x = oscillations(dt)
     y = output(system, x)
     x_hat = run(method.observer(artifact, system, dt, 0.0), y)
-    assert np.abs(x_hat - x)[len(x) // 2 :].max() < 0.05
+    assert late_error(x, x_hat) < 0.1
     misled = y.copy()
     misled[0] += 0.5  # only the start differs from here on
     slowest = -artifact.filter.A.diagonal().max()
@@ -80,13 +93,13 @@ def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
 
 
 def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
-    method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, configuration=1)
+    method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, configuration=1, steps=400)
     for stage in ("transient", "asymptotic"):
         assert np.abs(np.linalg.eigvals(arrays[f"{stage}.A"])).max() < 1
     x = oscillations(dt)
     y = output(system, x)
     x_hat = run(method.observer(arrays, system, dt, 0.0), y)
-    assert np.abs(x_hat - x)[len(x) // 2 :].max() < 0.05
+    assert late_error(x, x_hat) < 0.1
     one_stage = {**arrays, **{k.replace("transient", "asymptotic"): v for k, v in arrays.items() if "transient" in k}}
     misled = y.copy()
     misled[0] += 0.5
@@ -102,8 +115,7 @@ def test_dmf_switches_to_the_smaller_filtered_innovation(tmp_path):
     observer = method.observer(broken, system, dt, 0.0)
     first = run(observer, y)
     assert np.abs(first[0] - 5).max() < 3  # the transient observer begins
-    asymptotic = {k: v for k, v in broken.items()}
-    asymptotic |= {k.replace("asymptotic", "transient"): v for k, v in broken.items() if "asymptotic" in k}
+    asymptotic = broken | {k.replace("asymptotic", "transient"): v for k, v in broken.items() if "asymptotic" in k}
     np.testing.assert_allclose(first[1:], run(Switching(asymptotic, system), y)[1:])
     assert 0 < FORGET < 1
 
@@ -143,12 +155,11 @@ def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
 
 
 def test_gru_learns_and_steps_as_it_was_trained(tmp_path):
-    method, system, arrays, dt = trained_on_oscillator("gru", tmp_path, steps=400)
+    method, system, arrays, dt = trained_on_oscillator("gru", tmp_path, steps=200)
     x = oscillations(dt)
     y = output(system, x)
     x_hat = run(method.observer(arrays, system, dt, 0.0), y)
-    late = slice(len(x) // 2, None)
-    assert np.sqrt(((x_hat - x)[late] ** 2).mean()) < 0.3 * np.sqrt((x[late] ** 2).mean())
+    assert late_error(x, x_hat) < 0.3
     network = _Network(1, 2, 64)
     scaling = {"y_offset", "y_scale", "x_offset", "x_scale"}
     network.load_state_dict({k: torch.as_tensor(v) for k, v in arrays.items() if k not in scaling})
@@ -163,7 +174,7 @@ def test_default_estimates_the_oscillator(tmp_path):
     assert artifact.nu == 1
     x = oscillations(dt)
     x_hat = run(method.observer(artifact, system, dt, 0.0), output(system, x))
-    assert np.sqrt(((x_hat - x)[len(x) // 2 :] ** 2).mean()) < 0.05
+    assert late_error(x, x_hat) < 0.2
 
 
 def kalman(dt, Q, R, x0, P0):
@@ -270,7 +281,7 @@ def test_training_data_is_the_same_for_everyone_and_matches_the_states():
     data = simulated(system, SMALL, 0)
     assert data is simulated(Oscillator(), SMALL, 0)
     assert data.x.shape == (len(data.ages), 100, 2)
-    assert data.y.shape == (1501, 100, 1)
+    assert data.y.shape == (501, 100, 1)
     np.testing.assert_allclose(data.y[data.ages], output(system, data.x), atol=1e-6)
 
 
@@ -287,7 +298,7 @@ def test_saved_and_loaded_is_the_same_observer(name, tmp_path):
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-9)
     assert before.shape == (51, 3, 2)
     path.write_bytes(path.read_bytes()[:-7])
-    with pytest.raises(ValueError, match="damaged|trained.safetensors"):
+    with pytest.raises(ValueError, match=r"damaged|incomplete"):
         method.load(path)
 
 
@@ -304,7 +315,7 @@ def test_methods_that_make_artifacts_make_files_for_everyone(tmp_path):
 
 
 def test_unknown_method():
-    with pytest.raises(ValueError, match="unknown method 'kalman'; there are default, spinn"):
+    with pytest.raises(ValueError, match="unknown method 'kalman'"):
         get_method("kalman")
-    with pytest.raises(ValueError, match="not a subclass of training.Method"):
+    with pytest.raises(ValueError, match=r"not a subclass of training\.Method"):
         get_method("training.methods.gru:Recurrent")

@@ -1,6 +1,7 @@
 """``kkl-gym benchmark``."""
 
 import json
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -69,8 +70,7 @@ class Benchmark:
         if self.report:
             _report(out, console)
             return out
-        if self.jobs < 1 or not self.systems or not self.methods:
-            raise ValueError("name at least one system, one method and one worker process")
+        self._check()
         jobs = self._jobs(name, out)
         for job in jobs:
             job.claim()
@@ -87,11 +87,21 @@ class Benchmark:
                 text = f"observers (now {', '.join(running)})" if running else "observers"
                 progress.update(task, advance=1, description=text)
             self._time(jobs, progress)
-        _collect(out, name, jobs)
-        _report(out, console)
+        if any(job.done for job in jobs):
+            _collect(out, name, jobs)
+            _report(out, console)
         if failures:
             raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
         return out
+
+    def _check(self) -> None:
+        if self.jobs < 1 or not self.systems or not self.methods or not self.noise:
+            raise ValueError("give at least one system, method, noise level and worker process")
+        if any(not 0 <= level < math.inf for level in self.noise) or self.seed < 0:
+            raise ValueError(f"noise = {self.noise} must be finite, and it and seed = {self.seed} not negative")
+        for names in (self.systems, self.methods, self.noise):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{names} names one of them twice")
 
     def _jobs(self, name: str, out: Path) -> list[Job]:
         protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, noise=self.noise, seed=self.seed)
@@ -154,8 +164,6 @@ def _collect(out: Path, name: str, jobs: list[Job]) -> None:
                 "seed": job["protocol"]["seed"],
             }
         )
-    if not errors:
-        raise ValueError(f"no job in {out} has finished")
     write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
     write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
 

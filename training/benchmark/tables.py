@@ -51,8 +51,10 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: 
             lines.append(f"| {label} | " + " | ".join(cell(system, name) for system in systems) + " |")
         lines.append("")
 
+    summaries = {column: summarise(results, column) for column in ("smape", "smape_late", "settling", "rmse_late")}
+
     def measure(column: str, form: str, starts: str, noise: float) -> Any:
-        summary = summarise(results, column)
+        summary = summaries[column]
         chosen = summary[(summary.starts == starts) & (summary.noise == noise)].set_index(["system", "method"])
 
         def cell(system: str, name: str) -> str:
@@ -181,7 +183,7 @@ def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) ->
             ax.tick_params(length=0)
     figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", shrink=0.6)
     figure.suptitle(note, fontsize=9)
-    figure.savefig(path, dpi=130, metadata={"Software": None})
+    figure.savefig(path, dpi=130)
     plt.close(figure)
 
 

@@ -1,0 +1,383 @@
+"""The benchmark's protocol, jobs, tables and command."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from rich.console import Console
+
+import training.benchmark.command as command
+from kkl_gym import get_system
+from training.benchmark.command import Benchmark
+from training.benchmark.jobs import Job, run_all
+from training.benchmark.protocol import Protocol, measure, run, step_time, validate
+from training.benchmark.tables import summarise
+from training.data import output
+from training.evaluate import EVALUATION_SEED, VALIDATION_SEED, starts, unseen_runs
+from training.methods import METHODS, Budget, Method, get_method
+from training.metrics import component_smape, rmse, settling_time, smape
+
+TINY = Budget(trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
+SHORT = Protocol(trajectories=2, duration=2.0)
+COMMITTED = Path(__file__).parents[1] / "docs" / "results" / "benchmark"
+
+TOY = '''
+from pathlib import Path
+
+import numpy as np
+
+from training.methods import Method
+
+
+class Constant(Method):
+    """The mean of the training states, whatever y says."""
+
+    name = "constant"
+    label = "constant mean"
+
+    def configurations(self, system):
+        return ({"shift": 1.0}, {"shift": 0.0}, {"shift": 2.0})
+
+    def train(self, task, configuration):
+        with (Path(__file__).parent / "trainings").open("a") as log:
+            log.write(f"{task.system.name} {configuration['shift']}\\n")
+        return {"mean": task.data.x.mean((0, 1)) + configuration["shift"] * np.array(task.system.scale)}
+
+    def observer(self, trained, system, dt, noise):
+        return Held(trained["mean"])
+
+
+class Held:
+    def __init__(self, mean):
+        self.mean = mean
+
+    def reset(self, y0):
+        return np.tile(self.mean, (len(y0), 1))
+
+    def step(self, y):
+        return np.tile(self.mean, (len(y), 1))
+'''
+
+
+@pytest.fixture
+def toy(tmp_path):
+    """A user's method in a script of its own, and the log of its trainings."""
+    folder = tmp_path / "user"
+    folder.mkdir()
+    (folder / "toy.py").write_text(TOY)
+    return f"{folder / 'toy.py'}:Constant", folder / "trainings"
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """The command at toy size."""
+    monkeypatch.setitem(command.BUDGETS, "cpu", TINY)
+    monkeypatch.setitem(command.BUDGETS, "quick", TINY)
+    monkeypatch.setattr(command, "PROTOCOL", SHORT)
+    monkeypatch.setattr(command, "QUICK_PROTOCOL", SHORT)
+    monkeypatch.setattr(command, "VALIDATION", SHORT)
+    monkeypatch.setattr(command, "step_time", lambda *_: 1.0)
+
+
+def quiet():
+    return Console(quiet=True)
+
+
+def test_metrics_by_hand():
+    x = np.array([[[3.0, 4.0]], [[3.0, 4.0]], [[3.0, 4.0]], [[0.0, 0.0]]])
+    x_hat = np.array([[[0.0, 0.0]], [[3.0, 0.0]], [[3.0, 4.0]], [[0.0, 0.0]]])
+    assert smape(x, x_hat) == pytest.approx([100 * (2 + 2 * 4 / 8 + 0 + 0) / 4])
+    assert smape(x, x_hat, skip=1) == pytest.approx([100 * (2 * 4 / 8 + 0 + 0) / 3])
+    assert component_smape(x, x_hat) == pytest.approx([100 * (2 + 2 + 0 + 2 + 0 + 0 + 0 + 0) / 8])
+    assert component_smape(x, x_hat, skip=2) == pytest.approx([0.0])
+    assert rmse(x, x_hat) == pytest.approx([math.sqrt((25 + 16) / 4)])
+    assert rmse(x, x_hat, skip=1) == pytest.approx([math.sqrt(16 / 3)])
+    # The root mean square of |x| is sqrt(75 / 4); errors 5 and 4 are above a tenth of it, 0 is below.
+    assert settling_time(x, x_hat, dt=0.5) == pytest.approx([1.0])
+    assert settling_time(x, x, dt=0.5) == pytest.approx([0.0])
+    assert settling_time(x, x[::-1], dt=0.5) == pytest.approx([math.inf])
+
+
+def test_estimates_that_are_not_finite_count_as_infinitely_far():
+    x = np.ones((4, 3, 2))
+    x_hat = x.copy()
+    x_hat[3, 0, 0], x_hat[3, 1, 0] = np.nan, np.inf
+    assert smape(x, x_hat) == pytest.approx([50.0, 50.0, 0.0])
+    assert component_smape(x, x_hat) == pytest.approx([25.0, 25.0, 0.0])
+    assert rmse(x, x_hat).tolist() == [math.inf, math.inf, 0.0]
+    assert settling_time(x, x_hat, 0.1).tolist() == [math.inf, math.inf, 0.0]
+
+
+class Oracle(Method):
+    """Knows the trajectories of one case; broken ones at will."""
+
+    name, label = "oracle", "oracle"
+
+    def __init__(self, x, wrong=()):
+        self.x, self.wrong = x, wrong
+
+    def train(self, task, configuration):
+        raise AssertionError
+
+    def observer(self, trained, system, dt, noise):
+        return self
+
+    def reset(self, y0):
+        self.k = -1
+        return self.step(y0)
+
+    def step(self, y):
+        self.k += 1
+        x = self.x[self.k].copy()
+        for row, value in self.wrong:
+            x[row] = value
+        return x
+
+
+def test_measure_marks_the_lost_and_the_escaped():
+    system, dt = get_system("rossler"), 0.01
+    protocol = Protocol(domains=("2X",), noise=(0.0,), trajectories=100, duration=20.0)
+    runs = unseen_runs(system, dt, 100, 20.0, 0, "2X")
+    assert runs.escaped > 0
+    frame = measure(Oracle(runs.x, wrong=((0, np.nan), (1, 1e6))), None, system, dt, protocol)
+    assert len(frame) == 100
+    escaped = frame[frame.escaped == 1]
+    assert escaped.trajectory.tolist() == np.flatnonzero(~runs.inside).tolist()
+    assert escaped.smape.isna().all()
+    inside = frame[frame.escaped == 0]
+    assert inside.lost.tolist() == [1.0, 1.0] + [0.0] * (len(inside) - 2)
+    assert (inside.smape[2:] == 0).all()
+    assert inside.smape.iloc[0] == 200.0
+
+
+def test_methods_that_are_slow_get_the_first_trajectories():
+    system, dt = get_system("van_der_pol"), 0.05
+    runs = unseen_runs(system, dt, 2, 1.0, 0, "X")
+    method = Oracle(runs.x)
+    method.trajectories = 2
+    frame = measure(method, None, system, dt, Protocol(domains=("X",), trajectories=100, duration=1.0))
+    assert len(frame) == 2 * 2
+    many = unseen_runs(system, dt, 100, 1.0, 0, "X")
+    np.testing.assert_array_equal(many.x[:, :2], runs.x)
+
+
+def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
+    system, seen = get_system("lorenz"), []
+
+    class Spy(Oracle):
+        def observer(self, trained, system, dt, noise):
+            self.told = noise
+            return self
+
+        def reset(self, y0):
+            seen.append([])
+            return super().reset(y0)
+
+        def step(self, y):
+            seen[-1].append(y)
+            return super().step(y)
+
+    runs = unseen_runs(system, 0.01, 20, 2.0, 0, "X")
+    method = Spy(runs.x)
+    measure(method, None, system, 0.01, Protocol(domains=("X",), trajectories=20, duration=2.0))
+    quiet_y, noisy_y = (np.array(record) for record in seen)
+    np.testing.assert_array_equal(quiet_y, output(system, runs.x))
+    assert (noisy_y - quiet_y).std() == pytest.approx(0.5, rel=0.05)
+    assert method.told == 0.5
+
+
+def test_validation_trajectories_are_not_those_of_evaluation():
+    system = get_system("lorenz")
+    evaluation, validation = (
+        unseen_runs(system, 0.01, 5, 0.1, 0, first=first).x for first in (EVALUATION_SEED, VALIDATION_SEED)
+    )
+    assert np.abs(evaluation[0] - validation[0]).min() > 1e-3
+    exact = unseen_runs(system, 0.01, 5, 0.1, 0, first=VALIDATION_SEED).x
+    protocol = Protocol(noise=(0.0, 0.5), trajectories=5, duration=0.1)
+    assert validate(Oracle(exact), None, system, 0.01, protocol) == pytest.approx(1e-6)
+    double = validate(Oracle(2 * exact), None, system, 0.01, protocol)
+    assert double == pytest.approx(100 * 2 / 3)
+
+
+@pytest.mark.parametrize("domain", ["1.5X", "2X"])
+def test_starts_outside_x_lie_between_the_boxes(domain):
+    system = get_system("rossler")
+    x0 = starts(system, domain, 500, np.random.default_rng(0))
+    low, high = system.box()
+    assert ((x0 < low) | (x0 > high)).any(-1).all()
+    low, high = system.box(float(domain[:-1]))
+    assert ((x0 >= low) & (x0 <= high)).all()
+    assert (x0.max(0) > 0.9 * high).all()
+
+
+def test_step_time_is_positive():
+    x = np.zeros((10**6, 7, 3))
+    assert 0 < step_time(Oracle(x), None, get_system("lorenz"), 0.01, 7, seconds=0.02) < 1e5
+
+
+def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
+    name, trainings = toy
+    out = tmp_path / "out"
+    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(quiet())
+    results = pd.read_csv(out / "results.csv")
+    assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
+    expected = unseen_runs(get_system("lorenz"), TINY.dt, 2, 2.0, 0).x
+    info = json.loads((out / "jobs" / "lorenz" / "constant" / "info.json").read_text())
+    assert info["configuration"] == {"shift": 0.0}  # the sensible one of the three won on validation
+    assert info["validation"][1] == min(info["validation"])
+    mean = get_method(name).load(out / "jobs" / "lorenz" / "constant" / "trained.safetensors")["mean"]
+    row = results[(results.system == "lorenz") & (results.method == "constant") & (results.starts == "X")]
+    found = row[row.noise == 0].smape.to_numpy()
+    np.testing.assert_allclose(found, smape(expected, np.broadcast_to(mean, expected.shape)), rtol=1e-3)
+    table = (out / "table.md").read_text()
+    assert "| constant mean |" in table
+    assert "Partial: 4 of 52 observers." in table
+    with Image.open(out / "heatmap.png") as figure:
+        assert figure.size[0] > 300
+    assert len(trainings.read_text().splitlines()) == 2 * 4  # three configurations and the final one
+
+
+def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path, monkeypatch):
+    name, trainings = toy
+    out = tmp_path / "out"
+    benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, jobs=1)
+    original = command.run_all
+
+    def stopped(jobs, workers):
+        for i, found in enumerate(original(jobs, workers)):
+            if i == 1:
+                raise KeyboardInterrupt
+            yield found
+
+    monkeypatch.setattr(command, "run_all", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.run(quiet())
+    monkeypatch.setattr(command, "run_all", original)
+    shutil.rmtree(out / "jobs" / "lorenz" / "constant")
+    done = trainings.read_text().split()
+    benchmark.run(quiet())
+    after = trainings.read_text().split()
+    assert after.count("van_der_pol") == done.count("van_der_pol") == 4
+    assert after.count("lorenz") == done.count("lorenz") + 4
+    results = (out / "results.csv").read_bytes()
+    benchmark.run(quiet())
+    assert trainings.read_text().split() == after
+    assert (out / "results.csv").read_bytes() == results
+
+
+def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
+    name, trainings = toy
+    job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, 1.0, SHORT)
+    job.claim()
+    (job.folder / "configuration-0.json").write_text('{"configuration": {"shift": 1.0}, "score": 1e-9}')
+    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
+    assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0"]
+
+
+def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
+    name, _ = toy
+    script = Path(name.rpartition(":")[0])
+    script.write_text(script.read_text() + '\n\nclass Broken(Constant):\n    name = "broken"\n    train = None\n')
+    out = tmp_path / "out"
+    with pytest.raises(ValueError, match="1 of 2 jobs failed; the first: lorenz/broken"):
+        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(quiet())
+    assert set(pd.read_csv(out / "methods.csv").method) == {"constant"}
+
+
+def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):
+    name, _ = toy
+    out = tmp_path / "out"
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
+    with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
+        Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"systems": ("lorentz",)}, "unknown system 'lorentz'"),
+        ({"methods": ("kalman",)}, "unknown method 'kalman'"),
+        ({"methods": ()}, "at least one"),
+        ({"jobs": 0}, "at least one"),
+        ({"report": True}, "does not exist; run the benchmark first"),
+        ({"noise": (-0.1,)}, "noise"),
+        ({"seed": -1}, "seed"),
+        ({"methods": ("ekf", "ekf")}, "twice"),
+    ],
+)
+def test_impossible_benchmarks(wrong, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(quiet())
+    assert not (tmp_path / "out").exists()
+
+
+def test_worker_processes_do_what_one_process_does(toy, tmp_path):
+    name, _ = toy
+    jobs = {
+        workers: [
+            Job(system, name, tmp_path / str(workers) / system, TINY, SHORT, None, SHORT)
+            for system in ("lorenz", "van_der_pol")
+        ]
+        for workers in (1, 2)
+    }
+    for workers, mine in jobs.items():
+        assert [failure for _, failure, _ in run_all(mine, workers)] == [None, None]
+    for alone, together in zip(*jobs.values(), strict=True):
+        assert (alone.folder / "errors.csv").read_bytes() == (together.folder / "errors.csv").read_bytes()
+
+
+def test_every_method_at_toy_size(tiny, tmp_path):
+    out = tmp_path / "out"
+    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(quiet())
+    methods = pd.read_csv(out / "methods.csv")
+    assert set(methods.method) == set(METHODS)
+    results = pd.read_csv(out / "results.csv")
+    assert np.isfinite(results.smape).all()
+    assert (out / "heatmap.png").stat().st_size > 10_000
+
+
+def test_summary_by_hand():
+    frame = pd.DataFrame({"smape": [1.0, 2.0, 3.0, 4.0, np.nan], "escaped": [0, 0, 0, 0, 1]})
+    frame = frame.assign(system="lorenz", method="ekf", starts="X", noise=0.0)
+    (row,) = summarise(frame, "smape").itertuples()
+    assert (row.n, row.median, row.half_iqr) == (4, 2.5, 0.75)
+    assert 1.0 <= row.low < 2.5 < row.high <= 4.0
+
+
+def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
+    name, _ = toy
+    out = tmp_path / "out"
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    before = {file: (out / file).read_bytes() for file in ("table.md", "heatmap.png")}
+    for file in before:
+        (out / file).unlink()
+    Benchmark(report=True, out=out).run(quiet())
+    assert {file: (out / file).read_bytes() for file in before} == before
+
+
+@pytest.mark.skipif(not COMMITTED.exists(), reason="no results are committed yet")
+def test_committed_results_give_the_committed_table_and_figure(tmp_path):
+    for file in ("results.csv", "methods.csv"):
+        shutil.copy(COMMITTED / file, tmp_path)
+    Benchmark(report=True, out=tmp_path).run(quiet())
+    assert (tmp_path / "table.md").read_text() == (COMMITTED / "table.md").read_text()
+    with Image.open(COMMITTED / "heatmap.png") as committed, Image.open(tmp_path / "heatmap.png") as drawn:
+        if committed.info["Software"] != drawn.info["Software"]:
+            pytest.skip(f"the committed figure was drawn by another version than {matplotlib.__version__}")
+        np.testing.assert_array_equal(np.asarray(committed), np.asarray(drawn))
+
+
+def test_run_is_causal():
+    y = np.random.default_rng(0).normal(size=(50, 2, 1))
+    method = get_method("ekf")
+    arrays = {"process_noise": np.array([0.01])}
+    whole = run(method.observer(arrays, get_system("lorenz"), 0.01, 0.5), y)
+    part = run(method.observer(arrays, get_system("lorenz"), 0.01, 0.5), y[:20])
+    np.testing.assert_array_equal(whole[:20], part)
