@@ -56,7 +56,7 @@ def oscillations(dt, seconds=30.0, n=8, seed=0):
     ],
 )
 def test_forward_map_of_a_linear_system_is_the_sylvester_solution(name, steps, tolerance, tmp_path):
-    _, system, artifact, _ = trained_on_oscillator(name, tmp_path, steps=steps)
+    _, system, artifact, _ = trained_on_oscillator(name, tmp_path, configuration=2 if name == "ae" else 0, steps=steps)
     M = sylvester(artifact.filter.A, artifact.filter.B)
     x = np.random.default_rng(1).uniform(*system.box(), (1000, 2))
     z = x @ M.T
@@ -85,10 +85,10 @@ def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     x_hat = run(method.observer(artifact, system, dt, 0.0), y)
     assert late_error(x, x_hat) < 0.1
     misled = y.copy()
-    misled[0] += 0.5  # only the start differs from here on
+    misled[0] += 0.1  # only the start differs from here on
     slowest = -artifact.filter.A.diagonal().max()
     assert slowest != pytest.approx(1.0, abs=1e-4)  # it was learned, 1 is where it began
-    rate = decay_rate(run(method.observer(artifact, system, dt, 0.0), misled) - x_hat, dt, 3.0, 6.0)
+    rate = decay_rate(run(method.observer(artifact, system, dt, 0.0), misled) - x_hat, dt, 5.0, 8.0)
     assert rate == pytest.approx(slowest, rel=0.1)
 
 
@@ -102,8 +102,8 @@ def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     assert late_error(x, x_hat) < 0.1
     one_stage = {**arrays, **{k.replace("transient", "asymptotic"): v for k, v in arrays.items() if "transient" in k}}
     misled = y.copy()
-    misled[0] += 0.5
-    rate = decay_rate(run(Switching(one_stage, system), misled) - run(Switching(one_stage, system), y), dt, 4.0, 6.0)
+    misled[0] += 0.1
+    rate = decay_rate(run(Switching(one_stage, system), misled) - run(Switching(one_stage, system), y), dt, 5.0, 8.0)
     slowest = -np.log(np.abs(np.linalg.eigvals(arrays["transient.A"])).max()) / dt
     assert rate == pytest.approx(slowest, rel=0.15)
 

@@ -302,8 +302,8 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     monkeypatch.setattr(training.optimise, "CHECKPOINT_SECONDS", 0.0)
     save, saved = training.optimise._save, []
 
-    def save_and_stop(path, stage, module, optimiser, generator, step, history):
-        save(path, stage, module, optimiser, generator, step, history)
+    def save_and_stop(path, stage, module, optimiser, generator, step, *rest):
+        save(path, stage, module, optimiser, generator, step, *rest)
         saved.append(step)
         if stage.name == "inverse" and step == 200:
             raise KeyboardInterrupt

@@ -11,6 +11,7 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+from training.data import run_filter
 from training.forward import on_tensors
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
@@ -29,8 +30,8 @@ class AE(KKLMethod):
     M. Buisson-Fenet, L. Bahr, V. Morgenthaler and F. Di Meglio, "Towards gain tuning for numerical KKL observers", IFAC
     World Congress 2023. A = w D with the poles of a Bessel filter of order nx + 1 for each output, B = w, so that z
     stays of the size of y for every cutoff w. T and T_inv are first learned with w as an input; the cutoff is the one
-    with the least "sensitivity of T_inv x (H-infinity gain from noise to z + H2 norm of the transient)". Training
-    then goes on at that cutoff alone.
+    with the least "sensitivity of T_inv x (H-infinity gain from noise to z + H2 norm of the transient)". The maps
+    are then learned for that cutoff alone.
     """
 
     name: ClassVar[str] = "ae"
@@ -41,15 +42,15 @@ class AE(KKLMethod):
         return tuple({"cutoff_factor": factor} for factor in (1.0, 3.0, 10.0))
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """Learn for every cutoff, choose one, learn on."""
+        """Learn for every cutoff, choose one, learn for it."""
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
         low, high = system.box()
         rate = float(np.median(np.broadcast_to(system.rate(task.rng.uniform(low, high, (1000, system.nx)).T), 1000)))
-        problem = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
-        task.fit("every-cutoff", problem, problem.loss, learning_rate=5e-3, share=TUNING)
-        chosen = configuration["cutoff_factor"] * problem.best_cutoff()
-        problem.fix(chosen)
+        every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
+        task.fit("every-cutoff", every, every.loss, learning_rate=5e-3, share=TUNING)
+        chosen = configuration["cutoff_factor"] * every.best_cutoff()
+        problem = _Problem(task, chosen, chosen)
         task.fit("one-cutoff", problem, problem.loss, learning_rate=5e-3, share=1 - TUNING)
         z_offset, z_scale = problem.z_offset.cpu().numpy().astype(float), problem.z_scale.cpu().numpy().astype(float)
         scaling = (problem.x_offset, problem.x_scale, z_offset, z_scale)
@@ -86,7 +87,11 @@ def bessel_filter(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class _Problem(nn.Module):
-    """T(x, w) and T_inv(z, w) with their losses; w is drawn evenly in the logarithm until :meth:`fix`."""
+    """T(x, w) and T_inv(z, w) with their losses; w is drawn evenly in the logarithm between slowest and fastest.
+
+    z is scaled by its spread along some of the trajectories, after the transient, filtered
+    at the middle of that range.
+    """
 
     def __init__(self, task: Task, slowest: float, fastest: float) -> None:
         super().__init__()
@@ -100,19 +105,16 @@ class _Problem(nn.Module):
         size = (len(self.D), budget.width, budget.depth, budget.activation)
         self.encoder = Network(system.nx + 1, *size).to(device)
         self.decoder = Network(len(self.D) + 1, system.nx, *size[1:]).to(device)
-        gain = -np.linalg.solve(self.D, self.F)
-        outputs = data.y.reshape(-1, system.ny)
-        self.z_offset = tensor(gain @ outputs.mean(0, dtype=float), device)
-        size_of_z = float(np.abs(gain).max() * outputs.std(0, dtype=float).max())  # a single gain may well be zero
-        self.z_scale = tensor(np.full(len(self.D), size_of_z), device)
+        middle = float(np.sqrt(slowest * fastest))
+        y = data.y[:, :200].astype(float)
+        linear = LinearFilter(middle * self.D, middle * self.F, budget.dt)
+        late = data.ages[data.ages >= data.ages[-1] // 2]
+        z = run_filter(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
+        self.z_offset, self.z_scale = tensor(z.mean(0), device), tensor(np.maximum(z.std(0), 1e-12), device)
         self._D, self._F = tensor(self.D, device), tensor(self.F, device)
         self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
         self._states = tensor(states, device)
         self._low, self._span = tensor(low, device), tensor(high - low, device)
-
-    def fix(self, cutoff: float) -> None:
-        """From now on this cutoff only."""
-        self.slowest = self.fastest = cutoff
 
     def feature(self, w: torch.Tensor) -> torch.Tensor:
         """What the networks are told of the cutoff."""
