@@ -88,7 +88,7 @@ class Benchmark:
                 progress.update(task, advance=1, description=text)
             self._time(jobs, progress)
         if any(job.done for job in jobs):
-            _collect(out, name, jobs)
+            _collect(out, name)
             _report(out, console)
         if failures:
             raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
@@ -141,12 +141,19 @@ def _progress(console: Console) -> Iterator[Progress]:
         yield progress
 
 
-def _collect(out: Path, name: str, jobs: list[Job]) -> None:
+def _collect(out: Path, name: str) -> None:
     """One CSV of all errors and one of all costs, from every job found in the folder."""
     errors, costs = [], []
-    order = {job.folder: i for i, job in enumerate(jobs)}
-    found = {path.parent for path in (out / "jobs").glob("*/*/errors.csv")}
-    for folder in sorted(found, key=lambda folder: (order.get(folder, len(order)), folder)):
+
+    systems, methods = list(SYSTEMS), list(METHODS)  # shipped ones in their order, then the user's
+
+    def position(folder: Path) -> tuple[int, str, int, str]:
+        system, method = folder.parent.name, folder.name
+        first = systems.index(system) if system in systems else len(systems)
+        second = methods.index(method) if method in methods else len(methods)
+        return first, system, second, method
+
+    for folder in sorted((path.parent for path in (out / "jobs").glob("*/*/errors.csv")), key=position):
         errors.append(pd.read_csv(folder / "errors.csv"))
         info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
         speed = folder / "speed.json"
@@ -159,7 +166,7 @@ def _collect(out: Path, name: str, jobs: list[Job]) -> None:
                 "configuration": json.dumps(info["configuration"]),
                 "validation": json.dumps(info["validation"]),
                 "train_seconds": info["train_seconds"],
-                **(json.loads(speed.read_text()) if speed.exists() else {}),
+                **(json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}),
                 "trajectories": job["protocol"]["trajectories"],
                 "seed": job["protocol"]["seed"],
             }

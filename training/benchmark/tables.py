@@ -1,5 +1,8 @@
 """Tables and the figure, from the benchmark's two CSV files and nothing else."""
 
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,35 @@ PRINTED = {
     "dmf": {"reverse_duffing": 46.2, "van_der_pol": 98.2, "rossler": 23.5, "lorenz": 8.76},
     "node": {"reverse_duffing": 159.8, "van_der_pol": 11.9, "rossler": 24.7, "lorenz": 11.0},
 }
+INTERVAL = "{median} ± {half_iqr} [{low}, {high}]"
+# Column of results.csv, title, form of a cell, explanation.
+MEASURES = (
+    (
+        "smape",
+        "SMAPE in %, all steps",
+        INTERVAL,
+        "The paper's measure: median ± half the interquartile range [bootstrap 95 % interval of the median].",
+    ),
+    (
+        "smape_late",
+        "SMAPE in % after the first 20 %",
+        INTERVAL,
+        "The same.",
+    ),
+    (
+        "rmse_late",
+        "RMSE after the first 20 %",
+        INTERVAL,
+        "The same, in units of the state.",
+    ),
+    (
+        "settling",
+        "Settling time in s",
+        "{median}",
+        "Median time from which the error stays below a tenth of the trajectory's size.",
+    ),
+)
+NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
 
@@ -26,7 +58,7 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
     rows = []
     for key, group in results[results.escaped == 0].groupby(["system", "method", "starts", "noise"], sort=False):
         values = group[column].to_numpy(dtype=float)
-        finite = np.minimum(values, 1e12)  # an infinite settling time is a large one
+        finite = np.minimum(values, NEVER)
         low, median, high = np.quantile(finite, [0.25, 0.5, 0.75])
         interval = (median, median)
         if len(set(finite)) > 1:
@@ -38,105 +70,103 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) -> None:
-    """All measures as Markdown."""
-    labels = _labels(methods)
-    systems = list(dict.fromkeys(methods.system))
+    """All measures as Markdown, a table for each measure and case with a row for each method."""
+    cases = sorted(
+        results[["starts", "noise"]].drop_duplicates().itertuples(index=False, name=None),
+        key=lambda case: (list(DOMAINS).index(case[0]), case[1]),
+    )
     lines = ["# Benchmark", "", note, ""]
-
-    def table(title: str, cell: Any, explain: str = "") -> None:
-        lines.extend([f"## {title}", ""] + ([explain, ""] if explain else []))
-        lines.append("| | " + " | ".join(system.replace("_", " ") for system in systems) + " |")
-        lines.append("|---" * (1 + len(systems)) + "|")
-        for name, label in labels.items():
-            lines.append(f"| {label} | " + " | ".join(cell(system, name) for system in systems) + " |")
-        lines.append("")
-
-    summaries = {column: summarise(results, column) for column in ("smape", "smape_late", "settling", "rmse_late")}
-
-    def measure(column: str, form: str, starts: str, noise: float) -> Any:
-        summary = summaries[column]
-        chosen = summary[(summary.starts == starts) & (summary.noise == noise)].set_index(["system", "method"])
-
-        def cell(system: str, name: str) -> str:
-            if (system, name) not in chosen.index:
-                return "–"
-            row = chosen.loc[(system, name)]
-            return "never" if row["median"] >= 1e12 else form.format(**row)
-
-        return cell
-
-    spread = "{median:.3g} ± {half_iqr:.2g} [{low:.3g}, {high:.3g}]"
-    cases = results[["starts", "noise"]].drop_duplicates().itertuples(index=False)
-    cases = sorted(cases, key=lambda case: (list(DOMAINS).index(case.starts), case.noise))
-    for case in cases:
-        title = f"SMAPE in %, all steps, {DOMAINS[case.starts]}, noise {case.noise:g}"
-        explain = "Median ± half the interquartile range [bootstrap 95 % interval of the median]."
-        table(title, measure("smape", spread, case.starts, case.noise), explain)
-    for case in cases:
-        title = f"SMAPE in % after the first 20 %, {DOMAINS[case.starts]}, noise {case.noise:g}"
-        table(title, measure("smape_late", spread, case.starts, case.noise))
-    for case in cases:
-        title = f"Settling time in s, {DOMAINS[case.starts]}, noise {case.noise:g}"
-        explain = "Median time from which the error stays below a tenth of the trajectory's size."
-        table(title, measure("settling", "{median:.2f}", case.starts, case.noise), explain)
-    for case in cases:
-        title = f"RMSE after the first 20 %, {DOMAINS[case.starts]}, noise {case.noise:g}"
-        table(title, measure("rmse_late", "{median:.3g} ± {half_iqr:.2g}", case.starts, case.noise))
-
+    for column, title, form, explanation in MEASURES:
+        summary = summarise(results, column).set_index(["starts", "noise", "system", "method"])
+        for case in cases:
+            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]:g}", "", explanation, ""]
+            lines += _table(methods, partial(_spread, summary, form, case))
+    lines += ["## Lost trajectories in %", "", "Above 50 % after the first 20 %, or not finite. In this order: "]
+    lines[-1] += ", ".join(f"{starts} at noise {noise:g}" for starts, noise in cases) + "."
     lost = results[results.escaped == 0].groupby(["system", "method", "starts", "noise"]).lost.mean() * 100
-
-    def lost_cell(system: str, name: str) -> str:
-        shares = [lost.get((system, name, case.starts, case.noise)) for case in cases]
-        return "–" if shares[0] is None else " / ".join(f"{share:.0f}" for share in shares)
-
-    order = ", ".join(f"{case.starts} at noise {case.noise:g}" for case in cases)
-    table("Lost trajectories in %", lost_cell, f"Above 50 % after the first 20 %, or not finite. In order: {order}.")
-
-    component = summarise(results, "component_late")
-    component = component[component.noise == 0].set_index(["system", "method", "starts"])["median"]
-
-    def beside(system: str, name: str) -> str:
-        found = [component.get((system, name, starts)) for starts in DOMAINS]
-        ours = " / ".join("–" if value is None else f"{value:.3g}" for value in found)
-        printed = PRINTED.get(name, {}).get(system)
-        return ours if printed is None else f"{ours} ({printed:g})"
-
-    table(
-        "Component-wise SMAPE in % after the first 20 %, no noise",
-        beside,
-        "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper print "
-        "for 1.5X \\ X, from other networks, budgets and data.",
-    )
-
+    lines += ["", *_table(methods, partial(_lost, lost, cases))]
+    if (results.noise == 0).any():
+        component = summarise(results[results.noise == 0], "component_late").set_index(["system", "method", "starts"])
+        lines += [
+            "## Component-wise SMAPE in % after the first 20 %, no noise",
+            "",
+            "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper "
+            "print for 1.5X \\ X, from other networks, budgets and data.",
+            "",
+            *_table(methods, partial(_beside_printed, component["median"])),
+        ]
     costs = methods.set_index(["system", "method"])
-
-    def cost(system: str, name: str) -> str:
-        if (system, name) not in costs.index:
-            return "–"
-        row = costs.loc[(system, name)]
-        return f"{row.train_seconds:.0f} s; {row.us_batch_1:.0f}, {row.us_batch_1000:.0f} µs"
-
-    table("Cost", cost, "CPU seconds of training; CPU time of one step for one trajectory, and for a batch of 1,000.")
-    table(
-        "Configuration chosen on validation",
-        lambda system, name: (
-            str(costs.loc[(system, name)].configuration).strip("{}").replace('"', "") or "only one"
-            if (system, name) in costs.index
-            else "–"
-        ),
-    )
-    escaped = results[results.escaped == 1].drop_duplicates(["system", "starts", "trajectory"])
-    counts = escaped.groupby(["system", "starts"], sort=False).size()
-    lines.append("## Starts that escape")
-    lines.append("")
-    total = results.groupby(["system", "starts"]).trajectory.nunique()
     lines += [
-        f"- {system}, {starts}: {n} of {total[(system, starts)]}, in no figure above."
-        for (system, starts), n in counts.items()
+        "## Cost",
+        "",
+        "CPU seconds of training; CPU time of one step, for one trajectory and for 1,000 at once.",
+        "",
     ]
-    if counts.empty:
-        lines.append("None.")
+    lines += _table(methods, partial(_cost, costs))
+    lines += ["## Configuration", "", "Chosen on validation trajectories.", ""]
+    lines += _table(methods, partial(_configuration, costs))
+    lines += ["## Starts that escape", "", *_escaped(results)]
     path.write_text("\n".join(lines) + "\n")
+
+
+def _table(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) -> list[str]:
+    """Lines of a Markdown table with a cell for each (system, method)."""
+    systems = list(dict.fromkeys(methods.system))
+    lines = [
+        "| | " + " | ".join(system.replace("_", " ") for system in systems) + " |",
+        "|---" * (1 + len(systems)) + "|",
+    ]
+    there = set(zip(methods.system, methods.method, strict=True))
+    for name, label in _labels(methods).items():
+        cells = (cell((system, name)) if (system, name) in there else "–" for system in systems)
+        lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
+def _spread(summary: pd.DataFrame, form: str, case: tuple[str, float], job: tuple[str, str]) -> str:
+    if (*case, *job) not in summary.index:  # every trajectory escaped
+        return "–"
+    row = summary.loc[(*case, *job)]
+    return form.format(**{name: _number(value) for name, value in row.items()})
+
+
+def _number(value: float) -> str:
+    """To three digits, as far as they mean something."""
+    if value >= NEVER / 2:
+        return "never"
+    return f"{value:.3g}" if value >= 0.001 or value == 0 else "<0.001"
+
+
+def _lost(lost: pd.Series, cases: Sequence[tuple[str, float]], job: tuple[str, str]) -> str:
+    return " / ".join(f"{lost[(*job, *case)]:.0f}" if (*job, *case) in lost.index else "–" for case in cases)
+
+
+def _beside_printed(component: pd.Series, job: tuple[str, str]) -> str:
+    ours = " / ".join(_number(component[(*job, starts)]) for starts in DOMAINS if (*job, starts) in component.index)
+    system, method = job
+    printed = PRINTED.get(method, {}).get(system)
+    return ours if printed is None else f"{ours} ({printed:g})"
+
+
+def _cost(costs: pd.DataFrame, job: tuple[str, str]) -> str:
+    row = costs.loc[job]
+    times = ", ".join("–" if np.isnan(us) else f"{us:.0f} µs" for us in (row.us_batch_1, row.us_batch_1000))
+    return f"{row.train_seconds:.0f} s; {times}"
+
+
+def _configuration(costs: pd.DataFrame, job: tuple[str, str]) -> str:
+    configuration = json.loads(costs.loc[job].configuration)
+    return ", ".join(f"{key} {value}" for key, value in configuration.items()).replace("_", " ") or "only one"
+
+
+def _escaped(results: pd.DataFrame) -> list[str]:
+    trajectories = results.drop_duplicates(["system", "starts", "trajectory"])
+    lines = [
+        f"- {system}, {DOMAINS[starts]}: {group.escaped.sum()} of {len(group)}, in no figure above."
+        for (system, starts), group in trajectories.groupby(["system", "starts"], sort=False)
+        if group.escaped.any()
+    ]
+    return lines or ["None."]
 
 
 def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) -> None:
