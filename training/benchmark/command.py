@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pandas as pd
 import torch
+import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -44,18 +45,18 @@ class Benchmark:
     """
 
     budget: Literal["cpu", "paper"] = "cpu"
-    """cpu: 400,000 points and 300 CPU seconds for each training. paper: 8 million points, networks of 4 x 512 and
-    an hour each; wants a GPU."""
+    """cpu: 400,000 points and 300 CPU seconds for each training. paper: 8 million points, networks of 4 x 512, an hour
+    each; wants a GPU."""
     quick: bool = False
-    """A version of minutes in place of the budget: short trainings, no search, few and short test trajectories."""
+    """In place of the budget: short trainings, no search, few and short test trajectories; a matter of minutes."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     noise: tuple[float, ...] = (0.0, 0.5)
     """Standard deviations of the measurement noise."""
-    out: Path | None = None
-    """Folder of results (default: benchmark/BUDGET)."""
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: benchmark/BUDGET)")] = None
+    """Folder of results."""
     jobs: int = 2
     """Worker processes, of one thread each."""
     seed: int = 0
@@ -107,6 +108,7 @@ class Benchmark:
         protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, noise=self.noise, seed=self.seed)
         budget = BUDGETS[name]
         search = None if self.quick else SEARCH * budget.seconds
+        device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
         return [
             Job(
                 system=system,
@@ -116,6 +118,7 @@ class Benchmark:
                 protocol=protocol,
                 search=search,
                 validation=replace(VALIDATION, noise=self.noise),
+                device=device,
             )
             for system in self.systems
             for method in self.methods

@@ -28,6 +28,8 @@ class Job:
     folder : what it makes: trained.safetensors, errors.csv, info.json, and what the search tried.
     search : seconds of CPU time for each configuration; none if the first is to be taken as it is.
     validation : trajectories on which configurations are compared; their seeds are those of validation.
+    seed : of the training.
+    device : where networks are trained.
     """
 
     system: str
@@ -38,6 +40,7 @@ class Job:
     search: float | None
     validation: Protocol
     seed: int = 0
+    device: str = "cpu"
 
     @property
     def name(self) -> str:
@@ -61,7 +64,7 @@ class Job:
             "system": describe(get_system(self.system)),
             "method": get_method(self.method).name,
         }
-        del described["folder"]
+        del described["folder"], described["device"]
         found: dict[str, Any] = json.loads(json.dumps(described))
         return found
 
@@ -132,7 +135,7 @@ def _train(
     if not (path.exists() and timing.exists()):
         folder = job.folder / name
         folder.mkdir(parents=True, exist_ok=True)
-        task = Task(get_system(job.system), budget, folder, job.seed)
+        task = Task(get_system(job.system), budget, folder, job.seed, torch.device(job.device))
         began = time.process_time()
         trained = method.train(task, configuration)
         write(timing, f"{time.process_time() - began:.1f}\n")
