@@ -24,7 +24,8 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
     except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
         raise ValueError(f"cannot load the {base.__name__.lower()} {name!r}: {error}") from error
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
-        raise ValueError(f"{name!r} is {found!r}, not a subclass of {base.__module__.split('.')[0]}.{base.__name__}")
+        package = base.__module__.rpartition(".")[0]
+        raise ValueError(f"{name!r} is {found!r}, not a subclass of {package}.{base.__name__}")
     return found
 
 

@@ -23,7 +23,7 @@ from training.evaluate import EVALUATION_SEED, VALIDATION_SEED, starts, unseen_r
 from training.methods import METHODS, Budget, Method, get_method
 from training.metrics import component_smape, rmse, settling_time, smape
 
-TINY = Budget(trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
+TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
 COMMITTED = Path(__file__).parents[1] / "docs" / "results" / "benchmark"
 

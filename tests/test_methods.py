@@ -1,6 +1,7 @@
 """Each method of the benchmark, where the truth is known."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,6 @@ from training.benchmark.protocol import run
 from training.data import output, run_filter
 from training.methods import METHODS, Budget, Task, get_method
 from training.methods.autoencoder import bessel_filter
-from training.methods.base import simulated
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
 from training.methods.kalman import (
@@ -30,7 +30,9 @@ from training.methods.kalman import (
 )
 from training.methods.recurrent import rollout
 
-SMALL = Budget(trajectories=100, duration=25.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.05, steps=600)
+SMALL = Budget(
+    "small", trajectories=100, duration=25.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.05, steps=600
+)
 
 
 def trained_on_oscillator(name, tmp_path, configuration=0, **changes):
@@ -276,10 +278,10 @@ def test_bessel_filter_has_the_poles_of_a_bessel_filter(nx):
     np.testing.assert_allclose(poles, np.sort_complex(bessel(nx + 1, 1.0, analog=True, output="zpk")[1]), atol=1e-9)
 
 
-def test_training_data_is_the_same_for_everyone_and_matches_the_states():
+def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path):
     system = Oscillator()
-    data = simulated(system, SMALL, 0)
-    assert data is simulated(Oscillator(), SMALL, 0)
+    data = Task(system, SMALL, tmp_path).data
+    assert data is Task(Oscillator(), replace(SMALL, seconds=1.0), tmp_path).data
     assert data.x.shape == (len(data.ages), 100, 2)
     assert data.y.shape == (501, 100, 1)
     np.testing.assert_allclose(data.y[data.ages], output(system, data.x), atol=1e-6)
@@ -288,7 +290,9 @@ def test_training_data_is_the_same_for_everyone_and_matches_the_states():
 @pytest.mark.parametrize("name", sorted(METHODS))
 def test_saved_and_loaded_is_the_same_observer(name, tmp_path):
     method, system = get_method(name), Oscillator()
-    budget = Budget(trajectories=10, duration=25.0, samples=20, seconds=math.inf, width=8, depth=1, dt=0.02, steps=2)
+    budget = Budget(
+        "tiny", trajectories=10, duration=25.0, samples=20, seconds=math.inf, width=8, depth=1, dt=0.02, steps=2
+    )
     trained = method.train(Task(system, budget, tmp_path / "train"), method.configurations(system)[-1])
     assert 1 <= len(method.configurations(system)) <= 3
     path = tmp_path / "trained.safetensors"
@@ -317,5 +321,5 @@ def test_methods_that_make_artifacts_make_files_for_everyone(tmp_path):
 def test_unknown_method():
     with pytest.raises(ValueError, match="unknown method 'kalman'"):
         get_method("kalman")
-    with pytest.raises(ValueError, match=r"not a subclass of training\.Method"):
+    with pytest.raises(ValueError, match=r"not a subclass of training\.methods\.Method"):
         get_method("training.methods.gru:Recurrent")

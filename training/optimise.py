@@ -17,6 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 CHECKPOINT_SECONDS = 20.0
 LOG_EVERY = 100
+WARM_UP = 0.01  # part of a stage in which the learning rate rises
 
 # A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
@@ -58,7 +59,6 @@ def optimise(
     device = next(module.parameters()).device
     generator = torch.Generator(device).manual_seed(stage.seed)
     optimiser = torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
-    warmup = max(1, min(300, stage.steps // 100))
     began = time.process_time()
 
     def seconds() -> float:
@@ -66,7 +66,7 @@ def optimise(
 
     def rate(step: int) -> float:
         done = max(step / stage.steps, min(1.0, seconds() / stage.cap))
-        return min(1.0, (step + 1) / warmup) * 0.5 * (1.0 + math.cos(math.pi * done))
+        return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
 
     checkpoint = stage.folder / f"{stage.name}.checkpoint.safetensors"
     start, spent = 0, 0.0
@@ -102,6 +102,15 @@ def optimise(
         if last:
             break
     return history
+
+
+def seconds_spent(folder: Path) -> float:
+    """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
+    total = 0.0
+    for path in folder.glob("*.checkpoint.safetensors"):
+        with safe_open(path, framework="pt") as opened:
+            total += json.loads(opened.metadata()["checkpoint"])["seconds"]
+    return total
 
 
 def _save(

@@ -21,6 +21,7 @@ from kkl_gym.system import System
 from observers import Artifact, LinearFilter
 from training.config import Config
 from training.data import output, record, recording_ages
+from training.files import write
 from training.forward import ForwardProblem, truncation_time
 from training.inverse import ForwardMapSampler, InverseProblem, TrajectorySampler
 from training.networks import Network
@@ -166,7 +167,7 @@ def _claim(folder: Path, described: dict[str, Any], resume: bool) -> None:
                 f"{name} = {before.get(name)} there, {described.get(name)} here" for name in changed
             )
             raise ValueError(f"{folder} holds a run of another configuration: {differences}")
-    file.write_text(json.dumps(described, indent=2) + "\n")
+    write(file, json.dumps(described, indent=2) + "\n")
 
 
 def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import pandas as pd
 import torch
@@ -15,17 +15,18 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from kkl_gym.systems import SYSTEMS, get_system
-from training.benchmark.jobs import Job, run_all, write
+from training.benchmark.jobs import Job, run_all
 from training.benchmark.protocol import Protocol, step_time
 from training.benchmark.tables import draw, write_table
+from training.files import write
 from training.methods import METHODS, Budget, get_method
 
 BUDGETS = {
-    "cpu": Budget(trajectories=2000, duration=50.0, samples=200, seconds=300.0),
-    "quick": Budget(trajectories=200, duration=20.0, samples=50, seconds=5.0, width=64, depth=2),
+    "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, seconds=300.0),
+    "quick": Budget("quick", trajectories=200, duration=20.0, samples=50, seconds=5.0, width=64, depth=2),
     # 8 million points, as in the paper
     "paper": Budget(
-        trajectories=1600, duration=50.0, samples=5000, seconds=3600.0, width=512, depth=4, activation="silu"
+        "paper", trajectories=1600, duration=50.0, samples=5000, seconds=3600.0, width=512, depth=4, activation="silu"
     ),
 }
 PROTOCOL = Protocol()
@@ -73,10 +74,8 @@ class Benchmark:
             return out
         self._check()
         jobs = self._jobs(name, out)
-        for job in jobs:
-            job.claim()
-        failures = []
         todo = [job for job in jobs if not job.done]
+        failures = []
         with _progress(console) as progress:
             task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
             for job, failure, running in run_all(todo, min(self.jobs, max(1, len(todo)))):
@@ -87,9 +86,9 @@ class Benchmark:
                     progress.console.print(f"finished {job.name}")
                 text = f"observers (now {', '.join(running)})" if running else "observers"
                 progress.update(task, advance=1, description=text)
-            self._time(jobs, progress)
+            failures += self._time(jobs, progress)
         if any(job.done for job in jobs):
-            _collect(out, name)
+            _collect(out)
             _report(out, console)
         if failures:
             raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
@@ -100,9 +99,11 @@ class Benchmark:
             raise ValueError("give at least one system, method, noise level and worker process")
         if any(not 0 <= level < math.inf for level in self.noise) or self.seed < 0:
             raise ValueError(f"noise = {self.noise} must be finite, and it and seed = {self.seed} not negative")
-        for names in (self.systems, self.methods, self.noise):
+        systems = [get_system(name).name for name in self.systems]
+        methods = [get_method(name).name for name in self.methods]
+        for names in (systems, methods, list(self.noise)):
             if len(set(names)) < len(names):
-                raise ValueError(f"{names} names one of them twice")
+                raise ValueError(f"{names} has one of them twice")
 
     def _jobs(self, name: str, out: Path) -> list[Job]:
         protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, noise=self.noise, seed=self.seed)
@@ -124,17 +125,23 @@ class Benchmark:
             for method in self.methods
         ]
 
-    def _time(self, jobs: list[Job], progress: Progress) -> None:
-        """Time steps when nothing else runs."""
+    def _time(self, jobs: list[Job], progress: Progress) -> list[str]:
+        """Time the observers' steps, now that no training runs; returns what failed."""
+        failures = []
         torch.set_num_threads(1)
         todo = [job for job in jobs if job.done and not (job.folder / "speed.json").exists()]
         for job in progress.track(todo, description="timing steps"):
             method, system = get_method(job.method), get_system(job.system)
             trained = method.load(job.folder / "trained.safetensors")
-            times = {
-                f"us_batch_{batch}": step_time(method, trained, system, job.budget.dt, batch) for batch in (1, 1000)
-            }
+            try:
+                times = {
+                    f"us_batch_{batch}": step_time(method, trained, system, job.budget.dt, batch) for batch in (1, 1000)
+                }
+            except Exception as error:  # as in a job: whatever a method does wrong, the others go on
+                failures.append(f"{job.name}, timing: {error}")
+                continue
             write(job.folder / "speed.json", json.dumps(times) + "\n")
+        return failures
 
 
 @contextmanager
@@ -144,9 +151,13 @@ def _progress(console: Console) -> Iterator[Progress]:
         yield progress
 
 
-def _collect(out: Path, name: str) -> None:
-    """One CSV of all errors and one of all costs, from every job found in the folder."""
+def _collect(out: Path) -> None:
+    """One CSV of all errors and one of all costs, from every job found in the folder.
+
+    Raises ValueError if they are not all of one benchmark.
+    """
     errors, costs = [], []
+    rules: dict[str, Any] = {}
 
     systems, methods = list(SYSTEMS), list(METHODS)  # shipped ones in their order, then the user's
 
@@ -159,18 +170,24 @@ def _collect(out: Path, name: str) -> None:
     for folder in sorted((path.parent for path in (out / "jobs").glob("*/*/errors.csv")), key=position):
         errors.append(pd.read_csv(folder / "errors.csv"))
         info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
+        for rule in ("budget", "protocol", "search", "validation", "seed", "version"):
+            if rules.setdefault(rule, job[rule]) != job[rule]:
+                raise ValueError(
+                    f"{out} holds jobs of several benchmarks: {rule} = {job[rule]} in {folder}, "
+                    f"{rules[rule]} elsewhere; remove the ones that do not belong there"
+                )
         speed = folder / "speed.json"
         costs.append(
             {
                 "system": folder.parent.name,
                 "method": folder.name,
                 "label": info["label"],
-                "budget": name,
+                "budget": job["budget"]["name"],
                 "configuration": json.dumps(info["configuration"]),
                 "validation": json.dumps(info["validation"]),
                 "train_seconds": info["train_seconds"],
                 **(json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}),
-                "trajectories": job["protocol"]["trajectories"],
+                "trajectories": info["trajectories"],
                 "seed": job["protocol"]["seed"],
             }
         )

@@ -1,9 +1,12 @@
 """Independent jobs: one method on one system, from the choice of a configuration to its errors. Each is resumable."""
 
+import hashlib
+import inspect
 import json
 import multiprocessing
 import os
 import shutil
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -12,10 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock, Timeout
 
+import kkl_gym
 from kkl_gym.systems import get_system
 from training.benchmark.protocol import Protocol, measure, validate
-from training.methods import Budget, Configuration, Method, Task, get_method
+from training.files import write
+from training.methods import METHODS, Budget, Configuration, Method, Task, get_method
+from training.optimise import seconds_spent
 from training.pipeline import describe
 
 Running = Callable[[list[str]], None]
@@ -59,12 +66,18 @@ class Job:
         write(self.folder / "job.json", json.dumps(self._identity(), indent=2) + "\n")
 
     def _identity(self) -> dict[str, Any]:
+        """What makes its results what they are: where they lie and where they were computed do not."""
+        system, method = get_system(self.system), get_method(self.method)
         described = {
             **asdict(self),
-            "system": describe(get_system(self.system)),
-            "method": get_method(self.method).name,
+            "system": describe(system),
+            "method": method.name,
+            "configurations": method.configurations(system),
+            "version": kkl_gym.__version__,
         }
         del described["folder"], described["device"]
+        if type(method) not in METHODS.values():  # a user's, who may be at work on it
+            described["code"] = hashlib.sha256(inspect.getsource(type(method)).encode()).hexdigest()[:16]
         found: dict[str, Any] = json.loads(json.dumps(described))
         return found
 
@@ -81,12 +94,23 @@ class Job:
             )
 
 
-def run_job(job: Job, threads: int = 1) -> None:
-    """Choose, train, measure; steps that were done before are not done again."""
-    torch.set_num_threads(threads)
-    if job.done:
-        return
-    job.claim()
+def run_job(job: Job) -> None:
+    """Choose, train, measure; steps that were done before are not done again.
+
+    Raises ValueError if the folder is another benchmark's, RuntimeError if another process is at work there.
+    """
+    torch.set_num_threads(1)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with FileLock(job.folder / ".lock", timeout=0):
+            if not job.done:
+                job.claim()
+                _run(job)
+    except Timeout:
+        raise RuntimeError(f"another process is at work in {job.folder}") from None
+
+
+def _run(job: Job) -> None:
     method, system = get_method(job.method), get_system(job.system)
     configuration, scores = _choose(job, method)
     trained, seconds = _train(job, method, configuration, job.budget, "trained")
@@ -95,6 +119,7 @@ def run_job(job: Job, threads: int = 1) -> None:
         "configuration": dict(configuration),
         "validation": scores,
         "train_seconds": seconds,
+        "trajectories": min(job.protocol.trajectories, method.trajectories or job.protocol.trajectories),
     }
     write(job.folder / "info.json", json.dumps(info, indent=2) + "\n")
     errors = measure(method, trained, system, job.budget.dt, job.protocol)
@@ -107,8 +132,8 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
     """The configuration with the least validation error after a short training each, and all their errors."""
     system = get_system(job.system)
     configurations = method.configurations(system)
-    if len(configurations) > 3:
-        raise ValueError(f"{method.name} has {len(configurations)} configurations; at most three keep the search fair")
+    if not 1 <= len(configurations) <= 3:
+        raise ValueError(f"{method.name} has {len(configurations)} configurations; one to three keep the search fair")
     if job.search is None or len(configurations) == 1:
         return configurations[0], []
     scores = []
@@ -126,21 +151,21 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
     return configurations[scores.index(min(scores))], scores
 
 
-def _train(
-    job: Job, method: Method[Any], configuration: Configuration, budget: Budget, name: str
-) -> tuple[Any, float | None]:
-    """Train, or load what was trained before (its time is then in info.json, if the job came that far)."""
-    path = job.folder / f"{name}.safetensors"
-    timing = job.folder / f"{name}.seconds"
+def _train(job: Job, method: Method[Any], configuration: Configuration, budget: Budget, name: str) -> tuple[Any, float]:
+    """Train, or load what was trained before; returns it with the CPU seconds that its optimisation took."""
+    path, timing = job.folder / f"{name}.safetensors", job.folder / f"{name}.seconds"
     if not (path.exists() and timing.exists()):
         folder = job.folder / name
         folder.mkdir(parents=True, exist_ok=True)
         task = Task(get_system(job.system), budget, folder, job.seed, torch.device(job.device))
-        began = time.process_time()
-        trained = method.train(task, configuration)
-        write(timing, f"{time.process_time() - began:.1f}\n")
+        try:
+            trained = method.train(task, configuration)
+        except FloatingPointError:
+            shutil.rmtree(folder)  # its checkpoint would fail again
+            raise
+        write(timing, f"{seconds_spent(folder):.1f}\n")
         method.save(trained, path)
-        shutil.rmtree(folder)  # checkpoints
+        shutil.rmtree(folder)
     return method.load(path), float(timing.read_text())
 
 
@@ -150,7 +175,8 @@ def run_all(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Exception 
         for job in jobs:
             yield job, _failure(lambda job=job: run_job(job)), []  # type: ignore[misc]
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(os.getpid(),)) as pool:
         futures: dict[Future[None], Job] = {pool.submit(run_job, job): job for job in jobs}
         try:
             while futures:
@@ -163,17 +189,20 @@ def run_all(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Exception 
             raise
 
 
+def _end_with(parent: int) -> None:
+    """End this process when its parent is gone, even if that was killed."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 def _failure(call: Callable[[], None]) -> Exception | None:
     try:
         call()
     except Exception as error:  # whatever a method does wrong, the others go on
         return error
     return None
-
-
-def write(path: Path, text: str) -> None:
-    """Write a file, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.new")
-    temporary.write_text(text)
-    os.replace(temporary, path)

@@ -44,6 +44,16 @@ def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
     return out
 
 
+def noisy_output(system: System, runs: Runs, noise: float, n: int, seed: tuple[int, ...]) -> np.ndarray:
+    """Outputs with noise on every sample, (steps + 1, trajectories, ny).
+
+    The noise is drawn for ``n`` trajectories, of which ``runs`` may be the first few: it is the same for every method.
+    """
+    unit = np.random.default_rng(seed).standard_normal((n, len(runs.x), system.ny))
+    y: np.ndarray = output(system, runs.x) + noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
+    return y
+
+
 def measure(method: Method[Any], trained: Any, system: System, dt: float, protocol: Protocol) -> pd.DataFrame:
     """One row for each test trajectory, noise level and domain.
 
@@ -53,11 +63,13 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     frames = []
-    for domain in protocol.domains:
+    for i, domain in enumerate(protocol.domains):
+        seed = (EVALUATION_SEED, protocol.seed, 1, i)
         runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, domain)
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.noise:
-            x_hat = _estimates(method, trained, system, dt, runs, noise, [EVALUATION_SEED, protocol.seed, 1])
+            y = noisy_output(system, runs, noise, protocol.trajectories, seed)
+            x_hat = run(method.observer(trained, system, dt, noise), y)
             late = smape(runs.x, x_hat, skip)
             errors = pd.DataFrame(
                 {
@@ -84,12 +96,14 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED)
-    medians = [
-        np.median(
-            smape(runs.x, _estimates(method, trained, system, dt, runs, noise, [VALIDATION_SEED, protocol.seed, 1]))
-        )
-        for noise in protocol.noise
-    ]
+    if not runs.inside.any():
+        raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
+    seed = (VALIDATION_SEED, protocol.seed, 1)
+    medians = []
+    for noise in protocol.noise:
+        y = noisy_output(system, runs, noise, protocol.trajectories, seed)
+        x_hat = run(method.observer(trained, system, dt, noise), y)
+        medians.append(np.median(smape(runs.x, x_hat)))
     return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))
 
 
@@ -106,11 +120,3 @@ def step_time(method: Method[Any], trained: Any, system: System, dt: float, batc
             steps += 1
         best = min(best, (time.process_time() - began) / steps)
     return 1e6 * best
-
-
-def _estimates(
-    method: Method[Any], trained: Any, system: System, dt: float, runs: Runs, noise: float, seed: list[int]
-) -> np.ndarray:
-    y = output(system, runs.x)
-    rng = np.random.default_rng(seed)
-    return run(method.observer(trained, system, dt, noise), y + noise * rng.standard_normal(y.shape))

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import bootstrap
 
 # Component-wise SMAPE in % after the first 20 %, without noise, starts in 1.5X \ X: printed by the notebooks that
 # the paper's authors released.
@@ -55,6 +54,8 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
 
     Cells are system, method, starts and noise; trajectories that escaped are not among the values.
     """
+    from scipy.stats import bootstrap  # here, because it takes half a second that other commands need not wait for
+
     rows = []
     for key, group in results[results.escaped == 0].groupby(["system", "method", "starts", "noise"], sort=False):
         values = group[column].to_numpy(dtype=float)
@@ -103,7 +104,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: 
         "",
     ]
     lines += _table(methods, partial(_cost, costs))
-    lines += ["## Configuration", "", "Chosen on validation trajectories.", ""]
+    lines += ["## Configuration", "", "Chosen on validation trajectories, or the first where there was no search.", ""]
     lines += _table(methods, partial(_configuration, costs))
     lines += ["## Starts that escape", "", *_escaped(results)]
     path.write_text("\n".join(lines) + "\n")
@@ -132,8 +133,8 @@ def _spread(summary: pd.DataFrame, form: str, case: tuple[str, float], job: tupl
 
 def _number(value: float) -> str:
     """To three digits, as far as they mean something."""
-    if value >= NEVER / 2:
-        return "never"
+    if value >= NEVER / 4:
+        return "∞"
     return f"{value:.3g}" if value >= 0.001 or value == 0 else "<0.001"
 
 
@@ -218,7 +219,12 @@ def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) ->
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:
-    return dict(zip(methods.method, methods.label, strict=True))
+    """By method; a number of trajectories that is not everyone's is part of the label."""
+    most = methods.trajectories.max()
+    return {
+        row.method: row.label if row.trajectories == most else f"{row.label} ({row.trajectories} runs)"
+        for row in methods.itertuples()
+    }
 
 
 def _short(value: float) -> str:

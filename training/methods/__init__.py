@@ -1,5 +1,6 @@
 """The methods of the benchmark, by name."""
 
+from inspect import isabstract
 from typing import Any
 
 from kkl_gym.loading import load_class
@@ -27,7 +28,14 @@ def get_method(name: str) -> Method[Any]:
         raise ValueError(
             f"unknown method {name!r}; there are {', '.join(METHODS)}; your own: 'module:Class' or 'script.py:Class'"
         )
-    return load_class(name, Method)()  # type: ignore[type-abstract]
+    found = load_class(name, Method)  # type: ignore[type-abstract]
+    if isabstract(found):
+        raise ValueError(f"the method {name!r} must define {', '.join(sorted(found.__abstractmethods__))}")
+    if not isinstance(vars(found).get("name"), str) or not isinstance(getattr(found, "label", None), str):
+        raise ValueError(f"the method {name!r} must set the class variables name and label, its own")
+    if METHODS.get(found.name, found) is not found:
+        raise ValueError(f"the method {name!r} takes the name {found.name!r} of another; give it one of its own")
+    return found()
 
 
 __all__ = ["METHODS", "Budget", "CausalObserver", "Configuration", "Data", "Method", "Task", "get_method"]

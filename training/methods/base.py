@@ -43,6 +43,7 @@ class CausalObserver(Protocol):
 class Budget:
     """What every method is given for a training.
 
+    name : identifies it.
     trajectories, duration, samples : data: noise-free trajectories of this length in seconds from starts in X, and the
         points along each at which the state is recorded. The output is recorded at every step.
     seconds : CPU time of the optimisation.
@@ -51,6 +52,7 @@ class Budget:
     steps : batches after which a training ends in any case.
     """
 
+    name: str
     trajectories: int
     duration: float
     samples: int
@@ -77,13 +79,13 @@ class Data:
 
 
 @lru_cache(maxsize=1)
-def simulated(system: System, budget: Budget, seed: int) -> Data:
+def simulated(system: System, n: int, duration: float, samples: int, dt: float, seed: int) -> Data:
     """The training data of a system; the same for every method."""
     rng = np.random.default_rng([TRAINING_SEED, seed])
-    steps = max(1, round(budget.duration / budget.dt))
-    ages = recording_ages(0, steps, budget.samples)
+    steps = max(1, round(duration / dt))
+    ages = recording_ages(0, steps, samples)
     xs, ys = [], []
-    for x, _ in trajectories(system, budget.trajectories, steps, budget.dt, rng, driven=False):
+    for x, _ in trajectories(system, n, steps, dt, rng, driven=False):
         xs.append(x[ages])
         ys.append(output(system, x).astype(np.float32))
     return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))
@@ -102,7 +104,8 @@ class Task:
     @cached_property
     def data(self) -> Data:
         """Training trajectories, simulated when first asked for."""
-        return simulated(self.system, self.budget, self.seed)
+        budget = self.budget
+        return simulated(self.system, budget.trajectories, budget.duration, budget.samples, budget.dt, self.seed)
 
     @property
     def rng(self) -> np.random.Generator:
@@ -152,7 +155,7 @@ class Method(ABC, Generic[Trained]):
         """Write what was trained, whole or not at all; by default a dictionary of arrays."""
         if not isinstance(trained, dict):
             raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
-        temporary = path.with_name(f".{path.name}.new")
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
         arrays = {name: np.ascontiguousarray(value) for name, value in trained.items()}
         save_file(arrays, temporary, metadata={"kkl-gym-method": self.name})
         os.replace(temporary, path)

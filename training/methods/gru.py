@@ -91,7 +91,7 @@ class _Problem(nn.Module):
         recorded = np.flatnonzero((self._ages >= first) & (self._ages < first + len(y)))
         self.position.add_(len(y))
         self.hidden.copy_(hidden.detach())
-        if not len(recorded):  # nothing was recorded here: the state is carried on, and nothing is learned
+        if not len(recorded):  # nothing was recorded here: only the state is carried on
             return {"loss": 0.0 * features.sum()}
         estimate = self.network.readout(features[self._ages[recorded] - first])
         return {"loss": ((estimate - self._x[recorded][:, self.rows]) ** 2).mean()}

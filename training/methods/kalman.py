@@ -4,8 +4,6 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
-import sympy
-from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from kkl_gym.simulate import advance, advance_batch
 from kkl_gym.system import Box, Components, System
@@ -117,6 +115,8 @@ def faster(system: System, factor: float) -> System:
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of f or h from its own equations: for each component, those that are not zero by state."""
+    import sympy  # here, because it takes half a second that other commands need not wait for
+
     x = sympy.symbols(f"x:{nx}", real=True)
     rows = []
     for value in equations(list(x)):
@@ -213,7 +213,9 @@ class UnscentedFilters:
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """The start, corrected by the first sample."""
         self._filters = [self._fresh() for _ in y0]
-        return np.array([self._begin(one, y) for one, y in zip(self._filters, y0, strict=True)])
+        for one, y in zip(self._filters, y0, strict=True):
+            self._begin(one, y)
+        return self._estimates()
 
     def step(self, y: np.ndarray) -> np.ndarray:
         """Predict over one sample and correct."""
@@ -227,14 +229,18 @@ class UnscentedFilters:
             if lost:
                 self._filters[i] = one = self._fresh()
                 self._begin(one, value)
-        return np.array([one.x for one in self._filters])
+        return self._estimates()
 
-    def _begin(self, one: UnscentedKalmanFilter, y: np.ndarray) -> np.ndarray:
+    def _estimates(self) -> np.ndarray:
+        return np.array([one.x for one in self._filters]).reshape(-1, self._system.nx)
+
+    def _begin(self, one: Any, y: np.ndarray) -> None:
         one.sigmas_f = one.points_fn.sigma_points(one.x, one.P)
         one.update(y)
-        return np.asarray(one.x)
 
-    def _fresh(self) -> UnscentedKalmanFilter:
+    def _fresh(self) -> Any:
+        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
         system = self._system
         no_input, no_noise = [0.0] * system.nu, [0.0] * system.nx
 
