@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+from filelock import FileLock
 from PIL import Image
 from rich.console import Console
 
@@ -16,8 +17,8 @@ import training.benchmark.command as command
 from kkl_gym import get_system
 from training.benchmark.command import Benchmark
 from training.benchmark.jobs import Job, run_all
-from training.benchmark.protocol import Protocol, measure, run, step_time, validate
-from training.benchmark.tables import summarise
+from training.benchmark.protocol import Protocol, measure, noisy_output, run, step_time, validate
+from training.benchmark.tables import _number, summarise
 from training.data import output
 from training.evaluate import EVALUATION_SEED, VALIDATION_SEED, starts, unseen_runs
 from training.methods import METHODS, Budget, Method, get_method
@@ -63,6 +64,17 @@ class Held:
     def step(self, y):
         return np.tile(self.mean, (len(y), 1))
 '''
+
+
+EXPLOSIVE = """
+
+class Explosive(Constant):
+    name = "explosive"
+
+    def train(self, task, configuration):
+        task.folder.joinpath("half-done").touch()
+        raise FloatingPointError("the error of stage 'one' is not a number")
+"""
 
 
 @pytest.fixture
@@ -165,6 +177,8 @@ def test_methods_that_are_slow_get_the_first_trajectories():
     assert len(frame) == 2 * 2
     many = unseen_runs(system, dt, 100, 1.0, 0, "X")
     np.testing.assert_array_equal(many.x[:, :2], runs.x)
+    few, all_of_them = (noisy_output(system, one, 0.5, 100, (0,)) for one in (runs, many))
+    np.testing.assert_array_equal(all_of_them[:, :2], few)
 
 
 def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
@@ -243,32 +257,52 @@ def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     assert len(trainings.read_text().splitlines()) == 2 * 4  # three configurations and the final one
 
 
-def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path, monkeypatch):
+def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path):
     name, trainings = toy
-    out = tmp_path / "out"
+    out, script = tmp_path / "out", Path(name.rpartition(":")[0])
+    stop = script.parent / "stop"
+    script.write_text(
+        script.read_text().replace(
+            '        return {"mean"',
+            '        if task.system.name == "lorenz" and Path(__file__).with_name("stop").exists():\n'
+            "            raise KeyboardInterrupt\n"
+            '        return {"mean"',
+        )
+    )
     benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, jobs=1)
-    original = command.run_all
-
-    def stopped(jobs, workers):
-        for i, found in enumerate(original(jobs, workers)):
-            if i == 1:
-                raise KeyboardInterrupt
-            yield found
-
-    monkeypatch.setattr(command, "run_all", stopped)
+    stop.touch()
     with pytest.raises(KeyboardInterrupt):
         benchmark.run(quiet())
-    monkeypatch.setattr(command, "run_all", original)
-    shutil.rmtree(out / "jobs" / "lorenz" / "constant")
-    done = trainings.read_text().split()
+    begun = trainings.read_text().split()
+    assert (begun.count("van_der_pol"), begun.count("lorenz")) == (4, 1)
+    stop.unlink()
     benchmark.run(quiet())
     after = trainings.read_text().split()
-    assert after.count("van_der_pol") == done.count("van_der_pol") == 4
-    assert after.count("lorenz") == done.count("lorenz") + 4
+    assert (after.count("van_der_pol"), after.count("lorenz")) == (4, 5)  # the one interrupted was begun anew
     results = (out / "results.csv").read_bytes()
     benchmark.run(quiet())
     assert trainings.read_text().split() == after
     assert (out / "results.csv").read_bytes() == results
+
+
+def test_a_job_that_another_process_works_on_is_left_alone(toy, tmp_path):
+    name, trainings = toy
+    job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, None, SHORT)
+    job.folder.mkdir()
+    with FileLock(job.folder / ".lock"):
+        ((_, failure, _),) = run_all([job], 1)
+    assert "another process is at work" in str(failure)
+    assert not trainings.exists()
+
+
+def test_a_training_that_blows_up_leaves_no_checkpoint(toy, tmp_path):
+    name, _ = toy
+    script = Path(name.rpartition(":")[0])
+    script.write_text(script.read_text() + EXPLOSIVE)
+    job = Job("lorenz", f"{script}:Explosive", tmp_path / "job", TINY, SHORT, 1.0, SHORT)
+    ((_, failure, _),) = run_all([job], 1)
+    assert isinstance(failure, FloatingPointError)
+    assert not any(path.is_dir() for path in job.folder.iterdir())
 
 
 def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
@@ -296,7 +330,22 @@ def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monk
     Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
     monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
-        Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
+    assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
+    with pytest.raises(ValueError, match="holds jobs of several benchmarks: budget"):
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(quiet())
+
+
+def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_path):
+    name, _ = toy
+    script, out = Path(name.rpartition(":")[0]), tmp_path / "out"
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    changed = script.with_name("changed.py")
+    changed.write_text(
+        script.read_text().replace("self.mean, (len(y0)", "2 * self.mean, (len(y0)").replace("x.mean", "x.max")
+    )
+    with pytest.raises(ValueError, match="another benchmark: code"):
+        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(quiet())
 
 
 @pytest.mark.parametrize(
@@ -310,6 +359,7 @@ def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monk
         ({"noise": (-0.1,)}, "noise"),
         ({"seed": -1}, "seed"),
         ({"methods": ("ekf", "ekf")}, "twice"),
+        ({"methods": ("ekf", "training.methods.kalman:EKF")}, "twice"),
     ],
 )
 def test_impossible_benchmarks(wrong, message, tmp_path):
@@ -349,6 +399,19 @@ def test_summary_by_hand():
     (row,) = summarise(frame, "smape").itertuples()
     assert (row.n, row.median, row.half_iqr) == (4, 2.5, 0.75)
     assert 1.0 <= row.low < 2.5 < row.high <= 4.0
+
+
+def test_infinite_values_have_a_median_and_a_sign():
+    frame = pd.DataFrame({"settling": [1.0, 2.0, math.inf, math.inf, math.inf], "escaped": 0})
+    frame = frame.assign(system="lorenz", method="ekf", starts="X", noise=0.0)
+    (row,) = summarise(frame, "settling").itertuples()
+    assert [_number(value) for value in (row.median, row.half_iqr, 1.2345, 1e-5, 0.0)] == [
+        "∞",
+        "∞",
+        "1.23",
+        "<0.001",
+        "0",
+    ]
 
 
 def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):

@@ -1,5 +1,6 @@
 """Each method of the benchmark, where the truth is known."""
 
+import importlib
 import math
 from dataclasses import replace
 
@@ -17,9 +18,11 @@ from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
 from training.data import output, run_filter
 from training.methods import METHODS, Budget, Task, get_method
+from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.autoencoder import bessel_filter
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
+from training.methods.gru import _Problem as _GRUProblem
 from training.methods.kalman import (
     ExtendedKalmanFilter,
     UnscentedFilters,
@@ -276,6 +279,78 @@ def test_bessel_filter_has_the_poles_of_a_bessel_filter(nx):
     assert ones.sum(0).tolist() == [nx + 1, nx + 1]
     poles = np.sort_complex(np.linalg.eigvals(D[: nx + 1, : nx + 1]))
     np.testing.assert_allclose(poles, np.sort_complex(bessel(nx + 1, 1.0, analog=True, output="zpk")[1]), atol=1e-9)
+
+
+def test_gain_tuning_takes_the_least_of_the_authors_criterion(tmp_path):
+    problem = _AEProblem(Task(Oscillator(), SMALL, tmp_path), 0.5, 8.0)
+    for network in (
+        problem.encoder,
+        problem.decoder,
+    ):  # maps that ignore the cutoff: only the transient gain depends on it
+        network.linear_layers()[0].weight.data[:, -1] = 0.0
+    assert problem.best_cutoff() == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_kalman_filters_are_told_the_noise(name):
+    method, system = get_method(name), get_system("van_der_pol")
+    y0 = np.array([[3.0]])
+    moved = [
+        method.observer({"process_noise": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0]
+        for noise in (0.0, 50.0)
+    ]
+    assert moved[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
+    assert moved[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "expected"), [("node", 0.0), ("node-noise", 0.5), ("dmf", 0.0), ("dmf-noise", 0.5)])
+def test_noise_variants_see_noise_in_training(name, expected, tmp_path, monkeypatch):
+    module = importlib.import_module(f"training.methods.{name[:4].rstrip('-')}")
+    seen = []
+
+    class Spy(module.Batches):
+        def __call__(self, generator):
+            y, ages, x = super().__call__(generator)
+            seen.append(y.numpy())
+            return y, ages, x
+
+    monkeypatch.setattr(module, "Batches", Spy)
+    trained_on_oscillator(name, tmp_path, steps=1)
+    roughness = np.diff(seen[0], axis=1).std()  # of the clean output at dt = 0.05 about 0.03
+    assert roughness == pytest.approx(math.hypot(0.03, expected * math.sqrt(2)), abs=0.03)
+
+
+def test_gru_sees_every_noise_level_in_training(tmp_path):
+    data = Task(Oscillator(), SMALL, tmp_path).data
+    torch.manual_seed(0)
+    problem, generator, fed = _GRUProblem(data, 8, 50, torch.device("cpu")), torch.Generator().manual_seed(0), []
+    problem.network.gru.register_forward_pre_hook(lambda _, inputs: fed.append(inputs[0]))
+    problem.loss(generator)
+    level = problem.level[:, 0].numpy()
+    assert 0.3 < (level == 0).mean() < 0.7
+    assert 0.4 < level.max() <= 0.5
+    clean = (data.y[:50, problem.rows.numpy()] - problem.scaling["y_offset"]) / problem.scaling["y_scale"]
+    noise = (fed[0].numpy() - clean).std(0)[:, 0] * problem.scaling["y_scale"]
+    np.testing.assert_allclose(noise, level, atol=0.15)
+    assert noise[level == 0].max() < 1e-5
+    for _ in range(11):  # the hidden state goes on through a trajectory and begins anew with the next
+        problem.loss(generator)
+    assert int(problem.position) == 50
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("name = label = 'mine'", "must define observer, train"),
+        ("label = 'mine'\n    train = observer = None", "class variables name and label"),
+        ("name = 'mine'\n    train = observer = None", "class variables name and label"),
+        ("name = label = 'ekf'\n    train = observer = None", "takes the name 'ekf' of another"),
+    ],
+)
+def test_methods_that_lack_something(body, message, tmp_path):
+    (tmp_path / "mine.py").write_text(f"from training.methods import Method\n\n\nclass Mine(Method):\n    {body}\n")
+    with pytest.raises(ValueError, match=message):
+        get_method(f"{tmp_path / 'mine.py'}:Mine")
 
 
 def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path):

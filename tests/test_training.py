@@ -7,7 +7,9 @@ import pytest
 import torch
 from linear_system import Oscillator, sylvester
 from rich.console import Console
+from rich.progress import Progress
 from scipy.integrate import solve_ivp
+from torch.utils.tensorboard import SummaryWriter
 
 import training.optimise
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
@@ -324,6 +326,53 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):
         train(system, config, tmp_path / "cut", resume=True)
+
+
+class Clock:
+    """CPU time that goes on by a hundredth of a second whenever somebody looks."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        self.now += 0.01
+        return self.now
+
+
+def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypatch):
+    monkeypatch.setattr(training.optimise.time, "process_time", Clock())
+    rates = []
+
+    class Line(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.a = torch.nn.Parameter(torch.zeros(1))
+
+    def fit(stop_after=None):
+        module, calls = Line(), []
+
+        def loss(generator):
+            calls.append(float(module.a.detach()))
+            if stop_after and len(calls) > stop_after:
+                raise KeyboardInterrupt
+            return {"loss": ((module.a - 1.0) ** 2).sum()}
+
+        stage = training.optimise.Stage("line", 10**9, 0.1, tmp_path, "same", 0, cap=4.0)
+        with SummaryWriter(tmp_path) as writer, Progress(disable=True) as progress:
+            training.optimise.optimise(stage, module, loss, progress, writer, resume=True)
+        rates.extend(np.abs(np.diff(calls)))
+        return len(calls)
+
+    monkeypatch.setattr(training.optimise, "CHECKPOINT_SECONDS", 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        fit(stop_after=150)  # the checkpoint is of step 100
+    spent = training.optimise.seconds_spent(tmp_path)
+    assert 1.5 < spent < 3.0
+    rest = fit()
+    assert 4.0 <= training.optimise.seconds_spent(tmp_path) < 4.1
+    assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
+    assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
+    assert fit() == 0
 
 
 def test_resuming_notices_a_changed_equation(tmp_path):
