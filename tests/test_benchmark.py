@@ -77,6 +77,16 @@ class Explosive(Constant):
 """
 
 
+BROKEN = """
+
+class Broken(Constant):
+    name = "broken"
+
+    def train(self, task, configuration):
+        return 1 / 0
+"""
+
+
 @pytest.fixture
 def toy(tmp_path):
     """A user's method in a script of its own, and the log of its trainings."""
@@ -317,11 +327,12 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
 def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     name, _ = toy
     script = Path(name.rpartition(":")[0])
-    script.write_text(script.read_text() + '\n\nclass Broken(Constant):\n    name = "broken"\n    train = None\n')
+    script.write_text(script.read_text() + BROKEN)
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="1 of 2 jobs failed; the first: lorenz/broken"):
         Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(quiet())
     assert set(pd.read_csv(out / "methods.csv").method) == {"constant"}
+    assert "in train" in (out / "jobs" / "lorenz" / "broken" / "failure.txt").read_text()
 
 
 def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):

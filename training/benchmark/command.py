@@ -81,7 +81,7 @@ class Benchmark:
             for job, failure, running in run_all(todo, min(self.jobs, max(1, len(todo)))):
                 if failure:
                     failures.append(f"{job.name}: {failure}")
-                    progress.console.print(f"[red]failed[/red] {failures[-1]}")
+                    progress.console.print(f"[red]failed[/red] {failures[-1]} ({job.folder / 'failure.txt'})")
                 else:
                     progress.console.print(f"finished {job.name}")
                 text = f"observers (now {', '.join(running)})" if running else "observers"

@@ -8,6 +8,7 @@ import os
 import shutil
 import threading
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
@@ -24,8 +25,6 @@ from training.files import write
 from training.methods import METHODS, Budget, Configuration, Method, Task, get_method
 from training.optimise import seconds_spent
 from training.pipeline import describe
-
-Running = Callable[[list[str]], None]
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,8 @@ class Job:
 def run_job(job: Job) -> None:
     """Choose, train, measure; steps that were done before are not done again.
 
-    Raises ValueError if the folder is another benchmark's, RuntimeError if another process is at work there.
+    Raises ValueError if the folder is another benchmark's, RuntimeError if another process is at work there, and
+    whatever the method raises, with the traceback in failure.txt.
     """
     torch.set_num_threads(1)
     job.folder.mkdir(parents=True, exist_ok=True)
@@ -105,7 +105,11 @@ def run_job(job: Job) -> None:
         with FileLock(job.folder / ".lock", timeout=0):
             if not job.done:
                 job.claim()
-                _run(job)
+                try:
+                    _run(job)
+                except Exception:
+                    write(job.folder / "failure.txt", traceback.format_exc())
+                    raise
     except Timeout:
         raise RuntimeError(f"another process is at work in {job.folder}") from None
 
