@@ -229,6 +229,22 @@ def test_validation_trajectories_are_not_those_of_evaluation():
     assert double == pytest.approx(100 * 2 / 3)
 
 
+def test_methods_made_for_one_noise_level_are_validated_there():
+    system, asked = get_system("lorenz"), []
+
+    class Particular(Oracle):
+        tuned_for = (0.25,)
+
+        def observer(self, trained, system, dt, noise):
+            asked.append(noise)
+            return self
+
+    protocol = Protocol(noise=(0.0, 0.5), trajectories=2, duration=0.1)
+    exact = unseen_runs(system, 0.01, 2, 0.1, 0, first=VALIDATION_SEED).x
+    validate(Particular(exact), None, system, 0.01, protocol)
+    assert asked == [0.25]
+
+
 @pytest.mark.parametrize("domain", ["1.5X", "2X"])
 def test_starts_outside_x_lie_between_the_boxes(domain):
     system = get_system("rossler")

@@ -72,6 +72,7 @@ class Job:
             "system": describe(system),
             "method": method.name,
             "configurations": method.configurations(system),
+            "tuned_for": method.tuned_for,
             "version": kkl_gym.__version__,
         }
         del described["folder"], described["device"]

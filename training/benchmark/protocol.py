@@ -92,7 +92,7 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
 def validate(method: Method[Any], trained: Any, system: System, dt: float, protocol: Protocol) -> float:
     """How well a configuration does on validation trajectories from X: smaller is better.
 
-    The geometric mean over the noise levels of the median SMAPE over all steps, in percent.
+    The geometric mean over the noise levels that the method is tuned for of the median SMAPE over all steps, in percent.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED)
@@ -100,7 +100,7 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
     seed = (VALIDATION_SEED, protocol.seed, 1)
     medians = []
-    for noise in protocol.noise:
+    for noise in method.tuned_for or protocol.noise:
         y = noisy_output(system, runs, noise, protocol.trajectories, seed)
         x_hat = run(method.observer(trained, system, dt, noise), y)
         medians.append(np.median(smape(runs.x, x_hat)))

@@ -36,6 +36,7 @@ class AE(KKLMethod):
 
     name: ClassVar[str] = "ae"
     label: ClassVar[str] = "AE"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """The cutoff that the criterion gives, and faster ones: it knows nothing of how well T can be learned."""

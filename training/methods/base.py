@@ -133,11 +133,13 @@ class Method(ABC, Generic[Trained]):
     name : identifies the method in commands, folders and tables.
     label : how tables and figures call it.
     trajectories : the largest number of test trajectories, for methods too slow for all of them.
+    tuned_for : noise levels at which its configurations are compared, if not all those of the test.
     """
 
     name: ClassVar[str]
     label: ClassVar[str]
     trajectories: ClassVar[int | None] = None
+    tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """At most three; the benchmark takes the one that does best on validation trajectories."""

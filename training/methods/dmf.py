@@ -36,6 +36,7 @@ class DMF(Method[Arrays]):
 
     name: ClassVar[str] = "dmf"
     label: ClassVar[str] = "DMF"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
     noise: ClassVar[float] = 0.0
     """Standard deviation of the noise added to y in training."""
 
@@ -92,6 +93,7 @@ class DMFNoise(DMF):
 
     name: ClassVar[str] = "dmf-noise"
     label: ClassVar[str] = "DMF, noise"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.5,)
     noise: ClassVar[float] = 0.5
 
 

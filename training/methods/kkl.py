@@ -77,6 +77,7 @@ class SPINN(KKLMethod):
 
     name: ClassVar[str] = "spinn"
     label: ClassVar[str] = "SPINN"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three spectra."""

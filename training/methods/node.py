@@ -24,6 +24,7 @@ class NODE(KKLMethod):
 
     name: ClassVar[str] = "node"
     label: ClassVar[str] = "NODE"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
     noise: ClassVar[float] = 0.0
     """Standard deviation of the noise added to y in training."""
 
@@ -66,6 +67,7 @@ class NODENoise(NODE):
 
     name: ClassVar[str] = "node-noise"
     label: ClassVar[str] = "NODE, noise"
+    tuned_for: ClassVar[tuple[float, ...] | None] = (0.5,)
     noise: ClassVar[float] = 0.5
 
 
