@@ -92,7 +92,7 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
 def validate(method: Method[Any], trained: Any, system: System, dt: float, protocol: Protocol) -> float:
     """How well a configuration does on validation trajectories from X: smaller is better.
 
-    The geometric mean over the noise levels that the method is tuned for of the median SMAPE over all steps, in percent.
+    The geometric mean over the noise levels that it is tuned for of the median SMAPE over all steps, in percent.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED)
