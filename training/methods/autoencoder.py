@@ -40,7 +40,7 @@ class AE(KKLMethod):
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """The cutoff that the criterion gives, and faster ones: it knows nothing of how well T can be learned."""
-        return tuple({"cutoff_factor": factor} for factor in (1.0, 3.0, 10.0))
+        return tuple({"cutoff_factor": factor} for factor in (10.0, 3.0, 1.0))
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """Learn for every cutoff, choose one, learn for it."""

@@ -18,7 +18,7 @@ from training.pipeline import make_filter
 
 SHARE = 0.6  # of the transient stage in the CPU time; the asymptotic stage has the rest
 EPSILON = 1e-3  # 1/s, no mode is slower
-LEARNING_RATE = 5e-3
+LEARNING_RATE = 1e-2
 FORGET = 0.98  # of the filtered innovations, per sample
 
 

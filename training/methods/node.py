@@ -42,7 +42,7 @@ class NODE(KKLMethod):
         decoder = Decoder(network, linear, task.data, task.device)
         problem = _Problem(decoder, -linear.A.diagonal()[: linear.size // system.ny], system.ny, budget.dt, task.device)
         batches = Batches(task.data, decoder, self.noise, task.device)
-        task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=5e-3)
+        task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=1e-2)
         eigenvalues = tuple(problem.theta().tolist())
         return Artifact(
             filter=make_filter(eigenvalues, system.ny, budget.dt, 0),

@@ -9,8 +9,8 @@ from training.data import run_filter
 from training.methods.base import Data
 from training.networks import Network, tensor
 
-TRAJECTORIES_PER_BATCH = 64
-AGES_PER_BATCH = 64
+TRAJECTORIES_PER_BATCH = 128
+AGES_PER_BATCH = 32
 SOFT_FLOOR = 1e-3
 
 
@@ -45,16 +45,15 @@ def rollout(
     while len(powers) <= gaps.max():  # I, F, F^2, ... by doubling
         powers = torch.cat([powers, powers @ square])
         square = square @ square
-    n = len(y)
-    pairs = torch.cat([y[:, :-1], y[:, 1:]], -1)
-    response = (powers @ torch.cat([early, late], -1)).flip(0).transpose(1, 2)  # the oldest sample comes first
-    z, out, age = z0, [], 0
-    for gap in gaps.tolist():
+    # w = z - late y follows w_k+1 = transition w_k + (early + transition late) y_k, with one sample of y in each step.
+    response = (powers @ (early + transition @ late)).flip(0).transpose(1, 2)  # the oldest sample comes first
+    w, out, age = z0 - y[:, 0] @ late.T, [], 0
+    for gap, jump in zip(gaps.tolist(), powers[torch.as_tensor(gaps)].mT.unbind(), strict=True):
         if gap:
             kernel = response[len(response) - gap :].reshape(-1, len(transition))
-            z = z @ powers[gap].T + pairs[:, age : age + gap].reshape(n, -1) @ kernel
+            w = w @ jump + y[:, age : age + gap].reshape(len(y), -1) @ kernel
             age += gap
-        out.append(z)
+        out.append(w + y[:, age] @ late.T)
     return torch.stack(out)
 
 
