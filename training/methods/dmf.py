@@ -12,7 +12,7 @@ from observers import MLP, LinearFilter
 from training.data import output
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 from training.methods.kkl import SPECTRA, spectrum
-from training.methods.recurrent import Batches, Decoder, rollout
+from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, rollout
 from training.networks import Network
 from training.pipeline import make_filter
 
@@ -103,7 +103,8 @@ class _Stage(nn.Module):
     def __init__(self, decoder: Decoder, start: Network, linear: LinearFilter, device: torch.device) -> None:
         super().__init__()
         self.decoder, self.start, self.dt = decoder, start.to(device), linear.dt
-        self.S = nn.Parameter(torch.diag(torch.as_tensor(np.sqrt(-linear.A.diagonal()), device=device)))
+        self._S = torch.diag(torch.as_tensor(np.sqrt(-linear.A.diagonal()), device=device))
+        self.S = nn.Parameter(torch.zeros_like(self._S))
         self.K = nn.Parameter(torch.zeros_like(self.S))
         self.B = torch.as_tensor(linear.dt * linear.B, device=device)
         self._offset = torch.as_tensor(decoder.z_offset, device=device)
@@ -112,7 +113,8 @@ class _Stage(nn.Module):
     def A(self) -> torch.Tensor:
         """Schur stable, (nz, nz)."""
         eye = torch.eye(len(self.S), dtype=self.S.dtype, device=self.S.device)
-        M: torch.Tensor = self.K - self.K.T - self.S @ self.S.T - EPSILON * eye
+        S, K = self._S + SPECTRUM_PACE * self.S, SPECTRUM_PACE * self.K
+        M = K - K.T - S @ S.T - EPSILON * eye
         A: torch.Tensor = torch.linalg.matrix_exp(self.dt * M)
         return A
 

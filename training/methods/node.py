@@ -10,7 +10,7 @@ from kkl_gym.system import System
 from observers import Artifact, InverseMap
 from training.methods.base import Configuration, Task
 from training.methods.kkl import SPECTRA, KKLMethod, spectrum
-from training.methods.recurrent import Batches, Decoder, rollout
+from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, rollout
 from training.networks import Network
 from training.pipeline import make_filter, output_matrix
 
@@ -77,11 +77,12 @@ class _Problem(nn.Module):
     def __init__(self, decoder: Decoder, rates: np.ndarray, ny: int, dt: float, device: torch.device) -> None:
         super().__init__()
         self.decoder, self.ny, self.dt = decoder, ny, dt
-        self.log_rates = nn.Parameter(torch.as_tensor(np.log(rates), device=device))
+        self._log_rates = torch.as_tensor(np.log(rates), device=device)
+        self.change = nn.Parameter(torch.zeros_like(self._log_rates))
 
     def theta(self) -> torch.Tensor:
         """Eigenvalues in 1/s, (nz / ny,)."""
-        return -self.log_rates.exp()
+        return -(self._log_rates + SPECTRUM_PACE * self.change).exp()
 
     def loss(self, y: torch.Tensor, ages: np.ndarray, x: torch.Tensor) -> dict[str, Any]:
         """Mean square error of the scaled estimate, from z0 = -A^-1 B y0."""

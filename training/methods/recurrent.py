@@ -11,7 +11,9 @@ from training.networks import Network, tensor
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
-SOFT_FLOOR = 1e-3
+SOFT_FLOOR = 1e-4
+# Of the spectrum's learning rate in the decoder's, which has to follow it.
+SPECTRUM_PACE = 0.1
 
 
 def rollout(
