@@ -35,7 +35,7 @@ results: $(VENV)/ready
 	$(BIN)/kkl-gym demo --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
 
-benchmark: $(VENV)/ready  ## every method on every system, about three hours on two cores; resumable
+benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
