@@ -5,6 +5,8 @@ import gymnasium as gym
 from kkl_gym.envs import KKLEnv
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
+from kkl_gym.vector import KKLVectorEnv
+from kkl_gym.vector_wrappers import KKLVectorObservation, VectorActionRepeat
 from kkl_gym.wrappers import ActionRepeat, KKLObservation
 
 __version__ = "0.1.0"
@@ -13,7 +15,13 @@ ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
 for _name, _id in ENV_IDS.items():
     if _id not in gym.registry:  # a second import, as after importlib.reload, changes nothing
-        gym.register(_id, entry_point="kkl_gym.envs:KKLEnv", kwargs={"system": _name}, max_episode_steps=5000)
+        gym.register(
+            _id,
+            entry_point="kkl_gym.envs:KKLEnv",
+            vector_entry_point="kkl_gym.vector:KKLVectorEnv",
+            kwargs={"system": _name},
+            max_episode_steps=5000,
+        )
 
 __all__ = [
     "ENV_IDS",
@@ -21,10 +29,13 @@ __all__ = [
     "ActionRepeat",
     "KKLEnv",
     "KKLObservation",
+    "KKLVectorEnv",
+    "KKLVectorObservation",
     "Lorenz",
     "ReverseDuffing",
     "Rossler",
     "System",
     "VanDerPol",
+    "VectorActionRepeat",
     "get_system",
 ]

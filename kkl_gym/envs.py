@@ -1,20 +1,17 @@
 """Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
 
-import math
 from collections import deque
 from collections.abc import Mapping
-from numbers import Real
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.simulate import advance, check_dt
+from kkl_gym.plant import Plant
+from kkl_gym.simulate import advance
 from kkl_gym.system import System
-from kkl_gym.systems import get_system
 
 TRAIL = 1000  # samples that a rendered phase portrait shows
-NOISE_BLOCK = 64  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
 
 class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -72,32 +69,19 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         parameters: Mapping[str, float] | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.system = get_system(system, parameters)
-        check_dt(dt)
-        process_noise = self.system.process_noise if process_noise is None else process_noise
-        for name, level in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
-            if isinstance(level, bool) or not isinstance(level, Real) or not 0 <= level < math.inf:
-                raise ValueError(f"{name} must be finite and not negative, got {level!r}")
-        if observe not in ("state", "output"):
-            raise ValueError(f'observe must be "state" or "output", got {observe!r}')
+        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
-        self.dt = float(dt)
-        self.process_noise = float(process_noise)
-        self.measurement_noise = float(measurement_noise)
-        self.observe = observe
         self.render_mode = render_mode
+        self.system, self.dt, self.observe = self.plant.system, self.plant.dt, observe
+        self.process_noise, self.measurement_noise = self.plant.process_noise, self.plant.measurement_noise
+        self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 
-        self._nx, self._ny, self._nu = self.system.nx, self.system.ny, self.system.nu
-        self._w_max = np.array(self.system.scale) * self.process_noise
-        weights = [1.0 / (self._nx * scale**2) for scale in self.system.scale]
-        self._goal = [*zip(self.system.target, weights, strict=True)]
+        # What every step reads, as Python numbers
+        self._nx, self._nu = self.system.nx, self.system.nu
+        self._goal = [*zip(self.system.target, self.plant.weights.tolist(), strict=True)]
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
-        self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
-        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
-        self.observation_space = self.state_space if observe == "state" else self.output_space
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
-        self.action_space = gym.spaces.Box(-1.0, 1.0, (self._nu,), np.float32)
         self._noise: list[tuple[list[float], list[float]]] = []
         self._x: tuple[float, ...] | None = None
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
@@ -118,9 +102,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         for key, value in (options or {}).items():
             if key != "x0":
                 raise ValueError(f'unknown reset option {key!r}; the one there is is "x0"')
-            start = np.asarray(value, dtype=float)
-            if start.shape != (self._nx,) or not self._inside(start.tolist()):
-                raise ValueError(f"x0 must be {self._nx} numbers within {self.system.bounds}, got {value!r}")
+            start = self.plant.start(value)
         if start is None:
             start = self.np_random.uniform(*self.system.box())
         self._x = tuple(start.tolist())
@@ -196,22 +178,6 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     def _next_noise(self) -> tuple[list[float], list[float]]:
         """One sample of (w, v)."""
         if not self._noise:
-            w = self.np_random.uniform(-self._w_max, self._w_max, (NOISE_BLOCK, self._nx))
-            v = self.np_random.normal(0.0, self.measurement_noise, (NOISE_BLOCK, self._ny))
+            w, v = self.plant.noise(self.np_random)
             self._noise = [*zip(w.tolist()[::-1], v.tolist()[::-1], strict=True)]
         return self._noise.pop()
-
-
-def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high, each (ny,), of h over the declared bounds, widened by ``margin``.
-
-    Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
-    """
-    ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
-    points = np.array(np.meshgrid(*ends, indexing="ij")).reshape(system.nx, -1)
-    y = np.array([np.broadcast_to(yi, points.shape[1:]) for yi in system.h(points)])
-    return y.min(1) - margin, y.max(1) + margin
-
-
-def _float32_box(low: Any, high: Any) -> gym.spaces.Box:
-    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)

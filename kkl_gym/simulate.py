@@ -1,7 +1,7 @@
 """Fixed-step simulation: a sixth-order Runge–Kutta method with as many substeps as the state asks for.
 
-One compiled step serves single states (Python floats) and batches (NumPy arrays), with the same arithmetic in
-the same order, so that both give the same numbers.
+The same method, and the same substeps, twice: written out for single states on Python floats (:func:`advance`), and
+on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-13 of the state in each step.
 """
 
 import functools
@@ -31,6 +31,7 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
+_ROWS = [np.array(row) for row in (*STAGES, WEIGHTS)]
 
 VectorField = Callable[[Any], Any]
 
@@ -40,8 +41,8 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
     """The Runge–Kutta step of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
 
     The function returned, ``integrate(f, x, d, h, n)``, makes ``n`` steps of length ``h`` of x' = f(x) + d with d
-    constant. Written out (as :mod:`dataclasses` writes ``__init__``) it is several times as fast on floats as
-    loops over stages and components, and in batches it needs no arrays to be stacked.
+    constant, all components Python floats. Written out (as :mod:`dataclasses` writes ``__init__``) it is several times
+    as fast as loops over stages and components.
     """
     components = range(nx)
 
@@ -122,21 +123,33 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need = np.broadcast_to(system.rate(x) * dt / RATE_STEP, x.shape[1:])
-        out = np.full_like(x, np.nan)
-        n = 1
-        todo = need <= MAX_SUBSTEPS
-        while True:
-            rows = todo & (need <= n)
-            if rows.all():
-                field, d = forced(system, u, w)
-                return np.array(runge_kutta(len(x))(field, x, d, dt / n, n))
-            if rows.any():
-                field, d = forced(system, u[:, rows], w[:, rows])
-                out[:, rows] = runge_kutta(len(x))(field, x[:, rows], d, dt / n, n)
-                todo &= ~rows
-            if not todo.any():
-                return out
-            n *= 2
+        if (need <= 1).all():
+            return _step_batch(system, x, u, w, dt)
+        lost = ~(need <= MAX_SUBSTEPS)
+        mantissa, exponent = np.frexp(np.where(lost, 1, np.maximum(need, 1)))
+        substeps = 1 << (exponent - (mantissa == 0.5))  # the power of two that is not less than need
+        h = dt / substeps
+        out = _step_batch(system, x, u, w, h)
+        for k in range(2, substeps.max() + 1):
+            rows = np.flatnonzero(substeps >= k)
+            out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
+        out[:, lost] = np.nan
+        return out
+
+
+def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> np.ndarray:
+    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,)."""
+    field, d = forced(system, u, w)
+    slopes = np.empty((len(STAGES), *x.shape))  # times h
+    flat = slopes.reshape(len(STAGES), -1)
+    at = x
+    for stage, slope in enumerate(slopes, 1):
+        for fi, di, out in zip(field(at), d, slope, strict=True):
+            np.add(fi, di, out=out)
+        slope *= h
+        at = (_ROWS[stage] @ flat[:stage]).reshape(x.shape)
+        at += x
+    return at
 
 
 def simulate(

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from kkl_gym.envs import KKLEnv
-from observers import KKLObserver, load, shipped
+from kkl_gym.installed import Installed
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -54,22 +54,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         base = env.unwrapped
         if not isinstance(base, KKLEnv):
             raise ValueError(f"KKLObservation needs a kkl_gym environment, got {base}")
-        if estimate not in ("x", "z"):
-            raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
-        system = base.system
-        if observer is None and system.name not in shipped():
-            raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
-        self.observer: KKLObserver = load(
-            system.name if observer is None else observer,
-            base.measurement_noise if measurement_noise is None else measurement_noise,
-        )
-        self.observer.artifact.check(system.name, system.parameters, base.dt, system.ny, system.nu)
+        self._installed = Installed(base.plant, observer, estimate, measurement_noise, ignore_input)
+        self.observer = self._installed.observer
         self.estimate = estimate
-        self._blind = self.observer.artifact.nu == 0 and system.nu > 0
-        self._ignore_input = ignore_input
-        space = base.state_space if estimate == "x" else _filter_space(base, self.observer)
-        self.observation_space = space
-        self._low, self._high = space.low.astype(float), space.high.astype(float)
+        self.observation_space = self._installed.space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -88,22 +76,13 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 f"the observer was to see sample {self._sample} and was shown sample {info['sample']}: put wrappers "
                 "that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation"
             )
-        u = info["u"]
-        if self._blind:
-            if not self._ignore_input and u.any():
-                raise ValueError(
-                    f"the map {self.observer.artifact.system!r} in use knows no inputs, but the agent applied u = {u}; "
-                    "use the default map, keep the action at 0, or pass ignore_input=True"
-                )
-            u = None
-        return self._show(self.observer.step(info["y"], u), info), float(reward), terminated, truncated, info
+        x_hat = self.observer.step(info["y"], self._installed.known(info["u"]))
+        return self._show(x_hat, info), float(reward), terminated, truncated, info
 
     def _show(self, x_hat: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         z = self.observer.z
         info["x_hat"], info["z"] = x_hat, z
-        shown = np.maximum(x_hat if self.estimate == "x" else z, self._low)
-        out: np.ndarray = np.minimum(shown, self._high).astype(np.float32)
-        return out
+        return self._installed.shown(x_hat if self.estimate == "x" else z)
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -129,25 +108,6 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
             if terminated or truncated:
                 break
         return obs, total, terminated, truncated, info
-
-
-def _filter_space(env: KKLEnv, observer: KKLObserver) -> gym.spaces.Box:
-    """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
-
-    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
-    constant output would have led, so that its start lies within as well.
-    """
-    linear = observer.artifact.filter
-    y_max = np.maximum(np.abs(env.output_space.low), np.abs(env.output_space.high)).astype(float)
-    driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
-    limits = np.concatenate([y_max, y_max, env.system.u_max[: linear.nu]])
-    forgetting = np.abs(np.linalg.eigvals(linear.transition)).max()
-    bound = np.zeros(linear.size)
-    for _ in range(int(np.ceil(np.log(1e-4) / np.log(forgetting)))):
-        bound += np.abs(driven) @ limits
-        driven = linear.transition @ driven
-    bound = (1.001 * bound).astype(np.float32)  # for the tail of the sum
-    return gym.spaces.Box(-bound, bound, dtype=np.float32)
 
 
 __all__ = ["ActionRepeat", "KKLObservation"]

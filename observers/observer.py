@@ -16,7 +16,8 @@ class KKLObserver:
     """z' = A z + B y, x_hat = T_inv(z): a causal state estimate from sampled outputs (paper, sec. 3.2).
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
-    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx).
+    All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
+    linear filter, followed by :meth:`decode`, the network; :meth:`restart` begins anew in some rows of a batch.
 
     Parameters
     ----------
@@ -32,6 +33,7 @@ class KKLObserver:
         self.artifact = artifact
         self.measurement_noise = measurement_noise
         self._z: np.ndarray | None = None
+        self._age: Any = 0  # samples since reset, an array where rows have restarted
 
     @property
     def measurement_noise(self) -> float:
@@ -68,7 +70,25 @@ class KKLObserver:
         y0 = np.array(y0, dtype=float)  # a copy: it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1])
         self._z, self._y, self._age = self.artifact.filter.start(y0), y0, 0
-        return self._invert(self._z, 0.0)
+        return self.decode()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Forget the past in some rows of the batch and take in their first samples.
+
+        Parameters
+        ----------
+        y0 : first samples, (number of True in rows, ny).
+        rows : boolean, of the batch's shape (...,).
+
+        Raises ValueError on a wrong shape, NaN or infinity, RuntimeError before :meth:`reset`.
+        """
+        z = self._rows(rows)
+        y0 = np.asarray(y0, dtype=float)
+        self._check_output(y0, (int(rows.sum()),))
+        z[rows] = self.artifact.filter.start(y0)
+        self._z, self._y = z, self._y.copy()
+        self._y[rows] = y0
+        self._age = np.where(rows, 0, self._age)
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the sample y, (..., ny), that followed the input u, (..., nu); returns the estimate, (..., nx).
@@ -80,6 +100,11 @@ class KKLObserver:
         Raises ValueError on a wrong shape, NaN or infinity, or a nonzero input that the map does not know of;
         the observer is then as it was. Raises RuntimeError before :meth:`reset`.
         """
+        self.advance(y, u)
+        return self.decode()
+
+    def advance(self, y: np.ndarray | None, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
+        """The filter's half of :meth:`step`; with ``rows``, boolean of the batch's shape, in these rows only."""
         if self._z is None:
             raise RuntimeError("call reset(y0) before step(y)")
         batch = self._z.shape[:-1]
@@ -89,10 +114,30 @@ class KKLObserver:
         else:
             y = np.array(y, dtype=float)
             self._check_output(y, batch)
-        self._z = self.artifact.filter.advance(self._z, self._y, u, y)
-        self._y = y
-        self._age += 1
-        return self._invert(self._z, self._age * self.artifact.filter.dt)
+        z = self.artifact.filter.advance(self._z, self._y, u, y)
+        if rows is None:
+            self._z, self._y, self._age = z, y, self._age + 1
+        else:
+            kept = self._rows(rows)
+            kept[rows] = z[rows]
+            self._z, self._y = kept, np.where(rows[..., None], y, self._y)
+            self._age = self._age + rows
+
+    def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """The estimate T_inv(z) as things stand, (..., nx), or of some rows of the batch only, (number of rows, nx)."""
+        if self._z is None:
+            raise RuntimeError("call reset(y0) before the observer is used")
+        z, age = self._z, self._age
+        if rows is not None:
+            z, age = self._rows(rows)[rows], np.broadcast_to(age, rows.shape)[rows]
+        return self._invert(z, age * self.artifact.filter.dt)
+
+    def _rows(self, rows: np.ndarray) -> np.ndarray:
+        """A copy of z of which ``rows`` may be indexed."""
+        z = self.z
+        if rows.dtype != np.bool_ or rows.shape != z.shape[:-1]:
+            raise ValueError(f"rows must be boolean with shape {z.shape[:-1]}, got {rows.dtype} {rows.shape}")
+        return z
 
     def _predicted_output(self, z: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The next output by the observer's own estimate: predicted as it is now, corrected once."""

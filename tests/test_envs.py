@@ -18,7 +18,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import kkl_gym
 from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, get_system
-from kkl_gym.envs import NOISE_BLOCK, output_bounds
+from kkl_gym.plant import NOISE_BLOCK, output_bounds
 from kkl_gym.simulate import advance
 
 everyone = pytest.mark.parametrize("name", ENV_IDS)
@@ -407,8 +407,8 @@ def test_output_bounds():
     low, high = output_bounds(Rossler(), 3.0)
     assert (low.tolist(), high.tolist()) == ([-73.0], [73.0])
     env = KKLEnv("rossler", measurement_noise=0.5)
-    assert (env.output_space.low, env.output_space.high) == (-73.0, 73.0)
-    assert env.state_space.low.tolist() == [-50.0, -70.0, -5.0]
+    assert (env.plant.output_space.low, env.plant.output_space.high) == (-73.0, 73.0)
+    assert env.plant.state_space.low.tolist() == [-50.0, -70.0, -5.0]
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])

@@ -169,16 +169,18 @@ def one_by_one(system, x0, u, w, dt):
 
 @pytest.mark.parametrize("system", [*(cls() for cls in SYSTEMS.values()), TwoInputs()], ids=lambda s: s.name)
 @pytest.mark.parametrize("dt", [0.003, 0.01, 0.1])
-def test_scalar_equals_batch_bit_for_bit(system, dt):
+def test_scalar_and_batch_agree_to_rounding_in_each_step(system, dt):
     rng = np.random.default_rng(4)
     n, steps = 30, 20
     x0 = rng.uniform(*system.box(), (n, system.nx))
     u = rng.uniform(-1, 1, (steps, n, system.nu)) * system.u_max
     w = rng.uniform(-1, 1, (steps, n, system.nx))
-    batch, scalar = simulate(system, x0, steps, dt, u, w), one_by_one(system, x0, u, w, dt)
+    batch = simulate(system, x0, steps, dt, u, w)
+    scalar = np.array([one_by_one(system, x, ui[None], wi[None], dt)[1] for x, ui, wi in zip(batch, u, w)])
     stays = np.isfinite(batch[-1]).all(-1)
     assert stays.sum() >= n // 2
-    assert np.array_equal(batch[:, stays], scalar[:, stays])
+    error = np.abs(batch[1:, stays] - scalar[:, stays]).max(-1)
+    assert (error <= 1e-13 * (1.0 + np.abs(scalar[:, stays]).max(-1))).all()
 
 
 @settings(deadline=None, max_examples=200, derandomize=True)
@@ -188,13 +190,21 @@ def test_scalar_and_batch_choose_the_same_substeps(k, above, dt):
     rate = 2**k * RATE_STEP / dt
     for _ in range(abs(above)):
         rate = math.nextafter(rate, math.inf if above > 0 else 0.0)
-    system = fixed_rate(rate)
-    (batch,) = advance_batch(system, np.array([[1.0], [0.5]]), np.ones((1, 1)), np.zeros((2, 1)), dt).T
-    assert batch.tolist() == list(advance(system, (1.0, 0.5), (1.0,), (0.0, 0.0), dt))
+    alone, together = fixed_rate(rate), fixed_rate(rate)
+    advance(alone, (1.0, 0.5), (1.0,), (0.0, 0.0), dt)
+    advance_batch(together, np.array([[1.0], [0.5]]), np.ones((1, 1)), np.zeros((2, 1)), dt)
+    assert len(alone.calls) == len(together.calls) >= 7 * 2**k
 
 
 def fixed_rate(value):
     class Fixed(ReverseDuffing):
+        name = "fixed"
+        calls = []  # noqa: RUF012
+
+        def f(self, x):
+            self.calls.append(x)
+            return super().f(x)
+
         def rate(self, x):
             return value + 0.0 * x[0]
 
@@ -207,7 +217,7 @@ def test_each_row_takes_its_own_substeps():
     u, w = np.zeros((1, 2)), np.zeros((2, 2))
     together = advance_batch(system, np.array([slow, fast]).T, u, w, DT)
     for row, start in enumerate((slow, fast)):
-        assert together[:, row].tolist() == list(advance(system, start, (0.0,), (0.0, 0.0), DT))
+        assert together[:, row] == pytest.approx(advance(system, start, (0.0,), (0.0, 0.0), DT), rel=1e-14)
 
 
 def test_escape_leaves_nan_rows_and_no_warning():

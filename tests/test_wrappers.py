@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import kkl_gym.wrappers
+import kkl_gym.installed
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation
 from observers import ArtifactError, KKLObserver
 
@@ -64,7 +64,7 @@ def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_a
     assert np.array_equal(z, expected_z)
     assert np.allclose(bare.estimate(y, u), x_hat, rtol=1e-5, atol=1e-4)
     assert x_hat.dtype == z.dtype == np.float64
-    space = env.unwrapped.state_space
+    space = env.unwrapped.plant.state_space
     assert np.array_equal(shown, np.clip(x_hat, space.low, space.high).astype(np.float32))
     if inputs:
         assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), x_hat, rtol=1e-3)  # a shift by one would show
@@ -180,7 +180,7 @@ def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
         asked.append((name, noise))
         return KKLObserver(make_artifact(name), noise)
 
-    monkeypatch.setattr(kkl_gym.wrappers, "load", load)
+    monkeypatch.setattr(kkl_gym.installed, "load", load)
     KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7))
     assert asked == [("van_der_pol", 0.7)]
 
@@ -212,7 +212,7 @@ def test_the_z_space_holds_z_under_the_worst_signals(name, pair, saved):
     """For each component the outputs and inputs that drive it furthest, from the impulse response."""
     env = wrapped(saved, name, "z", pair=pair)
     linear, space, base = env.observer.artifact.filter, env.observation_space, env.unwrapped
-    y_max = np.maximum(-base.output_space.low, base.output_space.high).astype(float)
+    y_max = np.maximum(-base.plant.output_space.low, base.plant.output_space.high).astype(float)
     steps = 1500
     powers = [np.eye(linear.size)]
     for _ in range(steps):

@@ -1,0 +1,79 @@
+"""An observer fitted to a plant: what the single and the vector wrapper share."""
+
+import os
+
+import gymnasium as gym
+import numpy as np
+
+from kkl_gym.plant import Plant
+from observers import KKLObserver, load, shipped
+
+
+class Installed:
+    """An observer for a plant, and the space of what it shows; the parameters are those of :class:`KKLObservation`.
+
+    Attributes
+    ----------
+    observer : the observer, its noise level set.
+    estimate : "x" or "z".
+    space : of the estimate shown.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        observer: str | os.PathLike[str] | None,
+        estimate: str,
+        measurement_noise: float | None,
+        ignore_input: bool,
+    ) -> None:
+        if estimate not in ("x", "z"):
+            raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
+        system = plant.system
+        if observer is None and system.name not in shipped():
+            raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
+        self.observer: KKLObserver = load(
+            system.name if observer is None else observer,
+            plant.measurement_noise if measurement_noise is None else measurement_noise,
+        )
+        self.observer.artifact.check(system.name, system.parameters, plant.dt, system.ny, system.nu)
+        self.estimate = estimate
+        self._blind = self.observer.artifact.nu == 0 and system.nu > 0
+        self._ignore_input = ignore_input
+        self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
+        self._low, self._high = self.space.low.astype(float), self.space.high.astype(float)
+
+    def known(self, u: np.ndarray) -> np.ndarray | None:
+        """The input as far as the map knows it; raises ValueError if the agent acts on a map that knows none."""
+        if not self._blind:
+            return u
+        if not self._ignore_input and u.any():
+            raise ValueError(
+                f"the map {self.observer.artifact.system!r} in use knows no inputs, but the agent applied u = {u}; "
+                "use the default map, keep the action at 0, or pass ignore_input=True"
+            )
+        return None
+
+    def shown(self, value: np.ndarray) -> np.ndarray:
+        """x_hat or z as an observation: float32, within the space."""
+        out: np.ndarray = np.minimum(np.maximum(value, self._low), self._high).astype(np.float32)
+        return out
+
+
+def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:
+    """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
+
+    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
+    constant output would have led, so that its start lies within as well.
+    """
+    linear = observer.artifact.filter
+    y_max = np.maximum(np.abs(plant.output_space.low), np.abs(plant.output_space.high)).astype(float)
+    driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
+    limits = np.concatenate([y_max, y_max, plant.system.u_max[: linear.nu]])
+    forgetting = np.abs(np.linalg.eigvals(linear.transition)).max()
+    bound = np.zeros(linear.size)
+    for _ in range(int(np.ceil(np.log(1e-4) / np.log(forgetting)))):
+        bound += np.abs(driven) @ limits
+        driven = linear.transition @ driven
+    bound = (1.001 * bound).astype(np.float32)  # for the tail of the sum
+    return gym.spaces.Box(-bound, bound, dtype=np.float32)

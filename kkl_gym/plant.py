@@ -1,0 +1,86 @@
+"""A system sampled under noise: what single and vector environments share."""
+
+import math
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kkl_gym.simulate import check_dt
+from kkl_gym.system import System
+from kkl_gym.systems import get_system
+
+NOISE_BLOCK = 128  # noise is drawn for so many samples at once, because single draws cost more than the simulation
+
+
+class Plant:
+    """A system, its sampling interval, its noise and the spaces that follow; parameters are those of :class:`KKLEnv`.
+
+    Attributes
+    ----------
+    system, dt, process_noise, measurement_noise, observe : as given, with defaults filled in.
+    state_space, output_space : boxes of the states within the declared bounds and of the outputs that they allow.
+    observation_space : that of the two which ``observe`` names.
+    action_space : ``Box(-1, 1, (nu,))``.
+    weights : of the squared deviations from the target in the reward's cost, (nx,).
+
+    Raises ValueError on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
+    """
+
+    def __init__(
+        self,
+        system: str | System,
+        dt: float,
+        process_noise: float | None,
+        measurement_noise: float,
+        observe: str,
+        parameters: Mapping[str, float] | None,
+    ) -> None:
+        self.system = get_system(system, parameters)
+        check_dt(dt)
+        process_noise = self.system.process_noise if process_noise is None else process_noise
+        for name, level in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
+            if isinstance(level, bool) or not isinstance(level, Real) or not 0 <= level < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {level!r}")
+        if observe not in ("state", "output"):
+            raise ValueError(f'observe must be "state" or "output", got {observe!r}')
+        self.dt = float(dt)
+        self.process_noise = float(process_noise)
+        self.measurement_noise = float(measurement_noise)
+        self.observe = observe
+        self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
+        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
+        self.observation_space = self.state_space if observe == "state" else self.output_space
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
+        self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
+
+    def noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """``NOISE_BLOCK`` samples of process and measurement noise, (samples, nx) and (samples, ny)."""
+        w_max = np.array(self.system.scale) * self.process_noise
+        w = rng.uniform(-w_max, w_max, (NOISE_BLOCK, self.system.nx))
+        return w, rng.normal(0.0, self.measurement_noise, (NOISE_BLOCK, self.system.ny))
+
+    def start(self, x0: Any) -> np.ndarray:
+        """The start that a user asks for, (nx,); raises ValueError if it is no state within the declared bounds."""
+        start = np.asarray(x0, dtype=float)
+        low, high = np.array(self.system.bounds).T
+        if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
+            raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {x0!r}")
+        return start
+
+
+def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high, each (ny,), of h over the declared bounds, widened by ``margin``.
+
+    Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
+    """
+    ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
+    points = np.array(np.meshgrid(*ends, indexing="ij")).reshape(system.nx, -1)
+    y = np.array([np.broadcast_to(yi, points.shape[1:]) for yi in system.h(points)])
+    return y.min(1) - margin, y.max(1) + margin
+
+
+def _float32_box(low: Any, high: Any) -> gym.spaces.Box:
+    return gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)

@@ -1,0 +1,261 @@
+"""Many environments at once, simulated as one batch."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils.seeding import np_random
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from kkl_gym.plant import NOISE_BLOCK, Plant
+from kkl_gym.simulate import advance_batch
+from kkl_gym.system import System
+
+Infos = dict[str, Any]
+
+
+class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """``num_envs`` copies of :class:`KKLEnv` with equal parameters, simulated as one batch.
+
+    Row i behaves as a :class:`KKLEnv` under a time limit and with the same seed would: the same starts and noise, and
+    the same states to rounding. ``info`` holds the same keys, as arrays with a row for each environment, and for each
+    key a mask ``_key`` of the rows for which it was reported, as Gymnasium's own vector environments do.
+
+    **Autoreset modes.** ``NEXT_STEP``: the step after an episode's end ignores that row's action and resets it.
+    ``SAME_STEP``: the row is reset at once, the episode's last observation and info are in ``info["final_obs"]`` and
+    ``info["final_info"]``. ``DISABLED``: a row that has ended stays as it is, with reward 0 and its flags still set,
+    until ``reset(options={"reset_mask": mask})``.
+
+    Parameters
+    ----------
+    system, dt, process_noise, measurement_noise, observe, parameters : as for :class:`KKLEnv`.
+    num_envs : how many.
+    max_episode_steps : steps after which an episode is truncated; ``gym.make_vec`` passes what is registered.
+    autoreset_mode : one of Gymnasium's, see above.
+
+    Raises
+    ------
+    ValueError : as :class:`KKLEnv`, and if ``num_envs`` or ``max_episode_steps`` is not a positive integer.
+    """
+
+    def __init__(
+        self,
+        system: str | System,
+        num_envs: int = 1,
+        dt: float = 0.01,
+        process_noise: float | None = None,
+        measurement_noise: float = 0.5,
+        observe: Literal["state", "output"] = "state",
+        parameters: Mapping[str, float] | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
+            if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
+                raise ValueError(f"{name} must be a positive integer, got {count!r}")
+        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters)
+        self.num_envs = num_envs
+        self.max_episode_steps = max_episode_steps
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {"autoreset_mode": self.autoreset_mode}
+        self.single_observation_space = self.plant.observation_space
+        self.single_action_space = self.plant.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+
+        self.system = self.plant.system
+        nx, ny = self.system.nx, self.system.ny
+        self._low, self._high = (np.array(bound)[:, None] for bound in zip(*self.system.bounds, strict=True))
+        self._u_max = np.array(self.system.u_max)
+        self._target = np.array(self.system.target)[:, None]
+        self._rngs: list[np.random.Generator | None] = [None] * num_envs
+        self._seeds: list[int | None] = [None] * num_envs
+        # Blocks of noise [w, v] and where in its block each row is; at first, past the end.
+        self._blocks = np.empty((num_envs, NOISE_BLOCK, nx + ny))
+        self._used = np.full(num_envs, NOISE_BLOCK)
+        self._everyone = np.arange(num_envs)
+        self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
+        self._y = np.full((ny, num_envs), np.nan)
+        self._sample = np.zeros(num_envs, dtype=int)
+        self._terminated, self._truncated = np.zeros((2, num_envs), dtype=bool)
+        self._ready = False
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Start episodes.
+
+        Parameters
+        ----------
+        seed : for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
+        options : ``"x0"``: starts, (nx,) for all or (num_envs, nx), otherwise uniform in the training box;
+            ``"reset_mask"``: boolean (num_envs,), the rows to reset, otherwise all.
+
+        Raises ValueError on unknown options, wrong shapes and starts outside the declared bounds.
+        """
+        options = dict(options or {})
+        mask = options.pop("reset_mask", None)
+        x0 = options.pop("x0", None)
+        if options:
+            raise ValueError(f'unknown reset option {next(iter(options))!r}; there are "x0" and "reset_mask"')
+        if mask is None:
+            rows = self._everyone
+        else:
+            mask = np.asarray(mask)
+            if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+                raise ValueError(f"reset_mask must be boolean, ({self.num_envs},), with a True in it; got {mask!r}")
+            rows = np.flatnonzero(mask)
+            if not self._ready and len(rows) < self.num_envs:
+                raise gym.error.ResetNeeded("reset() all rows before some of them")
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
+        if seeds is None:
+            seeds = [None] * self.num_envs
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"there are {self.num_envs} environments and {len(seeds)} seeds")
+        starts = None
+        if x0 is not None:
+            starts = np.asarray(x0, dtype=float)
+            if starts.shape != (self.num_envs, self.system.nx):
+                starts = np.tile(self.plant.start(x0), (self.num_envs, 1))
+            starts = np.array([self.plant.start(starts[row]) for row in rows])
+        for row in rows.tolist():
+            if seeds[row] is not None:
+                self._rngs[row], self._seeds[row] = np_random(seeds[row])
+                self._used[row] = NOISE_BLOCK
+        self._begin(rows, starts)
+        self._ready = True
+        return self._observation(), self._info(np.isin(self._everyone, rows))
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
+        """Hold the inputs, (num_envs, nu), over one sampling interval; raises ValueError on a wrong shape or NaN."""
+        if not self._ready:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        u = self._inputs(actions)
+        over = self._terminated | self._truncated
+        if not over.any():
+            reward = self._move(self._everyone, u)
+        else:
+            rows = np.flatnonzero(~over)
+            reward = np.zeros(self.num_envs)
+            if len(rows):
+                reward[rows] = self._move(rows, u[:, rows])
+            if self.autoreset_mode is AutoresetMode.NEXT_STEP:
+                self._begin(np.flatnonzero(over))
+        terminated, truncated = self._terminated.copy(), self._truncated.copy()
+        info = self._info(np.ones(self.num_envs, dtype=bool))
+        info |= {"u": u.T * ~over[:, None], "_u": ~over, "escaped": terminated.copy(), "_escaped": ~over}
+        ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
+            info = self._restart(ended, info)
+        return self._observation(), reward, terminated, truncated, info
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The rows' seeds, None where a row was never seeded."""
+        return tuple(self._seeds)
+
+    def _rng(self, row: int) -> np.random.Generator:
+        rng = self._rngs[row]
+        if rng is None:
+            self._rngs[row], self._seeds[row] = rng, _ = np_random()
+        return rng
+
+    def _begin(self, rows: np.ndarray, starts: np.ndarray | None = None) -> None:
+        """Start episodes in some rows; the generators are used in the order in which :class:`KKLEnv` uses its own."""
+        if starts is None:
+            box = self.system.box()
+            starts = np.array([self._rng(row).uniform(*box) for row in rows.tolist()])
+        self._x[:, rows] = starts.T
+        self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1])
+        self._sample[rows] = 0
+        self._terminated[rows] = self._truncated[rows] = False
+
+    def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Advance some rows by a sampling interval; returns their rewards."""
+        whole = len(rows) == self.num_envs
+        before = self._x if whole else self._x[:, rows]
+        w, v = self._noise(rows)
+        x = advance_batch(self.system, before, u, w, self.plant.dt)
+        inside = np.all((x >= self._low) & (x <= self._high), axis=0)
+        if inside.all():
+            y = self._measure(x, v)
+        else:  # the last state and output inside
+            x = np.where(inside, x, before)
+            y = np.where(inside, self._measure(x, v), self._y[:, rows])
+        sample = self._sample[rows] + 1
+        truncated = sample >= (self.max_episode_steps or np.inf)
+        if whole:
+            self._x, self._y, self._sample, self._terminated, self._truncated = x, y, sample, ~inside, truncated
+        else:
+            self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
+            self._terminated[rows], self._truncated[rows] = ~inside, truncated
+        deviation = x - self._target
+        reward: np.ndarray = 1.0 / (1.0 + 4.0 * (self.plant.weights @ (deviation * deviation)))
+        return reward
+
+    def _restart(self, ended: np.ndarray, info: Infos) -> Infos:
+        """SAME_STEP: begin anew where an episode ended; its last observation and info are kept beside the new ones."""
+        final = last_of_episodes(self._observation(), info, ended)
+        self._begin(np.flatnonzero(ended))
+        new = self._info(np.ones(self.num_envs, dtype=bool))
+        for key in ("u", "escaped"):
+            values = info[key]
+            values[ended] = 0
+            new |= {key: values, f"_{key}": ~ended}
+        return new | final
+
+    def _inputs(self, actions: np.ndarray) -> np.ndarray:
+        values = np.asarray(actions, dtype=float)
+        if values.shape != (self.num_envs, self.system.nu):
+            raise ValueError(f"actions must have shape ({self.num_envs}, {self.system.nu}), got {values.shape}")
+        u = np.minimum(np.maximum(values, -1.0), 1.0) * self._u_max
+        if np.isnan(u).any():
+            raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(1)).tolist()}")
+        return np.ascontiguousarray(u.T)
+
+    def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """One sample of w, (nx, rows), and of v, (ny, rows)."""
+        used = self._used[rows]
+        if used.max(initial=0) == NOISE_BLOCK:
+            for row in rows[used == NOISE_BLOCK].tolist():
+                np.concatenate(self.plant.noise(self._rng(row)), axis=1, out=self._blocks[row])
+            used = np.where(used == NOISE_BLOCK, 0, used)
+        self._used[rows] = used + 1
+        drawn = self._blocks[rows, used].T
+        return drawn[: self.system.nx], drawn[self.system.nx :]
+
+    def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+
+    def _observation(self) -> np.ndarray:
+        values = self._x if self.plant.observe == "state" else self._y
+        obs = values.T.astype(np.float32, order="C")
+        if self.plant.observe == "output":
+            space = self.single_observation_space
+            np.clip(obs, space.low, space.high, out=obs)  # type: ignore[attr-defined]
+        return obs
+
+    def _info(self, rows: np.ndarray) -> Infos:
+        info: Infos = {}
+        for key, values in (("y", self._y.T), ("x", self._x.T), ("sample", self._sample)):
+            info |= {key: values.copy(), f"_{key}": rows.copy()}
+        return info
+
+
+def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
+    """``final_obs`` and ``final_info`` with their masks, as Gymnasium's vector environments report them."""
+    final_obs = np.full(len(ended), None, dtype=object)
+    for row in np.flatnonzero(ended):
+        final_obs[row] = obs[row].copy()
+    final_info: Infos = {}
+    for key, values in info.items():
+        if not key.startswith("_"):
+            kept = np.zeros_like(values)
+            kept[ended] = values[ended]
+            final_info |= {key: kept, f"_{key}": ended.copy()}
+    return {"final_obs": final_obs, "_final_obs": ended.copy(), "final_info": final_info, "_final_info": ended.copy()}
+
+
+__all__ = ["KKLVectorEnv"]

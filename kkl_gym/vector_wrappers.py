@@ -1,0 +1,252 @@
+"""Wrappers for vector environments: a batched learned observer, and agents that act more slowly than they sample."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from kkl_gym.installed import Installed
+from kkl_gym.plant import Plant
+from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes
+
+VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
+VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
+
+
+class KKLVectorObservation(VectorWrapper):
+    """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
+
+    Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
+    in every autoreset mode. ``info`` gains ``z`` and, with ``estimate="x"``, ``x_hat``, a row for each environment;
+    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
+
+    Parameters
+    ----------
+    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    observer, estimate, measurement_noise, ignore_input : as for :class:`kkl_gym.KKLObservation`; with "z" the network
+        is not evaluated.
+
+    Raises
+    ------
+    ValueError : as :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what
+        the observer must know.
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        observer: str | os.PathLike[str] | None = None,
+        estimate: Literal["x", "z"] = "x",
+        measurement_noise: float | None = None,
+        ignore_input: bool = False,
+    ) -> None:
+        super().__init__(env)
+        self._mode = _autoreset_mode(env)
+        self._installed = Installed(_plant(env), observer, estimate, measurement_noise, ignore_input)
+        self.observer = self._installed.observer
+        self.estimate = estimate
+        self.single_observation_space = self._installed.space
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+        self._sample = np.zeros(env.num_envs, dtype=int)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset the environments, or the rows of ``options["reset_mask"]``, and the observer to their first samples."""
+        options = None if options is None else dict(options)  # some environments take the mask out of it
+        mask = (options or {}).get("reset_mask")
+        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if mask is None:
+            self.observer.reset(info["y"])
+            mask = np.ones(self.num_envs, dtype=bool)
+        else:
+            self.observer.restart(info["y"][mask], mask)
+        self._ended = self._ended & ~mask
+        self._sample = np.where(mask, info["sample"], self._sample)
+        return self._show(info, mask), info
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Step the environments, and the observer with the new samples and the inputs that led to them."""
+        _, reward, terminated, truncated, info = self.env.step(actions)
+        before, ended = self._ended, terminated | truncated
+        if self._mode is not AutoresetMode.SAME_STEP:
+            self._ended = ended
+        elif ended.any():
+            return self._show_and_restart(info, ended), reward, terminated, truncated, info
+        moved = ~before
+        expected = self._sample + 1
+        if self._mode is AutoresetMode.NEXT_STEP:
+            expected[before] = 0
+        elif before.any():  # DISABLED: rows that have ended stay as they are
+            expected -= before
+        self._check(expected, info["sample"])
+        u = self._known(info, moved)
+        if self._mode is AutoresetMode.DISABLED and before.any():
+            self.observer.advance(info["y"], u, moved)
+        else:
+            self.observer.advance(info["y"], u)
+            if before.any():
+                self.observer.restart(info["y"][before], before)
+        return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
+
+    def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
+        """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
+        final = info["final_info"]
+        self._check(self._sample + 1, np.where(ended, final["sample"], info["sample"]))
+        u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
+        self.observer.advance(np.where(ended[:, None], final["y"], info["y"]), self._installed.known(u))
+        shown = self._show(info, np.ones_like(ended))
+        for key in ("x_hat", "z"):
+            if key in info:
+                final |= {key: np.where(ended[:, None], info[key], 0.0), f"_{key}": ended.copy()}
+        for row in np.flatnonzero(ended):
+            info["final_obs"][row] = shown[row].copy()
+        self.observer.restart(info["y"][ended], ended)
+        self._sample[ended] = 0
+        info["z"] = self.observer.z
+        if self.estimate == "x":
+            info["x_hat"][ended] = self.observer.decode(ended)
+        shown[ended] = self._installed.shown(info["x_hat" if self.estimate == "x" else "z"][ended])
+        return shown
+
+    def _known(self, info: Infos, moved: np.ndarray) -> np.ndarray | None:
+        if "u" not in info:  # every row was reset in this step
+            return None
+        return self._installed.known(np.where(moved[:, None], info["u"], 0.0))
+
+    def _check(self, expected: np.ndarray, seen: np.ndarray) -> None:
+        if (seen != expected).any():
+            row = int(np.flatnonzero(seen != expected)[0])
+            raise ValueError(
+                f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
+                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation"
+            )
+        self._sample = expected
+
+    def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
+        """Add z and x_hat to ``info``, reported for ``rows``; returns the observations of all."""
+        info |= {"z": self.observer.z, "_z": rows.copy()}
+        if self.estimate == "z":
+            return self._installed.shown(info["z"])
+        info |= {"x_hat": self.observer.decode(), "_x_hat": rows.copy()}
+        return self._installed.shown(info["x_hat"])
+
+
+class VectorActionRepeat(VectorWrapper):
+    """:class:`kkl_gym.ActionRepeat` for :class:`kkl_gym.KKLVectorEnv`, bare or under :class:`KKLVectorObservation`.
+
+    Holds each action for ``repeat`` steps and sums the rewards. A row whose episode ends on the way stays at its end
+    for the rest of the repeat, so that its next episode begins with an action of its own. The environment inside must
+    therefore leave resets to this wrapper (``autoreset_mode="Disabled"``), which then offers every mode.
+
+    Parameters
+    ----------
+    env : the vector environment, with ``autoreset_mode`` DISABLED.
+    repeat : a positive integer.
+    autoreset_mode : the mode that this wrapper offers.
+
+    Raises
+    ------
+    ValueError : if ``repeat`` is not a positive integer or the environment resets by itself.
+    """
+
+    def __init__(
+        self, env: VectorEnv, repeat: int, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
+            raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
+        if not isinstance(env.unwrapped, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
+            raise ValueError(
+                'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled", and resets rows itself; '
+                "for Sync and Async vectors put ActionRepeat into each environment"
+            )
+        self.repeat = repeat
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset the environments, or the rows of ``options["reset_mask"]``."""
+        mask = (options or {}).get("reset_mask")
+        given: Any = None if options is None else dict(options)
+        obs, info = self.env.reset(seed=seed, options=given)  # type: ignore[arg-type]
+        self._ended[slice(None) if mask is None else mask] = False
+        return obs, info
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Apply ``actions`` for ``repeat`` steps; observations and infos are those of each row's last one."""
+        waiting = self._ended  # since an earlier step; they stay as they are in this one
+        total, info = np.zeros(self.num_envs), Infos()
+        for _ in range(self.repeat):
+            obs, reward, terminated, truncated, new = self.env.step(actions)
+            total += reward
+            info = _merged(info, new)
+            if (terminated | truncated).all():
+                break
+        self._ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and waiting.any():
+            obs, new = self.reset(options={"reset_mask": waiting})
+            info = _merged(info, new)
+            terminated, truncated = terminated & ~waiting, truncated & ~waiting
+        elif self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
+            ended = self._ended.copy()
+            final = last_of_episodes(obs, info, ended)
+            obs, new = self.reset(options={"reset_mask": ended})
+            info = _merged(info, new) | final
+            for key in ("u", "escaped"):
+                info[key] = info[key] * _column(~ended, info[key])
+                info[f"_{key}"] = info[f"_{key}"] & ~ended
+        return obs, total, terminated, truncated, info
+
+
+def _merged(old: Infos, new: Infos) -> Infos:
+    """What ``new`` reports, and ``old`` where ``new`` reports nothing."""
+    out = dict(old)
+    for key, mask in new.items():
+        if key.startswith("_") and key[1:] in new:
+            values = new[key[1:]]
+            if key in old and not mask.all():
+                values = np.where(_column(mask, values), values, old[key[1:]])
+                mask = mask | old[key]
+            out |= {key[1:]: values, key: mask}
+    return out
+
+
+def _column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+    return mask.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
+    mode = env.metadata.get("autoreset_mode")
+    if not isinstance(mode, AutoresetMode):
+        raise ValueError(f"{env} does not say its autoreset mode: metadata['autoreset_mode'] is {mode!r}")
+    return mode
+
+
+def _plant(env: VectorEnv) -> Plant:
+    base: Any = env.unwrapped
+    if isinstance(base, KKLVectorEnv):
+        return base.plant
+    try:
+        plants: tuple[Plant, ...] = base.get_attr("plant")
+    except AttributeError:
+        raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {base}") from None
+    first = plants[0]
+    for plant in plants:
+        if (plant.system, plant.dt, plant.measurement_noise) != (first.system, first.dt, first.measurement_noise):
+            raise ValueError(
+                "the environments differ in system, dt or measurement_noise: one observer cannot serve all"
+            )
+    return first
+
+
+__all__ = ["KKLVectorObservation", "VectorActionRepeat"]

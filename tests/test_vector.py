@@ -1,0 +1,410 @@
+"""Vector environments and wrappers against Gymnasium's own vectors of single environments."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+import kkl_gym
+from kkl_gym import (
+    ENV_IDS,
+    ActionRepeat,
+    KKLObservation,
+    KKLVectorEnv,
+    KKLVectorObservation,
+    Lorenz,
+    VectorActionRepeat,
+)
+from kkl_gym.plant import NOISE_BLOCK
+
+everyone = pytest.mark.parametrize("name", ENV_IDS)
+modes = pytest.mark.parametrize("mode", list(AutoresetMode))
+N = 4
+ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler, within a few steps
+
+
+def actions(steps, n=N, seed=0):
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (steps, n, 1)).astype(np.float32)
+
+
+def vector(name, mode, steps=23, n=N, **options):
+    return gym.make_vec(
+        ENV_IDS[name],
+        num_envs=n,
+        vectorization_mode="vector_entry_point",
+        max_episode_steps=steps,
+        autoreset_mode=mode,
+        **options,
+    )
+
+
+def single(name, steps=23, observer=None, repeat=None, estimate="x", **options):
+    env = gym.make("kkl_gym:" + ENV_IDS[name], max_episode_steps=steps, **options)
+    if observer is not None:
+        env = KKLObservation(env, observer, estimate)
+    return env if repeat is None else ActionRepeat(env, repeat)
+
+
+def sync(name, mode, n=N, **options):
+    return SyncVectorEnv([partial(single, name, **options)] * n, autoreset_mode=mode)
+
+
+def assert_same(ours, theirs, at=""):
+    """Equal to rounding where ``theirs`` reports something; ours may report more."""
+    if isinstance(theirs, dict):
+        for key, value in theirs.items():
+            if not key.startswith("_"):
+                rows = theirs[f"_{key}"]
+                assert (ours[f"_{key}"] == rows).all(), f"{at}_{key}"
+                if key in ("final_obs", "final_info"):
+                    assert_same(ours[key], value, f"{at}{key}.")
+                else:
+                    assert_same(ours[key][rows], value[rows], f"{at}{key}")
+    elif theirs.dtype == object:
+        for a, b in zip(ours, theirs, strict=True):
+            assert (a is None) == (b is None)
+            if b is not None:
+                assert a.dtype == b.dtype
+                assert np.allclose(a, b, rtol=1e-5, atol=1e-5), at
+    else:
+        assert ours.dtype == theirs.dtype, at
+        tolerance = 1e-5 if ours.dtype == np.float32 or "x_hat" in at else 1e-9
+        assert np.allclose(ours, theirs, rtol=tolerance, atol=tolerance), (at, np.abs(ours - theirs).max())
+
+
+def compare(ours, theirs, steps, mode, mask_at=(5,), x0=None):
+    """The same calls to both; some rows are reset on the way, so that episodes end at different times."""
+    options = {} if x0 is None else {"x0": x0}
+    both = (ours, theirs)
+    results = [env.reset(seed=7, options=dict(options)) for env in both]
+    assert_same(results[0][0], results[1][0])
+    assert_same(results[0][1], results[1][1])
+    ended = np.zeros(ours.num_envs, dtype=bool)
+    ends = set()
+    for k, action in enumerate(actions(steps, ours.num_envs)):
+        mask = ended.copy() if mode is AutoresetMode.DISABLED else np.zeros_like(ended)
+        if k in mask_at:
+            mask[::2] = True
+        if mask.any():
+            first = [env.reset(options={"reset_mask": mask.copy()}) for env in both]
+            assert_same(first[0][0], first[1][0], "reset ")
+            assert_same(first[0][1], first[1][1], "reset ")
+        results = [env.step(action) for env in both]
+        for i, what in enumerate(("obs ", "reward ", "terminated ", "truncated ", "info ")):
+            assert_same(results[0][i], results[1][i], f"step {k}, {what}")
+        for i, row in zip(*np.nonzero([results[0][2] | results[0][3]]), strict=True):
+            ends.add((k + i, row))
+        ended = results[0][2] | results[0][3]
+    for env in both:
+        env.close()
+    return ends
+
+
+@everyone
+@modes
+@pytest.mark.parametrize("observe", ["state", "output"])
+def test_rows_are_single_environments(name, mode, observe):
+    ends = compare(vector(name, mode, observe=observe), sync(name, mode, observe=observe), 60, mode)
+    assert len({k for k, _ in ends}) > 2  # at different times
+    assert {row for _, row in ends} == set(range(N))
+
+
+@modes
+def test_escapes_in_some_rows(mode):
+    x0 = [ESCAPING, [1.0, 1.0, 1.0]]
+    ours, theirs = vector("rossler", mode, 400, 2), sync("rossler", mode, 2, steps=400)
+    ours.reset(seed=3, options={"x0": x0})
+    theirs.reset(seed=3)
+    for row, env in enumerate(theirs.envs):
+        env.reset(seed=3 + row, options={"x0": x0[row]})
+    for _ in range(300):
+        results = [env.step(np.zeros((2, 1))) for env in (ours, theirs)]
+        for mine, other in zip(*results, strict=True):
+            assert_same(mine, other)
+        obs, _, terminated, truncated, info = results[0]
+        assert np.isfinite(obs).all()
+        if terminated.any():
+            break
+    assert terminated.tolist() == [True, False]
+    assert not truncated.any()
+    info = info["final_info"] if mode is AutoresetMode.SAME_STEP else info
+    assert info["escaped"].tolist() == [True, False]
+    if mode is AutoresetMode.DISABLED:
+        for env in (ours, theirs):
+            env.reset(options={"reset_mask": terminated})
+    for mine, other in zip(*(env.step(np.zeros((2, 1))) for env in (ours, theirs)), strict=True):
+        assert_same(mine, other)
+
+
+def test_noise_does_not_repeat_and_blocks_are_refilled_row_by_row():
+    steps = 2 * NOISE_BLOCK + 10
+    assert compare(vector("lorenz", "SameStep", 31), sync("lorenz", "SameStep", steps=31), steps, None, (3, 4, 40))
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@modes
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
+def test_the_observer_is_reset_row_by_row(name, mode, estimate, saved):
+    path = saved(system=name)
+    ours = KKLVectorObservation(vector(name, mode), path, estimate)
+    theirs = sync(name, mode, observer=path, estimate=estimate)
+    if estimate == "z":  # the vector does not evaluate the network
+        theirs = Without(theirs, "x_hat")
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert ours.observation_space == theirs.observation_space
+    assert len(compare(ours, theirs, 60, mode)) >= 2 * N
+
+
+class Without(gym.vector.VectorWrapper):
+    def __init__(self, env, key):
+        super().__init__(env)
+        self._key = key
+
+    def _trimmed(self, info):
+        for part in (info, info.get("final_info", {})):
+            part.pop(self._key, None), part.pop(f"_{self._key}", None)
+        return info
+
+    def reset(self, **options):
+        obs, info = self.env.reset(**options)
+        return obs, self._trimmed(info)
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        return *rest, self._trimmed(info)
+
+
+@modes
+def test_the_observer_inside_gymnasiums_sync_vector(mode, saved):
+    path = saved()
+    inner = sync("van_der_pol", mode)
+    assert len(compare(KKLVectorObservation(inner, path), sync("van_der_pol", mode, observer=path), 60, mode)) >= 2 * N
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_the_observer_inside_gymnasiums_async_vector(mode, saved):
+    path = saved()
+    inner = AsyncVectorEnv([partial(single, "van_der_pol")] * 2, autoreset_mode=mode, context="spawn")
+    theirs = sync("van_der_pol", mode, n=2, observer=path)
+    assert len(compare(KKLVectorObservation(inner, path), theirs, 60, mode)) >= 4
+
+
+@modes
+@pytest.mark.parametrize("steps", [20, 23])  # the latter ends within a repeat
+@pytest.mark.parametrize("estimate", [None, "x"])
+def test_action_repeat(mode, steps, estimate, saved):
+    path = None if estimate is None else saved()
+    inner = vector("van_der_pol", "Disabled", steps)
+    if path is not None:
+        inner = KKLVectorObservation(inner, path)
+    ours = VectorActionRepeat(inner, 4, mode)
+    assert ours.metadata["autoreset_mode"] is mode
+    assert inner.metadata["autoreset_mode"] is AutoresetMode.DISABLED
+    theirs = sync("van_der_pol", mode, steps=steps, observer=path, repeat=4)
+    assert len(compare(ours, theirs, 40, mode, (2,))) >= 3 * N
+
+
+def test_action_repeat_under_escape():
+    x0 = [ESCAPING, [1.0, 1.0, 1.0]]
+    env = VectorActionRepeat(vector("rossler", "Disabled", 500, n=2, process_noise=0.0), 1000)
+    _, info = env.reset(seed=0, options={"x0": x0})
+    obs, reward, terminated, truncated, info = env.step(np.zeros((2, 1)))
+    assert terminated.tolist() == [True, False]
+    assert truncated.tolist() == [False, True]
+    alone = ActionRepeat(gym.make("KKLRossler-v0", process_noise=0.0), 1000)
+    alone.reset(seed=0, options={"x0": ESCAPING})
+    expected = alone.step(np.zeros(1))
+    assert np.allclose(obs[0], expected[0])
+    assert reward[0] == pytest.approx(expected[1])
+    assert info["sample"][0] == expected[4]["sample"] < 300
+    obs, reward, terminated, truncated, info = env.step(np.zeros((2, 1)))  # both begin anew
+    assert not (terminated | truncated).any()
+    assert reward.tolist() == [0.0, 0.0]
+    assert info["sample"].tolist() == [0, 0]
+    assert not info["_u"].any()
+
+
+def test_rows_that_have_ended_stay_until_they_are_reset():
+    env = vector("lorenz", "Disabled", 3)
+    env.reset(seed=0)
+    env.reset(options={"reset_mask": np.array([True, False, False, False])})
+    for _ in range(2):
+        env.step(np.ones((N, 1)))
+    env.reset(options={"reset_mask": np.array([True, False, False, False])})
+    obs, *_ = env.step(np.ones((N, 1)))
+    again, reward, terminated, truncated, info = env.step(np.ones((N, 1)))
+    assert truncated.tolist() == [False, True, True, True]
+    assert (obs[1:] == again[1:]).all()
+    assert (obs[0] != again[0]).any()
+    assert (reward[1:] == 0.0).all()
+    assert reward[0] > 0
+    assert info["sample"].tolist() == [2, 3, 3, 3]
+    assert info["_u"].tolist() == [True, False, False, False]
+    assert not terminated.any()
+
+
+def test_seeds():
+    env = vector("lorenz", "NextStep")
+    whole, _ = env.reset(seed=5)
+    assert env.unwrapped.np_random_seed == (5, 6, 7, 8)
+    assert (env.reset(seed=[5, 6, 7, 8])[0] == whole).all()
+    mixed, _ = env.reset(seed=[8, None, 5, None])
+    assert (mixed[0] == whole[3]).all()
+    assert (mixed[2] == whole[0]).all()
+    assert (mixed[[1, 3]] != whole[[1, 3]]).any(1).all()
+    alone, _ = gym.make("KKLLorenz-v0").reset(seed=6)
+    assert (alone == whole[1]).all()
+    assert len(np.unique(vector("lorenz", "NextStep").reset()[0][:, 0])) == N
+
+
+def test_starts():
+    env = vector("lorenz", "NextStep", process_noise=0.0)
+    start = [1.0, 2.0, 20.0]
+    assert (env.reset(options={"x0": start})[0] == start).all()
+    many = np.arange(3 * N).reshape(N, 3) * 1.0
+    assert (env.reset(options={"x0": many})[0] == many).all()
+    mask = np.array([False, True, False, False])
+    obs, info = env.reset(options={"x0": start, "reset_mask": mask})
+    assert (obs[1] == start).all()
+    assert (obs[[0, 2, 3]] == many[[0, 2, 3]]).all()
+    assert (info["_x"] == mask).all()
+
+
+@pytest.mark.parametrize(("options", "match"), [
+    ({"x0": [1.0, 2.0]}, "x0 must be 3 numbers"),
+    ({"x0": [[1.0, 2.0, np.nan]] * N}, "x0 must be 3 numbers"),
+    ({"x0": [[1.0, 2.0, 3.0]] * (N + 1)}, "x0 must be 3 numbers"),
+    ({"reset_mask": np.zeros(N, bool)}, "reset_mask must be boolean"),
+    ({"reset_mask": np.ones(N)}, "reset_mask must be boolean"),
+    ({"reset_mask": np.ones(N + 1, bool)}, "reset_mask must be boolean"),
+    ({"start": [0, 0, 0]}, "unknown reset option 'start'"),
+])  # fmt: skip
+def test_wrong_reset_options_change_nothing(options, match):
+    env = vector("lorenz", "NextStep")
+    before, _ = env.reset(seed=1)
+    with pytest.raises(ValueError, match=match):
+        env.reset(seed=2, options=options)
+    after, *_ = env.step(np.zeros((N, 1)))
+    other = vector("lorenz", "NextStep")
+    assert (other.reset(seed=1)[0] == before).all()
+    assert (other.step(np.zeros((N, 1)))[0] == after).all()
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(N), np.zeros((N + 1, 1)), np.full((N, 1), np.nan), np.zeros((N, 2))])
+def test_wrong_actions_change_nothing(wrong):
+    env = vector("lorenz", "NextStep")
+    env.reset(seed=1)
+    with pytest.raises(ValueError, match="actions must"):
+        env.step(wrong)
+    other = vector("lorenz", "NextStep")
+    other.reset(seed=1)
+    assert (other.step(np.zeros((N, 1)))[0] == env.step(np.zeros((N, 1)))[0]).all()
+
+
+@pytest.mark.parametrize(("wrong", "match"), [
+    ({"num_envs": 0}, "num_envs must be a positive integer"),
+    ({"num_envs": 2.0}, "num_envs must be a positive integer"),
+    ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
+    ({"autoreset_mode": "sometimes"}, "sometimes"),
+    ({"dt": 0.0}, "dt must be"),
+    ({"observe": "x"}, "observe must be"),
+    ({"system": "lorentz"}, "unknown system"),
+])  # fmt: skip
+def test_wrong_arguments(wrong, match):
+    with pytest.raises(ValueError, match=match):
+        KKLVectorEnv(**{"system": "lorenz", **wrong})
+
+
+def test_reset_is_required():
+    env = KKLVectorEnv("lorenz", 2)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(np.zeros((2, 1)))
+    with pytest.raises(gym.error.ResetNeeded):
+        env.reset(options={"reset_mask": np.array([True, False])})
+
+
+def test_results_are_copies():
+    env = vector("lorenz", "NextStep")
+    obs, info = env.reset(seed=0)
+    kept = obs.copy(), {key: value.copy() for key, value in info.items()}
+    for _ in range(3):
+        env.step(np.ones((N, 1)))
+    assert (obs == kept[0]).all()
+    assert all((info[key] == value).all() for key, value in kept[1].items())
+    for array in (obs, *info.values()):
+        array[:] = 0
+    assert (env.step(np.ones((N, 1)))[0] != 0).all()
+
+
+def test_the_registered_limit_and_the_default_mode():
+    env = gym.make_vec("KKLLorenz-v0", num_envs=2)  # vector_entry_point, because there is one
+    assert isinstance(env.unwrapped, KKLVectorEnv)
+    assert env.unwrapped.max_episode_steps == 5000
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert isinstance(gym.make_vec("KKLLorenz-v0", num_envs=2, vectorization_mode="sync"), SyncVectorEnv)
+
+
+def test_autonomous_user_system(script):
+    env = KKLVectorEnv(f"{script}:Pendulum", 3, measurement_noise=0.0)
+    obs, _ = env.reset(seed=0)
+    after, *_ = env.step(np.zeros((3, 0)))
+    assert after.shape == obs.shape == (3, 2)
+    alone = kkl_gym.KKLEnv(f"{script}:Pendulum", measurement_noise=0.0)
+    alone.reset(seed=1)
+    assert np.allclose(alone.step(np.zeros(0))[0], after[1])
+
+
+def test_gymnasiums_statistics_on_top(saved):
+    env = RecordEpisodeStatistics(KKLVectorObservation(vector("van_der_pol", "SameStep", 10), saved()))
+    env.reset(seed=0)
+    lengths = []
+    for action in actions(25):
+        *_, info = env.step(action)
+        if "episode" in info:
+            lengths += info["episode"]["l"][info["_episode"]].tolist()
+    assert lengths == [10] * 2 * N
+
+
+def test_wrong_repeats():
+    for repeat in (0, 1.5, True):
+        with pytest.raises(ValueError, match="repeat must be"):
+            VectorActionRepeat(vector("lorenz", "Disabled"), repeat)
+    for env in (vector("lorenz", "SameStep"), sync("lorenz", "Disabled")):
+        with pytest.raises(ValueError, match="VectorActionRepeat needs a KKLVectorEnv"):
+            VectorActionRepeat(env, 2)
+
+
+def test_a_repeat_inside_the_observer_is_noticed(saved):
+    env = KKLVectorObservation(VectorActionRepeat(vector("lorenz", "Disabled"), 2), saved(system="lorenz"))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="outside KKLVectorObservation"):
+        env.step(np.zeros((N, 1)))
+
+
+def test_foreign_and_mixed_vectors(saved):
+    with pytest.raises(ValueError, match="needs a vector of kkl_gym environments"):
+        KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))
+    mixed = SyncVectorEnv([partial(single, "lorenz", measurement_noise=noise) for noise in (0.1, 0.2)])
+    with pytest.raises(ValueError, match="one observer cannot serve all"):
+        KKLVectorObservation(mixed, saved(system="lorenz"))
+    with pytest.raises(ValueError, match="rho"):
+        KKLVectorObservation(vector("lorenz", "NextStep", parameters={"rho": 20.0}), saved(system="lorenz"))
+
+
+def test_a_blind_map_under_action(saved):
+    path = saved(inputs=False)
+    env = KKLVectorObservation(vector("van_der_pol", "NextStep"), path)
+    env.reset(seed=0)
+    env.step(np.zeros((N, 1)))
+    with pytest.raises(ValueError, match="knows no inputs"):
+        env.step(np.ones((N, 1)))
+    env = KKLVectorObservation(vector("van_der_pol", "NextStep"), path, ignore_input=True)
+    env.reset(seed=0)
+    assert np.isfinite(env.step(np.ones((N, 1)))[0]).all()
+
+
+def test_system_instances():
+    assert KKLVectorEnv(Lorenz(rho=20.0), 2).plant.system.rho == 20.0
