@@ -5,14 +5,13 @@ from typing import ClassVar
 import numpy as np
 import torch
 from torch import nn
-from torch.nn.functional import huber_loss
 
 from kkl_gym.system import System
 from observers import MLP, LinearFilter
 from training.data import output
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 from training.methods.kkl import SPECTRA, spectrum
-from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, rollout
+from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance, rollout
 from training.networks import Network
 from training.pipeline import make_filter
 
@@ -26,7 +25,7 @@ class DMF(Method[Arrays]):
     """z+ = A z + B y, x_hat = T_inv(z): A and T_inv trained through time, in two stages.
 
     J. Peralez and M. Nadri, "Deep model-free KKL observer: a switching approach", L4DC 2024. The transient stage starts
-    from z0 = MLP(y0) and is trained by the Huber loss of x_hat from the first sample on. The asymptotic stage
+    from z0 = MLP(y0) and is trained by the error of x_hat from the first sample on. The asymptotic stage
     starts from z = T(x), with T learned so that T(x_k) = z_k, and so never sees a transient. Online both run side by
     side, and the estimate is that of the smaller filtered innovation |y - h(x_hat)|.
 
@@ -65,13 +64,13 @@ class DMF(Method[Arrays]):
         def from_output(generator: torch.Generator) -> dict[str, torch.Tensor]:
             y, ages, x = batches(generator)
             z = transient.run(transient.z0((y[:, 0] - offset.to(y)) / scale.to(y)), y, ages)
-            return {"loss": huber_loss(transient.decoder(z), x)}
+            return {"loss": distance(transient.decoder(z), x)}
 
         def from_state(generator: torch.Generator) -> dict[str, torch.Tensor]:
             y, ages, x = batches(generator)
             z = asymptotic.run(asymptotic.z0(x[0]), y[:, ages[0] :], ages - ages[0])
-            consistent = huber_loss(asymptotic.start(x), asymptotic.decoder.coordinates(z))
-            return {"loss": huber_loss(asymptotic.decoder(z), x) + consistent, "consistency": consistent.detach()}
+            consistent = distance(asymptotic.start(x), asymptotic.decoder.coordinates(z))
+            return {"loss": distance(asymptotic.decoder(z), x) + consistent, "consistency": consistent.detach()}
 
         task.fit("transient", transient, from_output, LEARNING_RATE, SHARE)
         asymptotic.load_state_dict(

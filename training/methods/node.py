@@ -10,7 +10,7 @@ from kkl_gym.system import System
 from observers import Artifact, InverseMap
 from training.methods.base import Configuration, Task
 from training.methods.kkl import SPECTRA, KKLMethod, spectrum
-from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, rollout
+from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance, rollout
 from training.networks import Network
 from training.pipeline import make_filter, output_matrix
 
@@ -85,7 +85,7 @@ class _Problem(nn.Module):
         return -(self._log_rates + SPECTRUM_PACE * self.change).exp()
 
     def loss(self, y: torch.Tensor, ages: np.ndarray, x: torch.Tensor) -> dict[str, Any]:
-        """Mean square error of the scaled estimate, from z0 = -A^-1 B y0."""
+        """Error of the scaled estimate, from z0 = -A^-1 B y0."""
         s = self.theta() * self.dt
         eye = torch.eye(self.ny, dtype=s.dtype, device=s.device)
 
@@ -97,4 +97,4 @@ class _Problem(nn.Module):
         z0 = y[:, 0] @ block(-1.0 / self.theta()).T
         transition = torch.kron(eye, torch.diag(s.exp()))
         z = rollout(transition, block(hold - late), block(late), z0, y, ages)
-        return {"loss": ((self.decoder(z) - x) ** 2).mean()}
+        return {"loss": distance(self.decoder(z), x)}
