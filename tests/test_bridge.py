@@ -1,0 +1,180 @@
+"""The bridge against stable-baselines3's own vector of single environments."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
+
+from kkl_gym import ActionRepeat, KKLObservation, KKLVectorEnv, KKLVectorObservation, VectorActionRepeat
+from training.agents import SB3VecEnv
+
+N, STEPS = 3, 10
+
+
+def vector(path=None, system="van_der_pol", **options):
+    env = KKLVectorEnv(system, N, max_episode_steps=STEPS, autoreset_mode="SameStep", **options)
+    return env if path is None else KKLVectorObservation(env, path)
+
+
+def single(path=None, system="KKLVanDerPol-v0", **options):
+    env = gym.make(system, max_episode_steps=STEPS, **options)
+    return env if path is None else KKLObservation(env, path)
+
+
+def actions(steps):
+    return np.random.default_rng(0).uniform(-1, 1, (steps, N, 1)).astype(np.float32)
+
+
+def test_steps_equal_those_of_stable_baselines3s_own_vector(saved):
+    ours, theirs = SB3VecEnv(vector(saved()), ("y", "u")), DummyVecEnv([partial(single, saved())] * N)
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    for env in (ours, theirs):
+        env.seed(4)
+    assert np.allclose(ours.reset(), theirs.reset(), atol=1e-5)
+    for info, other in zip(ours.reset_infos, theirs.reset_infos, strict=True):
+        assert np.allclose(info["y"], other["y"])
+    ended = 0
+    for action in actions(3 * STEPS):
+        obs, reward, done, infos = ours.step(action)
+        their_obs, their_reward, their_done, their_infos = theirs.step(action)
+        assert np.allclose(obs, their_obs, atol=1e-5)
+        assert reward.dtype == their_reward.dtype
+        assert np.allclose(reward, their_reward)
+        assert (done == their_done).all()
+        for row in range(N):
+            mine, other = infos[row], their_infos[row]
+            if done[row]:
+                ended += 1
+                assert mine.keys() == other.keys()
+                assert np.allclose(mine["terminal_observation"], other["terminal_observation"], atol=1e-5)
+                assert mine["TimeLimit.truncated"] is other["TimeLimit.truncated"] is True
+                assert np.allclose(mine["x_hat"], other["x_hat"], atol=1e-5)
+            else:
+                assert mine.keys() == {"y", "u"}
+            assert np.allclose(mine["y"], other["y"])
+            assert np.allclose(mine["u"], other["u"])
+    assert ended == 3 * N
+
+
+def test_escapes_are_no_time_limits():
+    env = SB3VecEnv(KKLVectorEnv("rossler", 2, max_episode_steps=400, autoreset_mode="SameStep"))
+    env.set_options({"x0": [-44.0, -17.0, 212.0]})
+    env.reset()
+    for _ in range(300):
+        _, _, done, infos = env.step(np.zeros((2, 1)))
+        if done.any():
+            break
+    assert done.any()
+    row = int(done.argmax())
+    assert infos[row]["TimeLimit.truncated"] is False
+    assert infos[row]["escaped"]
+    assert all(options == {} for options in env._options)  # used once
+    assert (np.abs(env.reset()) < 25).all()
+
+
+def rollout(env):
+    """What PPO has collected after one rollout over several episodes."""
+    torch.manual_seed(0)
+    agent = PPO("MlpPolicy", env, n_steps=3 * STEPS + 5, batch_size=21, n_epochs=1, seed=3, device="cpu")
+    agent.learn(1)
+    return agent
+
+
+def test_ppo_bootstraps_at_time_limits_as_on_its_own_vector():
+    """Rewards in the buffer hold gamma V(terminal observation) where an episode was cut."""
+    ours = rollout(SB3VecEnv(vector()))
+    theirs = rollout(DummyVecEnv([single] * N))
+    buffer, other = ours.rollout_buffer, theirs.rollout_buffer
+    assert np.allclose(buffer.observations, other.observations, atol=1e-4)
+    assert np.allclose(buffer.rewards, other.rewards, atol=1e-4)
+    assert np.allclose(buffer.returns, other.returns, atol=1e-3)
+    assert other.episode_starts.sum() >= 3 * N
+    for mine, theirs_ in zip(ours.policy.parameters(), theirs.policy.parameters(), strict=True):
+        assert torch.allclose(mine, theirs_, atol=1e-3)
+
+
+def test_sac_learns_through_the_bridge(saved):
+    agent = SAC("MlpPolicy", SB3VecEnv(vector(saved())), learning_starts=10, batch_size=8, seed=0, device="cpu")
+    agent.learn(60)
+    assert agent.replay_buffer.timeouts[: agent.replay_buffer.pos].sum() == N * (20 // STEPS)
+
+
+def test_stable_baselines3s_wrappers_on_top(saved):
+    env = VecMonitor(VecNormalize(VecFrameStack(SB3VecEnv(vector(saved())), 4)))
+    assert env.reset().shape == (N, 8)
+    episodes = []
+    for action in actions(2 * STEPS):
+        _, _, done, infos = env.step(action)
+        episodes += [info["episode"] for info, ended in zip(infos, done, strict=True) if ended]
+        assert all(info["terminal_observation"].shape == (8,) for info, ended in zip(infos, done, strict=True) if ended)
+    assert [episode["l"] for episode in episodes] == [STEPS] * 2 * N
+
+
+def test_action_repeat_under_the_bridge(saved):
+    inner = KKLVectorEnv("van_der_pol", N, max_episode_steps=STEPS, autoreset_mode="Disabled")
+    ours = SB3VecEnv(VectorActionRepeat(KKLVectorObservation(inner, saved()), 4, "SameStep"))
+    theirs = DummyVecEnv([lambda: ActionRepeat(single(saved()), 4)] * N)
+    for env in (ours, theirs):
+        env.seed(1)
+        env.reset()
+    for action in actions(9):
+        mine, other = ours.step(action), theirs.step(action)
+        assert np.allclose(mine[0], other[0], atol=1e-5)
+        assert np.allclose(mine[1], other[1])
+        assert (mine[2] == other[2]).all()
+
+
+def test_any_vector_environment():
+    make = partial(gym.make, "CartPole-v1", max_episode_steps=STEPS)
+    ours = SB3VecEnv(RecordEpisodeStatistics(SyncVectorEnv([make] * N, autoreset_mode="SameStep")))
+    theirs = DummyVecEnv([make] * N)
+    for env in (ours, theirs):
+        env.seed(0)
+    assert (ours.reset() == theirs.reset()).all()
+    assert ours.get_attr("spec", 1)[0].id == "CartPole-v1"
+    assert ours.get_attr("render_mode") == [None] * N
+    assert ours.env_method("get_wrapper_attr", "gravity", indices=[0, 2]) == [9.8, 9.8]
+    assert ours.env_is_wrapped(RecordEpisodeStatistics) == [True] * N
+    assert ours.env_is_wrapped(KKLVectorObservation) == [False] * N
+    for _ in range(2 * STEPS):
+        action = np.random.default_rng(0).integers(0, 2, N)
+        mine, other = ours.step(action), theirs.step(action)
+        for a, b in zip(mine[:3], other[:3], strict=True):
+            assert (a == b).all()
+        for row in np.flatnonzero(mine[2]):
+            assert (mine[3][row]["terminal_observation"] == other[3][row]["terminal_observation"]).all()
+    assert PPO("MlpPolicy", ours, n_steps=8, batch_size=8, device="cpu").learn(24)
+
+
+def test_attributes_of_batched_environments(saved):
+    env = SB3VecEnv(vector(saved()))
+    assert env.get_attr("estimate") == ["x"] * N
+    assert [plant.dt for plant in env.get_attr("plant", [0, 1])] == [0.01, 0.01]
+    assert not env.has_attr("nothing")
+    env.set_attr("max_episode_steps", 3)
+    assert env.env.unwrapped.max_episode_steps == 3
+    with pytest.raises(ValueError, match="for all rows at once"):
+        env.set_attr("max_episode_steps", 3, [0])
+    with pytest.raises(AttributeError, match="no environments with a method"):
+        env.env_method("step", 0)
+    env.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_other_autoreset_modes_are_refused(mode):
+    with pytest.raises(ValueError, match='autoreset_mode="SameStep"'):
+        SB3VecEnv(KKLVectorEnv("lorenz", 2, autoreset_mode=mode))
+
+
+def test_options_of_single_rows_are_refused():
+    env = SB3VecEnv(vector())
+    env.set_options([{"x0": [1.0, 1.0]}, {}, {}])
+    with pytest.raises(ValueError, match="the same options for all rows"):
+        env.reset()
