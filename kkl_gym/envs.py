@@ -179,5 +179,5 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         """One sample of (w, v)."""
         if not self._noise:
             w, v = self.plant.noise(self.np_random)
-            self._noise = [*zip(w.tolist()[::-1], v.tolist()[::-1], strict=True)]
+            self._noise = [*zip(w.T.tolist()[::-1], v.T.tolist()[::-1], strict=True)]
         return self._noise.pop()

@@ -41,7 +41,6 @@ class Installed:
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self._ignore_input = ignore_input
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
-        self._low, self._high = self.space.low.astype(float), self.space.high.astype(float)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it; raises ValueError if the agent acts on a map that knows none."""
@@ -56,7 +55,9 @@ class Installed:
 
     def shown(self, value: np.ndarray) -> np.ndarray:
         """x_hat or z as an observation: float32, within the space."""
-        out: np.ndarray = np.minimum(np.maximum(value, self._low), self._high).astype(np.float32)
+        out: np.ndarray = value.astype(np.float32)
+        np.maximum(out, self.space.low, out=out)
+        np.minimum(out, self.space.high, out=out)
         return out
 
 

@@ -12,7 +12,7 @@ from kkl_gym.simulate import check_dt
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 
-NOISE_BLOCK = 128  # noise is drawn for so many samples at once, because single draws cost more than the simulation
+NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
 
 class Plant:
@@ -54,13 +54,15 @@ class Plant:
         self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
+        self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)[:, None]
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
     def noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``NOISE_BLOCK`` samples of process and measurement noise, (samples, nx) and (samples, ny)."""
-        w_max = np.array(self.system.scale) * self.process_noise
-        w = rng.uniform(-w_max, w_max, (NOISE_BLOCK, self.system.nx))
-        return w, rng.normal(0.0, self.measurement_noise, (NOISE_BLOCK, self.system.ny))
+        """``NOISE_BLOCK`` samples of process and measurement noise, (nx, samples) and (ny, samples)."""
+        w = rng.random((self.system.nx, NOISE_BLOCK))
+        w -= 0.5
+        w *= self._w_range
+        return w, self.measurement_noise * rng.standard_normal((self.system.ny, NOISE_BLOCK))
 
     def start(self, x0: Any) -> np.ndarray:
         """The start that a user asks for, (nx,); raises ValueError if it is no state within the declared bounds."""

@@ -31,7 +31,8 @@ STAGES = (
     (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0, -16 / 11),
 )
 WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
-_ROWS = [np.array(row) for row in (*STAGES, WEIGHTS)]
+# Of the state, of a constant slope and of the slopes of the stages before.
+_ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 
 VectorField = Callable[[Any], Any]
 
@@ -138,17 +139,22 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> np.ndarray:
-    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,)."""
+    """One Runge–Kutta step of a batch, (nx, n), of length h, a number or (n,).
+
+    Few, large operations, because each call of numpy costs as much as its work on a thousand numbers: a stage is one
+    product of its coefficients with x, d and the slopes so far.
+    """
     field, d = forced(system, u, w)
-    slopes = np.empty((len(STAGES), *x.shape))  # times h
-    flat = slopes.reshape(len(STAGES), -1)
+    rows = np.empty((2 + len(STAGES), *x.shape))
+    rows[0] = x
+    for out, di in zip(rows[1], d, strict=True):
+        np.multiply(di, h, out=out)
+    flat = rows.reshape(len(rows), -1)
     at = x
-    for stage, slope in enumerate(slopes, 1):
-        for fi, di, out in zip(field(at), d, slope, strict=True):
-            np.add(fi, di, out=out)
-        slope *= h
-        at = (_ROWS[stage] @ flat[:stage]).reshape(x.shape)
-        at += x
+    for stage, slope in enumerate(rows[2:], 1):
+        for out, fi in zip(slope, field(at), strict=True):
+            np.multiply(fi, h, out=out)
+        at = (_ROWS[stage] @ flat[: 2 + stage]).reshape(x.shape)
     return at
 
 

@@ -73,7 +73,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # Blocks of noise [w, v] and where in its block each row is; at first, past the end.
-        self._blocks = np.empty((num_envs, NOISE_BLOCK, nx + ny))
+        self._blocks = np.empty((nx + ny, NOISE_BLOCK, num_envs))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
@@ -178,10 +178,12 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
         x = advance_batch(self.system, before, u, w, self.plant.dt)
-        inside = np.all((x >= self._low) & (x <= self._high), axis=0)
-        if inside.all():
+        within = (x >= self._low) & (x <= self._high)
+        if within.all():
+            inside = np.ones_like(within[0])
             y = self._measure(x, v)
         else:  # the last state and output inside
+            inside = np.all(within, axis=0)
             x = np.where(inside, x, before)
             y = np.where(inside, self._measure(x, v), self._y[:, rows])
         sample = self._sample[rows] + 1
@@ -218,12 +220,17 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
         used = self._used[rows]
-        if used.max(initial=0) == NOISE_BLOCK:
-            for row in rows[used == NOISE_BLOCK].tolist():
-                np.concatenate(self.plant.noise(self._rng(row)), axis=1, out=self._blocks[row])
-            used = np.where(used == NOISE_BLOCK, 0, used)
+        if used.max() == NOISE_BLOCK:
+            empty = used == NOISE_BLOCK
+            fresh = [np.concatenate(self.plant.noise(self._rng(row))) for row in rows[empty].tolist()]
+            self._blocks[:, :, rows[empty]] = np.stack(fresh, axis=-1)
+            used[empty] = 0
         self._used[rows] = used + 1
-        drawn = self._blocks[rows, used].T
+        first = used[0]
+        if len(rows) == self.num_envs and (used == first).all():
+            drawn = self._blocks[:, first]
+        else:
+            drawn = self._blocks[:, used, rows]
         return drawn[: self.system.nx], drawn[self.system.nx :]
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:

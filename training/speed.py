@@ -1,7 +1,9 @@
-"""How fast the environments step, as a ratio to a well-known one measured in the same run."""
+"""How fast the environments step, as a ratio to well-known ones measured in the same run."""
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -9,46 +11,83 @@ from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
+from kkl_gym.simulate import advance_batch
 
 REFERENCE = "Pendulum-v1"
+VECTOR_REFERENCE = "CartPole-v1"
 
 
 @dataclass(frozen=True)
 class Speed:
-    """Time single environments, bare and with an observer, against Gymnasium's Pendulum-v1.
+    """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
     Actions are drawn beforehand. The environments take turns, several times over, and each ratio is the median of
     those to the reference in the same turn, because a shared machine's speed drifts.
     """
 
     steps: int = 5000
-    """Steps of each environment in a turn."""
+    """Steps of each single environment in a turn."""
     turns: int = 7
     """Number of turns."""
+    num_envs: int = 1024
+    """Rows of the vector environments."""
+    vector_steps: int = 1000
+    """Steps of each vector environment in a turn, from starts in the training box on."""
 
     def run(self, console: Console) -> dict[str, float]:
-        """Measure; returns the steps per second of each environment as multiples of the reference's."""
+        """Measure; returns the steps per second of each environment as multiples of its reference's."""
+        ratios = self._single(console)
+        return ratios | self._vector(console)
+
+    def _single(self, console: Console) -> dict[str, float]:
         envs = {REFERENCE: gym.make(REFERENCE)}
         for env_id in kkl_gym.ENV_IDS.values():
             envs[env_id] = gym.make(env_id)
             envs[f"{env_id}, x_hat"] = kkl_gym.KKLObservation(gym.make(env_id))
-        actions = {}
-        for name, env in envs.items():
-            env.action_space.seed(0)
-            actions[name] = [env.action_space.sample() for _ in range(self.steps)]
-        seconds: dict[str, list[float]] = {name: [] for name in envs}
-        for turn in range(self.turns + 1):
-            for name, env in envs.items():
-                elapsed = timed(env, actions[name])
-                if turn:  # the first one warms up
-                    seconds[name].append(elapsed)
-        reference = np.array(seconds[REFERENCE])
-        ratios = {name: float(np.median(reference / np.array(times))) for name, times in seconds.items()}
+        actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
+        tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
+        seconds = self._in_turns(tasks)
+        ratios = _ratios(seconds, REFERENCE)
         table = Table("environment", "µs per step", f"speed relative to {REFERENCE}")
         for name, ratio in ratios.items():
             table.add_row(name, f"{1e6 * np.median(seconds[name]) / self.steps:.1f}", f"{ratio:.2f}")
         console.print(table)
         return ratios
+
+    def _vector(self, console: Console) -> dict[str, float]:
+        """Whole steps, and how long their parts take by themselves on what the environment then holds."""
+
+        def make(env_id: str) -> gym.vector.VectorEnv:
+            return gym.make_vec(env_id, num_envs=self.num_envs, vectorization_mode="vector_entry_point")
+
+        envs = {VECTOR_REFERENCE: make(VECTOR_REFERENCE)}
+        parts: dict[str, dict[str, str]] = {}
+        for env_id in kkl_gym.ENV_IDS.values():
+            envs[env_id] = make(env_id)
+            envs[f"{env_id}, z"] = kkl_gym.KKLVectorObservation(make(env_id), estimate="z")
+            envs[f"{env_id}, x_hat"] = kkl_gym.KKLVectorObservation(make(env_id))
+        actions = {name: _drawn(env.action_space, self.vector_steps) for name, env in envs.items()}
+        tasks = {name: lambda name=name, env=env: timed_vector(env, actions[name]) for name, env in envs.items()}
+        seconds = self._in_turns(tasks)
+        for name, env in envs.items():
+            parts[name] = _parts(env, np.median(seconds[name]) / self.vector_steps)
+        ratios = _ratios(seconds, VECTOR_REFERENCE)
+        title = f"{self.num_envs} rows"
+        table = Table(title, "µs per step", "simulation", "network", f"speed relative to {VECTOR_REFERENCE}")
+        for name, ratio in ratios.items():
+            whole = f"{1e6 * np.median(seconds[name]) / self.vector_steps:.0f}"
+            table.add_row(name, whole, parts[name]["simulation"], parts[name]["network"], f"{ratio:.2f}")
+        console.print(table)
+        return {f"{name}, {self.num_envs} rows": ratio for name, ratio in ratios.items()}
+
+    def _in_turns(self, tasks: Mapping[str, Callable[[], float]]) -> dict[str, list[float]]:
+        seconds: dict[str, list[float]] = {name: [] for name in tasks}
+        for turn in range(self.turns + 1):
+            for name, task in tasks.items():
+                elapsed = task()
+                if turn:  # the first one warms up
+                    seconds[name].append(elapsed)
+        return seconds
 
 
 def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
@@ -60,3 +99,44 @@ def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
         if terminated or truncated:
             env.reset()
     return time.perf_counter() - started
+
+
+def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
+    """Seconds that the actions take in an environment that resets by itself."""
+    env.reset(seed=0)
+    started = time.perf_counter()
+    for action in actions:
+        env.step(action)
+    return time.perf_counter() - started
+
+
+def _parts(env: gym.vector.VectorEnv, step: float) -> dict[str, str]:
+    """Shares of a step's seconds."""
+    base = env.unwrapped
+    shares = {"simulation": "", "network": ""}
+    if isinstance(base, kkl_gym.KKLVectorEnv):
+        system, x = base.plant.system, base.reset(seed=0)[1]["x"].T.copy()
+        u, w = np.zeros((system.nu, x.shape[1])), np.zeros_like(x)
+        shares["simulation"] = _share(lambda: advance_batch(system, x, u, w, base.plant.dt), step)
+    if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
+        shares["network"] = _share(env.observer.decode, step)
+    return shares
+
+
+def _share(task: Callable[[], object], whole: float, repeats: int = 50) -> str:
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        task()
+        times.append(time.perf_counter() - started)
+    return f"{100 * np.median(times) / whole:.0f} %"
+
+
+def _drawn(space: gym.Space[Any], steps: int) -> list[np.ndarray]:
+    space.seed(0)
+    return [space.sample() for _ in range(steps)]
+
+
+def _ratios(seconds: Mapping[str, list[float]], reference: str) -> dict[str, float]:
+    base = np.array(seconds[reference])
+    return {name: float(np.median(base / np.array(times))) for name, times in seconds.items()}
