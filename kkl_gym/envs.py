@@ -9,7 +9,7 @@ import numpy as np
 
 from kkl_gym.plant import Plant
 from kkl_gym.simulate import advance
-from kkl_gym.system import System
+from kkl_gym.system import Box, System
 
 TRAIL = 1000  # samples that a rendered phase portrait shows
 
@@ -47,11 +47,13 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     measurement_noise : standard deviation of the Gaussian noise v on each sample of each output.
     observe : "state" or "output".
     parameters : physical parameters of the system, by name, where they differ from its defaults.
+    start_box : (low, high) of each state, where episodes start; None is the system's training box.
     render_mode : None or "rgb_array".
 
     Raises
     ------
-    ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
+    ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a
+        ``start_box`` that does not lie within the declared bounds.
     """
 
     metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares it without ClassVar
@@ -67,9 +69,10 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         measurement_noise: float = 0.5,
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
+        start_box: Box | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters)
+        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters, start_box)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode
@@ -90,7 +93,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode, from ``options["x0"]`` (nx numbers) or uniformly in the system's training box.
+        """Start an episode, from ``options["x0"]`` (nx numbers) or uniformly in ``start_box``.
 
         Raises ValueError if x0 has the wrong shape, is not finite, lies outside the declared bounds, or if
         ``options`` holds an unknown key.
@@ -104,7 +107,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
                 raise ValueError(f'unknown reset option {key!r}; the one there is is "x0"')
             start = self.plant.start(value)
         if start is None:
-            start = self.np_random.uniform(*self.system.box())
+            start = self.plant.draw_start(self.np_random)
         self._x = tuple(start.tolist())
         self._y = self._measure(self._next_noise()[1])
         self._sample = 0

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from kkl_gym.simulate import check_dt
-from kkl_gym.system import System
+from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
 
 NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
@@ -21,12 +21,14 @@ class Plant:
     Attributes
     ----------
     system, dt, process_noise, measurement_noise, observe : as given, with defaults filled in.
+    start_box : low and high corner, each (nx,), of where episodes start.
     state_space, output_space : boxes of the states within the declared bounds and of the outputs that they allow.
     observation_space : that of the two which ``observe`` names.
     action_space : ``Box(-1, 1, (nu,))``.
     weights : of the squared deviations from the target in the reward's cost, (nx,).
 
-    Raises ValueError on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``.
+    Raises ValueError on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a
+    ``start_box`` that does not lie within the declared bounds.
     """
 
     def __init__(
@@ -37,6 +39,7 @@ class Plant:
         measurement_noise: float,
         observe: str,
         parameters: Mapping[str, float] | None,
+        start_box: Box | None,
     ) -> None:
         self.system = get_system(system, parameters)
         check_dt(dt)
@@ -50,6 +53,7 @@ class Plant:
         self.process_noise = float(process_noise)
         self.measurement_noise = float(measurement_noise)
         self.observe = observe
+        self.start_box = _start_box(self.system, start_box)
         self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
         self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
         self.observation_space = self.state_space if observe == "state" else self.output_space
@@ -64,6 +68,11 @@ class Plant:
         w *= self._w_range
         return w, self.measurement_noise * rng.standard_normal((self.system.ny, NOISE_BLOCK))
 
+    def draw_start(self, rng: np.random.Generator) -> np.ndarray:
+        """A start uniform in ``start_box``, (nx,)."""
+        low, high = self.start_box
+        return rng.uniform(low, high)
+
     def start(self, x0: Any) -> np.ndarray:
         """The start that a user asks for, (nx,); raises ValueError if it is no state within the declared bounds."""
         start = np.asarray(x0, dtype=float)
@@ -71,6 +80,16 @@ class Plant:
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
             raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {x0!r}")
         return start
+
+
+def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
+    ends = np.asarray(system.X if box is None else box, dtype=float)
+    low, high = np.array(system.bounds).T
+    if ends.shape != (system.nx, 2):
+        raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {box!r}")
+    if not ((low <= ends[:, 0]) & (ends[:, 0] <= ends[:, 1]) & (ends[:, 1] <= high)).all():
+        raise ValueError(f"start_box must lie within the declared bounds {system.bounds}, low before high; got {box!r}")
+    return ends[:, 0], ends[:, 1]
 
 
 def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:

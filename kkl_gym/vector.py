@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.simulate import advance_batch
-from kkl_gym.system import System
+from kkl_gym.system import Box, System
 
 Infos = dict[str, Any]
 
@@ -30,7 +30,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Parameters
     ----------
-    system, dt, process_noise, measurement_noise, observe, parameters : as for :class:`KKLEnv`.
+    system, dt, process_noise, measurement_noise, observe, parameters, start_box : as for :class:`KKLEnv`.
     num_envs : how many.
     max_episode_steps : steps after which an episode is truncated; ``gym.make_vec`` passes what is registered.
     autoreset_mode : one of Gymnasium's, see above.
@@ -49,13 +49,14 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         measurement_noise: float = 0.5,
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
+        start_box: Box | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
             if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
                 raise ValueError(f"{name} must be a positive integer, got {count!r}")
-        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters)
+        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters, start_box)
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -90,7 +91,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Parameters
         ----------
         seed : for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
-        options : ``"x0"``: starts, (nx,) for all or (num_envs, nx), otherwise uniform in the training box;
+        options : ``"x0"``: starts, (nx,) for all or (num_envs, nx), otherwise uniform in ``start_box``;
             ``"reset_mask"``: boolean (num_envs,), the rows to reset, otherwise all.
 
         Raises ValueError on unknown options, wrong shapes and starts outside the declared bounds.
@@ -165,8 +166,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _begin(self, rows: np.ndarray, starts: np.ndarray | None = None) -> None:
         """Start episodes in some rows; the generators are used in the order in which :class:`KKLEnv` uses its own."""
         if starts is None:
-            box = self.system.box()
-            starts = np.array([self._rng(row).uniform(*box) for row in rows.tolist()])
+            starts = np.array([self.plant.draw_start(self._rng(row)) for row in rows.tolist()])
         self._x[:, rows] = starts.T
         self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1])
         self._sample[rows] = 0

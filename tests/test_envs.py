@@ -325,6 +325,19 @@ def test_start_is_taken():
         env.reset(options=empty)
 
 
+def test_start_box():
+    box = ((-3, 3), (-6.5, -6))
+    env = gym.make("KKLVanDerPol-v0", start_box=box)
+    starts = np.array([env.reset(seed=seed)[1]["x"] for seed in range(50)])
+    assert (starts >= [-3, -6.5]).all()
+    assert (starts <= [3, -6]).all()
+    assert np.ptp(starts[:, 0]) > 4
+    many = gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"]
+    assert (many == starts).all()
+    point = gym.make("KKLVanDerPol-v0", start_box=((1, 1), (2, 2)))
+    assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
+
+
 def test_unknown_option():
     with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
         KKLEnv("lorenz").reset(options={"x_0": [0.0, 0.0, 0.0]})
@@ -345,6 +358,10 @@ def test_unknown_option():
         ({"process_noise": math.nan}, "process_noise must be"),
         ({"measurement_noise": -0.1}, "measurement_noise must be"),
         ({"measurement_noise": math.inf}, "measurement_noise must be"),
+        ({"start_box": ((0, 1), (0, 1))}, "start_box must be"),
+        ({"start_box": ((0, 1), (0, 1), (2, 1))}, "start_box must lie within"),
+        ({"start_box": ((0, 1), (0, 1), (2, math.nan))}, "start_box must lie within"),
+        ({"start_box": ((0, 1), (0, 1), (2, 1000))}, "start_box must lie within"),
         ({"render_mode": "human"}, "render_mode must be None or one of .* 'human'"),
     ],
 )
