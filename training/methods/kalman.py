@@ -1,6 +1,5 @@
 """Kalman filters that know the equations of motion: what a control engineer would try first."""
 
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -8,6 +7,7 @@ import numpy as np
 from kkl_gym.simulate import advance, advance_batch
 from kkl_gym.system import Box, Components, System
 from training.data import output
+from training.derivatives import jacobian
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
 # Process noise, in multiples of each state's scale per square root of a second: what stands for the filters'
@@ -111,18 +111,6 @@ def faster(system: System, factor: float) -> System:
             return factor * system.rate(x)
 
     return Faster()
-
-
-def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of f or h from its own equations: for each component, those that are not zero by state."""
-    import sympy  # here, because it takes half a second that other commands need not wait for
-
-    x = sympy.symbols(f"x:{nx}", real=True)
-    rows = []
-    for value in equations(list(x)):
-        derivatives = {j: sympy.diff(sympy.sympify(value), x[j]) for j in range(nx)}
-        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
-    return rows
 
 
 def with_sensitivity(system: System) -> System:

@@ -1,0 +1,104 @@
+"""Control tasks, their scores and the classical controllers."""
+
+import numpy as np
+import pytest
+
+from kkl_gym import SYSTEMS, get_system
+from training.agents.controllers import controller, linear_quadratic
+from training.agents.play import play
+from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
+from training.derivatives import linearised
+
+everyone = pytest.mark.parametrize("name", SYSTEMS)
+
+
+def nothing(obs):
+    return np.zeros((len(obs), 1))
+
+
+@everyone
+def test_linearisation_equals_finite_differences(name):
+    system = get_system(name)
+    x, eps = np.random.default_rng(0).uniform(*system.box()), 1e-6
+    A, B, C = linearised(system, x)
+    for j, step in enumerate(eps * np.eye(system.nx)):
+        assert np.allclose(A[:, j], (np.array(system.f(x + step)) - system.f(x - step)) / (2 * eps), atol=1e-5)
+        assert np.allclose(C[:, j], (np.array(system.h(x + step)) - system.h(x - step)) / (2 * eps), atol=1e-6)
+    assert B.tolist() == [list(row) for row in system.G]
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "rossler", "lorenz"])
+def test_the_linear_quadratic_regulator_stabilises_the_target(name):
+    system = get_system(name)
+    A, B, _ = linearised(system, system.target)
+    act = linear_quadratic(system)
+    step = 1e-6 * np.eye(system.nx)
+    K = (act(np.array(system.target) - step) - act(np.array(system.target) + step)) * system.u_max / 2e-6
+    assert (np.linalg.eigvals(A - B @ K.T).real < 0).all()
+    assert act(np.array([system.target])).tolist() == [[0.0]]
+    assert np.abs(act(np.random.default_rng(0).uniform(*system.box(), (50, system.nx)))).max() == 1.0
+
+
+@everyone
+def test_the_state_feedback_succeeds_where_nothing_fails(name):
+    task, n = TASKS[name], 20
+    episodes = play(task.make(n, None, "Disabled"), controller(get_system(name)), task.steps, 0)
+    idle = play(task.make(n, None, "Disabled"), nothing, task.steps, 0)
+    assert (episodes.x[0] == idle.x[0]).all()
+    assert episodes.x.shape == (task.steps + 1, n, get_system(name).nx)
+    assert episodes.u.shape == (task.steps, n, 1)
+    assert not (episodes.escaped | idle.escaped).any()
+    assert successes(task, episodes.x).mean() >= (0.5 if name == "lorenz" else 0.95)
+    assert successes(task, idle.x).mean() <= 0.1
+    assert scores(get_system(name), episodes.x).mean() > scores(get_system(name), idle.x).mean() + 0.2
+
+
+def test_the_task_acts_once_a_period_and_ends_in_time():
+    task = ControlTask("van_der_pol", measurement_noise=0.1, period=0.05, duration=1.0, start_box=((1, 1), (0, 0)))
+    assert (task.repeat, task.steps) == (5, 20)
+    env = task.make(2)
+    env.reset(seed=0)
+    for k in range(task.steps):
+        obs, _, _, truncated, info = env.step(np.zeros((2, 1)))
+        assert truncated.all() == (k == task.steps - 1)
+    assert obs.shape == (2, 2)
+    assert info["final_info"]["sample"].tolist() == [100, 100]
+    assert task.make(2, "z").single_observation_space.shape[0] > 2
+    assert task.make(2, None, observe="output").single_observation_space.shape == (1,)
+    start = task.make(2, None).reset(seed=0)[0]
+    assert start.tolist() == [[1.0, 0.0]] * 2
+
+
+def test_scores_and_successes_by_hand():
+    system = get_system("reverse_duffing")  # target 0, scale (2, 1.5)
+    x = np.zeros((10, 2, 2))
+    x[:, 1] = [2.0, 1.5]  # one scale off in both states: c = 1
+    assert scores(system, x) == pytest.approx([0.0, np.exp(-4.0) - 1.0])
+    task = TASKS["reverse_duffing"]
+    x[:] = 0.0
+    x[:8, 0] = 5.0  # before the last fifth
+    x[9, 1] = [0.0, 1.01 * task.tolerance * 1.5]
+    assert successes(task, x).tolist() == [True, False]
+    x[9, 1] = [0.0, 0.99 * task.tolerance * 1.5]
+    assert successes(task, x).tolist() == [True, True]
+
+
+@pytest.mark.parametrize("wrong", [
+    {"tolerance": 0.0}, {"tolerance": float("nan")}, {"dt": 0.0}, {"period": 0.005}, {"period": 0.015},
+    {"duration": 0.0}, {"duration": 19.97},
+])  # fmt: skip
+def test_impossible_tasks(wrong):
+    with pytest.raises(ValueError, match=r"task needs|whole multiple"):
+        ControlTask("lorenz", **wrong)
+
+
+def test_finding_tasks():
+    assert get_task("lorenz", 2.0).measurement_noise == 2.0
+    assert get_task("lorenz").measurement_noise == 0.5
+    with pytest.raises(ValueError, match="no control task for 'lorentz'"):
+        get_task("lorentz")
+
+
+def test_no_controller_without_input(script):
+    with pytest.raises(ValueError, match="pendulum has no inputs"):
+        controller(get_system(f"{script}:Pendulum"))
