@@ -1,7 +1,7 @@
 """Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 import gymnasium as gym
@@ -87,6 +87,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
         self._x: tuple[float, ...] | None = None
+        self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Any = None
 
@@ -111,6 +112,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._x = tuple(start.tolist())
         self._y = self._measure(self._next_noise()[1])
         self._sample = 0
+        self._u = None
         self._trail.clear()
         self._trail.append(self._x)
         return self._observation(), {"y": np.array(self._y), "x": np.array(self._x), "sample": 0}
@@ -136,6 +138,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         }
         if self.render_mode is not None:
             self._trail.append(self._x)
+            self._u = u
         cost = 0.0
         for xi, (target, weight) in zip(self._x, self._goal):
             cost += weight * (xi - target) * (xi - target)
@@ -143,15 +146,19 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]
         """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
+        return self.draw()
+
+    def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
+        """:meth:`render` with estimated states, (nx,) each, beside the true ones."""
         if self.render_mode is None:
             return None
         if self._x is None:
             raise gym.error.ResetNeeded("call reset() before render()")
-        if self._canvas is None:
+        if self._canvas is None or self._canvas.estimates != bool(estimates):
             from kkl_gym.rendering import Canvas
 
-            self._canvas = Canvas(self.system)
-        return self._canvas.draw(self._trail)  # type: ignore[no-any-return]
+            self._canvas = Canvas(self.system, bool(estimates))
+        return self._canvas.draw(self._trail, estimates, self._u)  # type: ignore[no-any-return]
 
     def _input(self, action: np.ndarray) -> list[float]:
         values = np.asarray(action, dtype=float)

@@ -33,6 +33,7 @@ class System:
     u_max : bound of each input; the default, none, makes an autonomous system.
     G : constant input matrix, ``nx`` rows of ``nu`` numbers; override :meth:`g` where it depends on the state.
     scale : typical size of each state, for the reward and the process noise; default: the training box's half-width.
+    portrait : the two states that a phase portrait shows, by index; default: the first and the last.
     process_noise : default bound of the process noise as a multiple of ``scale`` per second.
     """
 
@@ -43,6 +44,7 @@ class System:
     u_max: ClassVar[tuple[float, ...]] = ()
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
+    portrait: ClassVar[tuple[int, int]] = (0, -1)
     process_noise: ClassVar[float] = 0.05
 
     def __init_subclass__(cls) -> None:
@@ -66,6 +68,8 @@ class System:
             cls.state_names = vars(cls).get("state_names") or tuple(f"x{i + 1}" for i in range(nx))
         if len(cls.scale) != nx or any(not 0 < scale < math.inf for scale in cls.scale):
             raise TypeError(f"{cls.__name__}: scale = {cls.scale} must be {nx} positive numbers")
+        if len(cls.portrait) != 2 or any(not -nx <= i < nx for i in cls.portrait):
+            raise TypeError(f"{cls.__name__}: portrait = {cls.portrait} must be two indices of its {nx} states")
         if len(cls.state_names) != nx:
             raise TypeError(f"{cls.__name__}: state_names = {cls.state_names} must name {nx} states")
 

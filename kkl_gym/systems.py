@@ -86,6 +86,7 @@ class Rossler(System):
     u_max: ClassVar[tuple[float, ...]] = (2.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (8.0, 8.0, 10.0)
+    portrait: ClassVar[tuple[int, int]] = (0, 1)
 
     def f(self, x: Components) -> Components:
         x1, x2, x3 = x

@@ -1,13 +1,14 @@
 """Wrappers: a learned observer inside the environment, and an agent that acts more slowly than it samples."""
 
 import os
+from collections import deque
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from kkl_gym.envs import KKLEnv
+from kkl_gym.envs import TRAIL, KKLEnv
 from kkl_gym.installed import Installed
 
 
@@ -57,6 +58,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._installed = Installed(base.plant, observer, estimate, measurement_noise, ignore_input)
         self.observer = self._installed.observer
         self.estimate = estimate
+        self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
         self.observation_space = self._installed.space
 
     def reset(
@@ -65,6 +67,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         """Reset the environment, and the observer to its first sample."""
         _, info = self.env.reset(seed=seed, options=options)
         self._sample = info["sample"]
+        self._trail.clear()
         return self._show(self.observer.reset(info["y"]), info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -79,9 +82,16 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         x_hat = self.observer.step(info["y"], self._installed.known(info["u"]))
         return self._show(x_hat, info), float(reward), terminated, truncated, info
 
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """The phase portrait with state and estimate as an RGB image, or None without ``render_mode``."""
+        base: KKLEnv = self.unwrapped  # type: ignore[assignment]
+        return base.draw(self._trail)
+
     def _show(self, x_hat: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         z = self.observer.z
         info["x_hat"], info["z"] = x_hat, z
+        if self.render_mode is not None:
+            self._trail.append(x_hat.tolist())
         return self._installed.shown(x_hat if self.estimate == "x" else z)
 
 

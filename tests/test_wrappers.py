@@ -317,6 +317,25 @@ def test_a_wrapper_inside_that_skips_samples_is_noticed(saved):
         env.step(np.zeros(1, np.float32))
 
 
+def test_render_shows_the_estimate_and_the_input(saved):
+    env = wrapped(saved, "van_der_pol", env={"render_mode": "rgb_array"})
+    env.reset(seed=0)
+    for _ in range(30):
+        env.step(np.zeros(1, np.float32))
+    with_estimate, without = env.render(), env.unwrapped.render()
+    assert with_estimate.shape == without.shape == (480, 480, 3)
+    assert (with_estimate != without).any()
+    assert (env.render() == with_estimate).all()
+    env.step(np.ones(1, np.float32))
+    pushed = env.render()
+    assert (pushed[430:460] != with_estimate[430:460]).any()  # the bar of the input
+    env.reset(seed=0)
+    assert (env.render()[430:460] == with_estimate[430:460]).all()
+    bare = wrapped(saved, "van_der_pol")
+    bare.reset(seed=0)
+    assert bare.render() is None
+
+
 def test_a_system_without_shipped_map_says_so():
     class Mine(kkl_gym.VanDerPol):
         name = "mine"
