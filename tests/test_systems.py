@@ -270,6 +270,7 @@ def test_good_class_variables_are_taken():
         ({"u_max": (1.0, 1.0)}, "2 rows of 2"),
         ({"G": ((1.0,),)}, "2 rows of 1"),
         ({"G": ()}, "override g"),
+        ({"portrait": (0, 2)}, "portrait = .* must be two indices"),
     ],
 )
 def test_wrong_class_variables_raise(wrong, match):
