@@ -1,6 +1,7 @@
 """An observer fitted to a plant: what the single and the vector wrapper share."""
 
 import os
+from collections.abc import Mapping
 
 import gymnasium as gym
 import numpy as np
@@ -53,9 +54,26 @@ class Installed:
             )
         return None
 
-    def shown(self, value: np.ndarray) -> np.ndarray:
+    def reset(self, y0: np.ndarray) -> None:
+        """Take in the first samples, (..., ny)."""
+        self.observer.reset(y0)
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Begin anew in some rows of a batch."""
+        self.observer.restart(y0, rows)
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
+        """Take in samples and the inputs that led to them; raises ValueError as :meth:`known`."""
+        self.observer.advance(y, None if u is None else self.known(u), rows)
+
+    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """z and, unless only z is shown, x_hat; of all rows or of some."""
+        z = self.observer.z if rows is None else self.observer.z[rows]
+        return {"z": z} if self.estimate == "z" else {"z": z, "x_hat": self.observer.decode(rows)}
+
+    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """x_hat or z as an observation: float32, within the space."""
-        out: np.ndarray = value.astype(np.float32)
+        out: np.ndarray = report["x_hat" if self.estimate == "x" else "z"].astype(np.float32)
         np.maximum(out, self.space.low, out=out)
         np.minimum(out, self.space.high, out=out)
         return out

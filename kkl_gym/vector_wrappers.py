@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +18,132 @@ VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
 
 
-class KKLVectorObservation(VectorWrapper):
+class Estimator(Protocol):
+    """A batch of observers, as :class:`VectorEstimate` drives them."""
+
+    space: gym.spaces.Box
+    """Of one row's observation."""
+
+    def reset(self, y0: np.ndarray) -> object:
+        """Take in the first samples, (n, ny)."""
+        ...
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Begin anew in some rows, boolean (n,), from their first samples, (number of rows, ny)."""
+        ...
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
+        """Take in the samples y, (n, ny), that followed the inputs u, (n, nu), None being zero; in some rows only."""
+        ...
+
+    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """What ``info`` gains, a row for each of the n rows or of ``rows``."""
+        ...
+
+    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The observations that a report makes."""
+        ...
+
+
+class VectorEstimate(VectorWrapper):
+    """Shows what a batch of observers makes of ``info["y"]`` and ``info["u"]``, in every autoreset mode.
+
+    ``info`` gains what the observers report, a row for each environment; so does ``info["final_info"]``, and
+    ``info["final_obs"]`` holds the last estimates.
+
+    Parameters
+    ----------
+    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    estimator : the observers.
+
+    Raises ValueError if the environment does not say its autoreset mode, and, at a step, if a wrapper inside hides
+    samples from the observers.
+    """
+
+    def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
+        super().__init__(env)
+        self._mode = _autoreset_mode(env)
+        self._estimator = estimator
+        self.single_observation_space = estimator.space
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+        self._sample = np.zeros(env.num_envs, dtype=int)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
+        options = None if options is None else dict(options)  # some environments take the mask out of it
+        mask = (options or {}).get("reset_mask")
+        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if mask is None:
+            self._estimator.reset(info["y"])
+            mask = np.ones(self.num_envs, dtype=bool)
+        else:
+            self._estimator.restart(info["y"][mask], mask)
+        self._ended = self._ended & ~mask
+        self._sample = np.where(mask, info["sample"], self._sample)
+        return self._show(info, mask), info
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Step the environments, and the observers with the new samples and the inputs that led to them."""
+        _, reward, terminated, truncated, info = self.env.step(actions)
+        before, ended = self._ended, terminated | truncated
+        if self._mode is not AutoresetMode.SAME_STEP:
+            self._ended = ended
+        elif ended.any():
+            return self._show_and_restart(info, ended), reward, terminated, truncated, info
+        expected = self._sample + 1
+        if self._mode is AutoresetMode.NEXT_STEP:
+            expected[before] = 0
+        else:
+            expected -= before  # DISABLED: rows that have ended stay as they are
+        self._check(expected, info["sample"])
+        u = np.where(before[:, None], 0.0, info["u"]) if "u" in info else None  # None: every row was reset
+        if self._mode is AutoresetMode.DISABLED and before.any():
+            self._estimator.advance(info["y"], u, ~before)
+        else:
+            self._estimator.advance(info["y"], u)
+            if before.any():
+                self._estimator.restart(info["y"][before], before)
+        return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
+
+    def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
+        """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
+        final = info["final_info"]
+        self._check(self._sample + 1, np.where(ended, final["sample"], info["sample"]))
+        u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
+        self._estimator.advance(np.where(ended[:, None], final["y"], info["y"]), u)
+        shown = self._show(info, np.ones_like(ended))
+        for row in np.flatnonzero(ended):
+            info["final_obs"][row] = shown[row].copy()
+        self._estimator.restart(info["y"][ended], ended)
+        self._sample[ended] = 0
+        first = self._estimator.report(ended)
+        for key, values in first.items():
+            final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
+            info[key][ended] = values
+        shown[ended] = self._estimator.shown(first)
+        return shown
+
+    def _check(self, expected: np.ndarray, seen: np.ndarray) -> None:
+        if (seen != expected).any():
+            row = int(np.flatnonzero(seen != expected)[0])
+            raise ValueError(
+                f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
+                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation"
+            )
+        self._sample = expected
+
+    def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
+        """Add the observers' report to ``info``, for ``rows``; returns the observations of all."""
+        report = self._estimator.report()
+        for key, values in report.items():
+            info |= {key: values, f"_{key}": rows.copy()}
+        return self._estimator.shown(report)
+
+
+class KKLVectorObservation(VectorEstimate):
     """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
 
     Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
@@ -45,97 +170,10 @@ class KKLVectorObservation(VectorWrapper):
         measurement_noise: float | None = None,
         ignore_input: bool = False,
     ) -> None:
-        super().__init__(env)
-        self._mode = _autoreset_mode(env)
-        self._installed = Installed(_plant(env), observer, estimate, measurement_noise, ignore_input)
-        self.observer = self._installed.observer
+        installed = Installed(plant_of(env), observer, estimate, measurement_noise, ignore_input)
+        super().__init__(env, installed)
+        self.observer = installed.observer
         self.estimate = estimate
-        self.single_observation_space = self._installed.space
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-        self._ended = np.zeros(env.num_envs, dtype=bool)
-        self._sample = np.zeros(env.num_envs, dtype=int)
-
-    def reset(  # type: ignore[override]
-        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments, or the rows of ``options["reset_mask"]``, and the observer to their first samples."""
-        options = None if options is None else dict(options)  # some environments take the mask out of it
-        mask = (options or {}).get("reset_mask")
-        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        if mask is None:
-            self.observer.reset(info["y"])
-            mask = np.ones(self.num_envs, dtype=bool)
-        else:
-            self.observer.restart(info["y"][mask], mask)
-        self._ended = self._ended & ~mask
-        self._sample = np.where(mask, info["sample"], self._sample)
-        return self._show(info, mask), info
-
-    def step(self, actions: np.ndarray) -> Step:
-        """Step the environments, and the observer with the new samples and the inputs that led to them."""
-        _, reward, terminated, truncated, info = self.env.step(actions)
-        before, ended = self._ended, terminated | truncated
-        if self._mode is not AutoresetMode.SAME_STEP:
-            self._ended = ended
-        elif ended.any():
-            return self._show_and_restart(info, ended), reward, terminated, truncated, info
-        moved = ~before
-        expected = self._sample + 1
-        if self._mode is AutoresetMode.NEXT_STEP:
-            expected[before] = 0
-        elif before.any():  # DISABLED: rows that have ended stay as they are
-            expected -= before
-        self._check(expected, info["sample"])
-        u = self._known(info, moved)
-        if self._mode is AutoresetMode.DISABLED and before.any():
-            self.observer.advance(info["y"], u, moved)
-        else:
-            self.observer.advance(info["y"], u)
-            if before.any():
-                self.observer.restart(info["y"][before], before)
-        return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
-
-    def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
-        """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
-        final = info["final_info"]
-        self._check(self._sample + 1, np.where(ended, final["sample"], info["sample"]))
-        u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
-        self.observer.advance(np.where(ended[:, None], final["y"], info["y"]), self._installed.known(u))
-        shown = self._show(info, np.ones_like(ended))
-        for key in ("x_hat", "z"):
-            if key in info:
-                final |= {key: np.where(ended[:, None], info[key], 0.0), f"_{key}": ended.copy()}
-        for row in np.flatnonzero(ended):
-            info["final_obs"][row] = shown[row].copy()
-        self.observer.restart(info["y"][ended], ended)
-        self._sample[ended] = 0
-        info["z"] = self.observer.z
-        if self.estimate == "x":
-            info["x_hat"][ended] = self.observer.decode(ended)
-        shown[ended] = self._installed.shown(info["x_hat" if self.estimate == "x" else "z"][ended])
-        return shown
-
-    def _known(self, info: Infos, moved: np.ndarray) -> np.ndarray | None:
-        if "u" not in info:  # every row was reset in this step
-            return None
-        return self._installed.known(np.where(moved[:, None], info["u"], 0.0))
-
-    def _check(self, expected: np.ndarray, seen: np.ndarray) -> None:
-        if (seen != expected).any():
-            row = int(np.flatnonzero(seen != expected)[0])
-            raise ValueError(
-                f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
-                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation"
-            )
-        self._sample = expected
-
-    def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
-        """Add z and x_hat to ``info``, reported for ``rows``; returns the observations of all."""
-        info |= {"z": self.observer.z, "_z": rows.copy()}
-        if self.estimate == "z":
-            return self._installed.shown(info["z"])
-        info |= {"x_hat": self.observer.decode(), "_x_hat": rows.copy()}
-        return self._installed.shown(info["x_hat"])
 
 
 class VectorActionRepeat(VectorWrapper):
@@ -203,7 +241,7 @@ class VectorActionRepeat(VectorWrapper):
             obs, new = self.reset(options={"reset_mask": ended})
             info = _merged(info, new) | final
             for key in ("u", "escaped"):
-                info[key] = info[key] * _column(~ended, info[key])
+                info[key] = info[key] * column(~ended, info[key])
                 info[f"_{key}"] = info[f"_{key}"] & ~ended
         return obs, total, terminated, truncated, info
 
@@ -215,13 +253,14 @@ def _merged(old: Infos, new: Infos) -> Infos:
         if key.startswith("_") and key[1:] in new:
             values = new[key[1:]]
             if key in old and not mask.all():
-                values = np.where(_column(mask, values), values, old[key[1:]])
+                values = np.where(column(mask, values), values, old[key[1:]])
                 mask = mask | old[key]
             out |= {key[1:]: values, key: mask}
     return out
 
 
-def _column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A mask over rows, (n,), shaped to go with values, (n, ...)."""
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
@@ -232,7 +271,8 @@ def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
     return mode
 
 
-def _plant(env: VectorEnv) -> Plant:
+def plant_of(env: VectorEnv) -> Plant:
+    """What the rows of a vector environment have in common; raises ValueError if they are not ours or differ."""
     base: Any = env.unwrapped
     if isinstance(base, KKLVectorEnv):
         return base.plant
@@ -249,4 +289,4 @@ def _plant(env: VectorEnv) -> Plant:
     return first
 
 
-__all__ = ["KKLVectorObservation", "VectorActionRepeat"]
+__all__ = ["Estimator", "KKLVectorObservation", "VectorActionRepeat", "VectorEstimate"]

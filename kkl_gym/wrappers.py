@@ -92,7 +92,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         info["x_hat"], info["z"] = x_hat, z
         if self.render_mode is not None:
             self._trail.append(x_hat.tolist())
-        return self._installed.shown(x_hat if self.estimate == "x" else z)
+        return self._installed.shown(info)
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):

@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import gymnasium as gym
 import numpy as np
+
+from kkl_gym.vector_wrappers import VectorEnv
 
 Policy = Callable[[np.ndarray], np.ndarray]
 
@@ -25,9 +26,7 @@ class Episodes:
     escaped: np.ndarray
 
 
-def play(
-    env: gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray], policy: Policy, steps: int, seed: int
-) -> Episodes:
+def play(env: VectorEnv, policy: Policy, steps: int, seed: int) -> Episodes:
     """One episode in each row of an environment that does not reset by itself (``autoreset_mode="Disabled"``).
 
     policy : observations (n, ...) in, actions (n, nu) out; rows that have ended are played on in place.

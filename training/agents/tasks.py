@@ -1,13 +1,14 @@
 """Control tasks: hold an equilibrium with a bounded input, seen through a noisy output."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from kkl_gym import KKLVectorEnv, KKLVectorObservation, VectorActionRepeat, get_system
+from kkl_gym import KKLVectorEnv, VectorActionRepeat, get_system
 from kkl_gym.system import Box, System
+from kkl_gym.vector_wrappers import VectorEnv
 
 
 @dataclass(frozen=True)
@@ -51,34 +52,28 @@ class ControlTask:
     def make(
         self,
         num_envs: int,
-        estimate: str | None = "x",
+        wrap: Callable[[VectorEnv], VectorEnv] | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
-        observer: str | None = None,
-        observe: str = "state",
-    ) -> gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> VectorEnv:
         """The task as a vector environment that acts once a period.
 
         Parameters
         ----------
         num_envs : rows.
-        estimate : "x" or "z", what the observer shows; None for no observer.
+        wrap : what goes around the environment at its own sampling interval, such as
+            :class:`kkl_gym.KKLVectorObservation`; None shows the state.
         autoreset_mode : as for :class:`kkl_gym.VectorActionRepeat`.
-        observer : name or path of a map; None is the one shipped for the system.
-        observe : without observer, "state" or "output".
         """
-        env: gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray] = KKLVectorEnv(
+        env: VectorEnv = KKLVectorEnv(
             self.system,
             num_envs,
             dt=self.dt,
             measurement_noise=self.measurement_noise,
-            observe=observe,  # type: ignore[arg-type]
             start_box=self.start_box,
             max_episode_steps=self.steps * self.repeat,
             autoreset_mode=AutoresetMode.DISABLED,
         )
-        if estimate is not None:
-            env = KKLVectorObservation(env, observer, estimate)  # type: ignore[arg-type]
-        return VectorActionRepeat(env, self.repeat, autoreset_mode)
+        return VectorActionRepeat(env if wrap is None else wrap(env), self.repeat, autoreset_mode)
 
 
 # Chosen so that what an agent knows of the state decides: Duffing is marginally stable, Van der Pol's target is

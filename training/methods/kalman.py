@@ -114,13 +114,17 @@ def faster(system: System, factor: float) -> System:
 
 
 def with_sensitivity(system: System) -> System:
-    """The system beside its variational equation: states (x, Phi row by row), x' = f(x), Phi' = df/dx Phi."""
+    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi."""
     nx, rows = system.nx, jacobian(system.f, system.nx)
+    if type(system).g is not System.g:
+        raise ValueError(f"{system.name} has an input matrix that depends on the state, which the filter does not know")
 
     class Sensitivity(System):
         name = f"{system.name}-sensitivity"
         X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
         bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+        u_max: ClassVar[tuple[float, ...]] = system.u_max
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * system.nu,) * nx**2) if system.nu else ()
 
         def f(self, x: Components) -> Components:
             state, Phi = x[:nx], x[nx:]
@@ -160,35 +164,54 @@ class ExtendedKalmanFilter:
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """The start, corrected by the first sample."""
         x0, P0 = self._start
-        self.x, self.P = np.tile(x0, (len(y0), 1)), np.tile(P0, (len(y0), 1, 1))
-        return self._correct(y0)
+        n = len(y0)
+        self.x, self.P = self._corrected(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), y0)
+        return self.decode()
 
-    def step(self, y: np.ndarray) -> np.ndarray:
-        """Predict over one sample and correct."""
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+        """Begin anew in some rows, boolean (n,), from their first samples, (number of rows, ny)."""
+        x0, P0 = self._start
+        n = len(y0)
+        self.x, self.P = self.x.copy(), self.P.copy()
+        self.x[rows], self.P[rows] = self._corrected(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), y0)
+
+    def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Predict over one sample under the input u, (n, nu) or None for zero, and correct."""
+        self.advance(y, u)
+        return self.decode()
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
+        """:meth:`step` without the estimate; with ``rows``, boolean (n,), in these rows only."""
         n, nx = self.x.shape
         Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
         joint = np.concatenate([self.x.T, Phi0])
-        joint = advance_batch(self._joint, joint, np.empty((0, n)), np.zeros_like(joint), self._dt)
-        self.x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
-        self.P = Phi @ self.P @ Phi.mT + self._Q * self._dt
-        return self._correct(y)
+        held = np.zeros((self._joint.nu, n)) if u is None else np.ascontiguousarray(u.T, dtype=float)
+        joint = advance_batch(self._joint, joint, held, np.zeros_like(joint), self._dt)
+        x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
+        x, P = self._corrected(x, Phi @ self.P @ Phi.mT + self._Q * self._dt, y)
+        if rows is not None:
+            x, P = np.where(rows[:, None], x, self.x), np.where(rows[:, None, None], P, self.P)
+        self.x, self.P = x, P
 
-    def _correct(self, y: np.ndarray) -> np.ndarray:
-        inside = np.isfinite(self.P).all((1, 2)) & (self.x >= self._low).all(-1) & (self.x <= self._high).all(-1)
+    def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """The estimate as things stand, (n, nx), or of some rows only."""
+        return self.x.copy() if rows is None else self.x[rows]
+
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        inside = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
         if not inside.all():
-            self.x, self.P = self.x.copy(), self.P.copy()
-            self.x[~inside], self.P[~inside] = self._start
-        n, nx = self.x.shape
+            x, P = x.copy(), P.copy()
+            x[~inside], P[~inside] = self._start
+        n, nx = x.shape
         H = np.zeros((n, self._system.ny, nx))
         for i, row in enumerate(self._outputs):
             for j, derivative in row.items():
-                H[:, i, j] = derivative(*self.x.T)
-        S = H @ self.P @ H.mT + self._R
-        K = np.linalg.solve(S, H @ self.P).mT
-        self.x = self.x + (K @ (y - output(self._system, self.x))[..., None])[..., 0]
+                H[:, i, j] = derivative(*x.T)
+        S = H @ P @ H.mT + self._R
+        K = np.linalg.solve(S, H @ P).mT
+        x = x + (K @ (y - output(self._system, x))[..., None])[..., 0]
         I_KH = np.eye(nx) - K @ H
-        self.P = I_KH @ self.P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
-        return self.x.copy()
+        return x, I_KH @ P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
 
 
 class UnscentedFilters:

@@ -1,0 +1,109 @@
+"""What agents are shown."""
+
+import numpy as np
+import pytest
+
+from kkl_gym import SYSTEMS, get_system
+from training.agents.information import INFORMATION, STACKED, Features, KalmanFilters, make, output_deviation
+from training.agents.tasks import ControlTask
+from training.methods.kalman import EKF
+
+N = 3
+TASK = ControlTask("van_der_pol", measurement_noise=0.2, period=0.02, duration=0.2)
+
+
+def actions(steps):
+    return np.random.default_rng(0).uniform(-1.5, 1.5, (steps, N, 1)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize("information", INFORMATION)
+def test_observations_are_finite_and_of_the_size_of_one(name, information):
+    env = make(ControlTask(name, duration=0.5, measurement_noise=0.1), information, 20)
+    shown = [env.reset(seed=0)[0]]
+    for action in np.random.default_rng(0).uniform(-1, 1, (25, 20, 1)):
+        shown.append(env.step(action)[0])
+        assert shown[-1] in env.observation_space
+    late = np.array(shown[8:])
+    assert 0.05 < np.sqrt((late**2).mean()) < 5
+
+
+@pytest.mark.parametrize("information", INFORMATION)
+def test_last_observations_of_episodes_and_first_ones_of_the_next(information):
+    """Against the same environment that leaves resets to us."""
+    ours, bare = make(TASK, information, N), make(TASK, information, N, "Disabled")
+    assert (ours.reset(seed=1)[0] == bare.reset(seed=1)[0]).all()
+    ends = 0
+    for action in actions(25):
+        obs, reward, terminated, truncated, info = ours.step(action)
+        expected, expected_reward, _, over, _ = bare.step(action)
+        assert (reward == expected_reward).all()
+        assert (truncated == over).all()
+        assert not terminated.any()
+        if over.any():
+            ends += 1
+            assert all((info["final_obs"][row] == expected[row]).all() for row in range(N))
+            assert all(info["final_obs"][row].dtype == np.float32 for row in range(N))
+            expected, _ = bare.reset(options={"reset_mask": over})
+        assert (obs == expected).all()
+    assert ends == 2
+
+
+def test_states_are_taken_from_the_target_over_the_scale():
+    system = get_system("lorenz")
+    task = ControlTask("lorenz", period=0.01, duration=1.0)
+    obs, info = make(task, "state", N).reset(seed=0)
+    assert np.allclose(obs, (info["x"] - system.target) / system.scale, atol=1e-6)
+    obs, info = make(task, "x_hat", N).reset(seed=0)
+    assert np.allclose(obs, (info["x_hat"] - system.target) / system.scale, atol=1e-6)
+    obs, info = make(task, "y", N).reset(seed=0)
+    assert np.allclose(obs, (info["y"] - system.target[1]) / system.scale[1], atol=1e-6)
+    assert output_deviation(system)(np.array([[system.target[1]]])).tolist() == [[0.0]]
+
+
+def test_stacked_outputs_and_actions_by_hand():
+    env = make(TASK, "stacked", N)
+    obs, info = env.reset(seed=0)
+    scaled = output_deviation(get_system("van_der_pol"))
+    pairs = [np.concatenate([scaled(info["y"]), np.zeros((N, 1))], 1)] * STACKED
+    assert np.allclose(obs, np.concatenate(pairs, 1))
+    for action in actions(TASK.steps - 1):
+        obs, *_, info = env.step(action)
+        pairs = [*pairs[1:], np.concatenate([scaled(info["y"]), np.clip(action, -1, 1)], 1)]
+        assert np.allclose(obs, np.concatenate(pairs, 1), atol=1e-6)
+
+
+def test_kalman_filters_follow_a_driven_state():
+    """Told the input, they converge; and they are the benchmark's filters."""
+    task = ControlTask("van_der_pol", measurement_noise=0.1, period=0.01, duration=5.0)
+    env = make(task, "ekf", N)
+    env.reset(seed=0)
+    errors = []
+    for action in actions(400):
+        *_, info = env.step(action)
+        errors.append(np.abs(info["x_hat"] - info["x"]).max())
+    assert max(errors[200:]) < 0.4 < errors[0]
+    system = get_system("van_der_pol")
+    ours = KalmanFilters(env.unwrapped)
+    theirs = EKF().observer({"process_noise": np.array([1e-2])}, system, 0.01, 0.1)
+    y = np.random.default_rng(0).normal(size=(20, N, 1))
+    ours.reset(y[0])
+    theirs.reset(y[0])
+    for yk in y[1:]:
+        ours.advance(yk, np.zeros((N, 1)))
+        assert np.array_equal(ours.report()["x_hat"], theirs.step(yk))
+    kept = ours.report()["x_hat"]
+    rows = np.array([True, False, False])
+    ours.advance(y[0], None, ~rows)
+    assert np.array_equal(ours.report(rows)["x_hat"], kept[rows])
+    assert (ours.report(~rows)["x_hat"] != kept[~rows]).any(1).all()
+    ours.restart(y[0, :1], rows)
+    theirs.reset(y[0])
+    assert np.allclose(ours.report(rows)["x_hat"], theirs.decode(rows))
+
+
+def test_wrong_uses():
+    with pytest.raises(ValueError, match="unknown information 'everything'"):
+        make(TASK, "everything", N)
+    with pytest.raises(ValueError, match="resets in the same step"):
+        Features(TASK.make(N, autoreset_mode="NextStep"), "x", lambda x: x, 2)

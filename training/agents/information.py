@@ -1,0 +1,162 @@
+"""What an agent may know: the information sets that are compared, as vector environments of normalised observations."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from kkl_gym import KKLVectorObservation, get_system
+from kkl_gym.system import System
+from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, plant_of
+from observers import KKLObserver, load
+from training.agents.tasks import ControlTask, deviation
+from training.derivatives import linearised
+from training.methods.kalman import NOISE_FLOOR, ExtendedKalmanFilter, unknown_start
+
+Information = Literal["state", "x_hat", "z", "y", "stacked", "ekf"]
+INFORMATION: tuple[Information, ...] = get_args(Information)
+STACKED = 8  # outputs, each with the action before it
+EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second
+
+Infos = dict[str, Any]
+Feature = Callable[[np.ndarray], np.ndarray]
+
+
+class Features(VectorWrapper):
+    """Shows features of what ``info`` holds, float32, optionally of several steps with the actions that led to them.
+
+    Parameters
+    ----------
+    env : with ``autoreset_mode`` SAME_STEP or DISABLED, as :class:`kkl_gym.VectorActionRepeat` offers them.
+    key : of ``info``.
+    feature : ``info[key]``, (n, ...), in, (n, width) out.
+    width : of the feature.
+    stacked : steps shown, the latest last; before an episode's first step, its first feature and action 0.
+    with_action : whether each feature has the action before it appended.
+    """
+
+    def __init__(
+        self, env: VectorEnv, key: str, feature: Feature, width: int, stacked: int = 1, with_action: bool = False
+    ) -> None:
+        super().__init__(env)
+        if env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
+            raise ValueError("Features needs an environment that resets in the same step or not at all")
+        self._key, self._feature, self._stacked = key, feature, stacked
+        (nu,) = env.single_action_space.shape or (0,)
+        self._taken = nu if with_action else 0
+        width = stacked * (width + self._taken)
+        self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self._history = np.empty((env.num_envs, stacked, 0))
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset the environments and what is remembered of them."""
+        mask = (options or {}).get("reset_mask")
+        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        first = self._first(info[self._key])
+        self._history = first if mask is None else np.where(mask[:, None, None], first, self._history)
+        return self._shown(), info
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
+        """Step the environments."""
+        _, reward, terminated, truncated, info = self.env.step(actions)
+        values = info[self._key]
+        ended = info.get("_final_info", np.zeros(self.num_envs, dtype=bool))
+        if ended.any():
+            values = values.copy()
+            values[ended] = info["final_info"][self._key][ended]
+        taken = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)[:, : self._taken]
+        latest = np.concatenate([self._feature(values), taken], axis=1)
+        self._history = np.concatenate([self._history[:, 1:], latest[:, None]], axis=1)
+        if ended.any():
+            last = self._shown()
+            for row in np.flatnonzero(ended):
+                info["final_obs"][row] = last[row].copy()
+            self._history[ended] = self._first(info[self._key][ended])
+        return self._shown(), reward, terminated, truncated, info
+
+    def _first(self, values: np.ndarray) -> np.ndarray:
+        feature = self._feature(values)
+        one = np.concatenate([feature, np.zeros((len(feature), self._taken))], axis=1)
+        return np.repeat(one[:, None], self._stacked, axis=1)
+
+    def _shown(self) -> np.ndarray:
+        return self._history.reshape(self.num_envs, -1).astype(np.float32)
+
+
+class KalmanFilters:
+    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them."""
+
+    def __init__(self, env: VectorEnv) -> None:
+        plant = plant_of(env)
+        system = plant.system
+        Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2)
+        R = max(plant.measurement_noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
+        self._filters = ExtendedKalmanFilter(system, plant.dt, Q, R, *unknown_start(system))
+        self.space = plant.state_space
+        self.reset, self.restart, self.advance = self._filters.reset, self._filters.restart, self._filters.advance
+
+    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """The estimates."""
+        return {"x_hat": self._filters.decode(rows)}
+
+    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The estimates within the declared bounds."""
+        shown: np.ndarray = np.clip(report["x_hat"], self.space.low, self.space.high).astype(np.float32)
+        return shown
+
+
+def make(
+    task: ControlTask,
+    information: Information,
+    num_envs: int,
+    autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
+    observer: str | None = None,
+) -> Features:
+    """A task in which the agent knows what ``information`` says, in units of about one.
+
+    "state": the true state. "x_hat" and "z": of the learned observer, z as its network sees it. "ekf": the estimate of
+    an extended Kalman filter with the exact model. "y": the latest noisy output. "stacked": the last ``STACKED`` of
+    them, each with the action before it. States and outputs are taken from the target, over their scale.
+
+    Raises ValueError on an unknown name.
+    """
+    if information not in INFORMATION:
+        raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
+    system = get_system(task.system)
+    scaled = partial(deviation, system)
+    if information == "state":
+        return Features(task.make(num_envs, None, autoreset_mode), "x", scaled, system.nx)
+    if information in ("y", "stacked"):
+        stacked = STACKED if information == "stacked" else 1
+        env = task.make(num_envs, None, autoreset_mode)
+        return Features(env, "y", output_deviation(system), system.ny, stacked, with_action=stacked > 1)
+    if information == "ekf":
+        env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
+        return Features(env, "x_hat", scaled, system.nx)
+    if information == "x_hat":
+        env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
+        return Features(env, "x_hat", scaled, system.nx)
+    env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, estimate="z"), autoreset_mode)
+    matrix, feature = modes(load(observer or system.name, task.measurement_noise))
+    return Features(env, "z", feature, matrix.shape[1])
+
+
+def output_deviation(system: System) -> Feature:
+    """(y - h(target)) over the size that the states' scales give to y, to first order."""
+    _, _, C = linearised(system, system.target)
+    y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
+    return lambda value: (value - y) / size
+
+
+def modes(observer: KKLObserver) -> tuple[np.ndarray, Feature]:
+    """z in the coordinates in front of the observer's network: centred, whitened, weighted against noise."""
+    inverse = observer.artifact.inverse
+    matrix = (inverse.gain(observer.measurement_noise)[:, None] * inverse.whiten).T
+    return matrix, lambda z: (z - inverse.z_offset) @ matrix
