@@ -160,6 +160,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             self._canvas = Canvas(self.system, bool(estimates))
         return self._canvas.draw(self._trail, estimates, self._u)  # type: ignore[no-any-return]
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
+
     def _input(self, action: np.ndarray) -> list[float]:
         values = np.asarray(action, dtype=float)
         if values.shape != (self._nu,):

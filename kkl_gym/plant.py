@@ -83,7 +83,7 @@ class Plant:
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
-    ends = np.asarray(system.X if box is None else box, dtype=float)
+    ends = np.array(system.X if box is None else box, dtype=float)  # a copy: it is kept
     low, high = np.array(system.bounds).T
     if ends.shape != (system.nx, 2):
         raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {box!r}")

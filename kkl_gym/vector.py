@@ -1,5 +1,6 @@
 """Many environments at once, simulated as one batch."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -54,10 +55,10 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
-            if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
+            if count is not None and (not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1):
                 raise ValueError(f"{name} must be a positive integer, got {count!r}")
         self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters, start_box)
-        self.num_envs = num_envs
+        self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode}
@@ -96,38 +97,30 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Raises ValueError on unknown options, wrong shapes and starts outside the declared bounds.
         """
-        options = dict(options or {})
-        mask = options.pop("reset_mask", None)
-        x0 = options.pop("x0", None)
-        if options:
-            raise ValueError(f'unknown reset option {next(iter(options))!r}; there are "x0" and "reset_mask"')
-        if mask is None:
-            rows = self._everyone
-        else:
-            mask = np.asarray(mask)
-            if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
-                raise ValueError(f"reset_mask must be boolean, ({self.num_envs},), with a True in it; got {mask!r}")
-            rows = np.flatnonzero(mask)
-            if not self._ready and len(rows) < self.num_envs:
-                raise gym.error.ResetNeeded("reset() all rows before some of them")
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int | np.integer) else seed
-        if seeds is None:
-            seeds = [None] * self.num_envs
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"there are {self.num_envs} environments and {len(seeds)} seeds")
+        given, mask = with_mask(options, self.num_envs)
+        x0 = (given or {}).get("x0")
+        for key in given or {}:
+            if key not in ("x0", "reset_mask"):
+                raise ValueError(f'unknown reset option {key!r}; there are "x0" and "reset_mask"')
+        if not self._ready and not mask.all():
+            raise gym.error.ResetNeeded("reset() all rows before some of them")
+        rows = np.flatnonzero(mask).tolist()
+        seeds = self._spread(seed)
         starts = None
         if x0 is not None:
-            starts = np.asarray(x0, dtype=float)
-            if starts.shape != (self.num_envs, self.system.nx):
-                starts = np.tile(self.plant.start(x0), (self.num_envs, 1))
-            starts = np.array([self.plant.start(starts[row]) for row in rows])
-        for row in rows.tolist():
-            if seeds[row] is not None:
-                self._rngs[row], self._seeds[row] = np_random(seeds[row])
-                self._used[row] = NOISE_BLOCK
-        self._begin(rows, starts)
+            many = np.asarray(x0, dtype=float)
+            if many.ndim > 1 and many.shape != (self.num_envs, self.system.nx):
+                raise ValueError(
+                    f"x0 must be {self.system.nx} numbers, or that for each of {self.num_envs} environments; got shape "
+                    f"{many.shape}"
+                )
+            starts = np.array([self.plant.start(many[row] if many.ndim > 1 else many) for row in rows])
+        for row, generator in {row: np_random(seeds[row]) for row in rows if seeds[row] is not None}.items():
+            self._rngs[row], self._seeds[row] = generator
+            self._used[row] = NOISE_BLOCK
+        self._begin(np.array(rows), starts)
         self._ready = True
-        return self._observation(), self._info(np.isin(self._everyone, rows))
+        return self._observation(), self._info(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Hold the inputs, (num_envs, nu), over one sampling interval; raises ValueError on a wrong shape or NaN."""
@@ -152,10 +145,35 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             info = self._restart(ended, info)
         return self._observation(), reward, terminated, truncated, info
 
+    @property  # type: ignore[override]
+    def np_random(self) -> tuple[np.random.Generator, ...]:
+        """The rows' generators; they are seeded by :meth:`reset`."""
+        return tuple(self._rng(row) for row in range(self.num_envs))
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        raise AttributeError("each row has a generator of its own; seed them by reset(seed=...)")
+
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
-        """The rows' seeds, None where a row was never seeded."""
+        """The rows' seeds, None where a row has not been used yet."""
         return tuple(self._seeds)
+
+    def _spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        """A seed for each row."""
+        given: Any = seed
+        try:
+            if given is None or np.ndim(given) == 0:
+                seeds = [None if given is None else operator.index(given) + i for i in range(self.num_envs)]
+            else:
+                seeds = [None if one is None else operator.index(one) for one in given]
+        except TypeError:
+            raise ValueError(f"a seed must be an integer or one (or None) for each row, got {seed!r}") from None
+        if len(seeds) != self.num_envs:
+            raise ValueError(f"there are {self.num_envs} environments and {len(seeds)} seeds")
+        if any(one is not None and one < 0 for one in seeds):
+            raise ValueError(f"seeds must not be negative, got {seed!r}")
+        return seeds
 
     def _rng(self, row: int) -> np.random.Generator:
         rng = self._rngs[row]
@@ -249,6 +267,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for key, values in (("y", self._y.T), ("x", self._x.T), ("sample", self._sample)):
             info |= {key: values.copy(), f"_{key}": rows.copy()}
         return info
+
+
+def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
+    """A copy of reset options, out of which some environments take the mask, and the rows to reset, boolean (n,)."""
+    if options is None or options.get("reset_mask") is None:
+        return None if options is None else dict(options), np.ones(n, dtype=bool)
+    mask = np.asarray(options["reset_mask"])
+    if mask.dtype != np.bool_ or mask.shape != (n,) or not mask.any():
+        raise ValueError(f"reset_mask must be boolean, ({n},), with a True in it; got {mask!r}")
+    return {**options, "reset_mask": mask}, mask
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:

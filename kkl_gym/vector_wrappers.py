@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym.installed import Installed
 from kkl_gym.plant import Plant
-from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes
+from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes, with_mask
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
 VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -73,12 +73,10 @@ class VectorEstimate(VectorWrapper):
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
-        options = None if options is None else dict(options)  # some environments take the mask out of it
-        mask = (options or {}).get("reset_mask")
+        options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        if mask is None:
+        if mask.all():
             self._estimator.reset(info["y"])
-            mask = np.ones(self.num_envs, dtype=bool)
         else:
             self._estimator.restart(info["y"][mask], mask)
         self._ended = self._ended & ~mask
@@ -98,7 +96,7 @@ class VectorEstimate(VectorWrapper):
             expected[before] = 0
         else:
             expected -= before  # DISABLED: rows that have ended stay as they are
-        self._check(expected, info["sample"])
+        self._check(expected, info["sample"], before)
         u = np.where(before[:, None], 0.0, info["u"]) if "u" in info else None  # None: every row was reset
         if self._mode is AutoresetMode.DISABLED and before.any():
             self._estimator.advance(info["y"], u, ~before)
@@ -106,19 +104,21 @@ class VectorEstimate(VectorWrapper):
             self._estimator.advance(info["y"], u)
             if before.any():
                 self._estimator.restart(info["y"][before], before)
+        self._sample = expected
         return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
 
     def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
         """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
         final = info["final_info"]
-        self._check(self._sample + 1, np.where(ended, final["sample"], info["sample"]))
+        expected = self._sample + 1
+        self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
         u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
         self._estimator.advance(np.where(ended[:, None], final["y"], info["y"]), u)
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
         self._estimator.restart(info["y"][ended], ended)
-        self._sample[ended] = 0
+        self._sample = np.where(ended, 0, expected)
         first = self._estimator.report(ended)
         for key, values in first.items():
             final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
@@ -126,14 +126,16 @@ class VectorEstimate(VectorWrapper):
         shown[ended] = self._estimator.shown(first)
         return shown
 
-    def _check(self, expected: np.ndarray, seen: np.ndarray) -> None:
+    def _check(self, expected: np.ndarray, seen: np.ndarray, ended: np.ndarray) -> None:
         if (seen != expected).any():
             row = int(np.flatnonzero(seen != expected)[0])
+            if ended[row]:
+                raise ValueError(f"the episode of environment {row} has ended: reset it before the next step")
             raise ValueError(
                 f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
-                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation"
+                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation, and reset after "
+                "an error"
             )
-        self._sample = expected
 
     def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
         """Add the observers' report to ``info``, for ``rows``; returns the observations of all."""
@@ -200,10 +202,13 @@ class VectorActionRepeat(VectorWrapper):
         super().__init__(env)
         if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
             raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
-        if not isinstance(env.unwrapped, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
+        inside: VectorEnv = env
+        while isinstance(inside, VectorEstimate | VectorActionRepeat):
+            inside = inside.env
+        if not isinstance(inside, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
             raise ValueError(
-                'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled", and resets rows itself; '
-                "for Sync and Async vectors put ActionRepeat into each environment"
+                'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled" and resets rows itself; '
+                "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment"
             )
         self.repeat = repeat
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -214,10 +219,9 @@ class VectorActionRepeat(VectorWrapper):
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset the environments, or the rows of ``options["reset_mask"]``."""
-        mask = (options or {}).get("reset_mask")
-        given: Any = None if options is None else dict(options)
-        obs, info = self.env.reset(seed=seed, options=given)  # type: ignore[arg-type]
-        self._ended[slice(None) if mask is None else mask] = False
+        options, mask = with_mask(options, self.num_envs)
+        obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        self._ended = self._ended & ~mask
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:

@@ -73,13 +73,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Step the environment, and the observer with the new sample and the input that led to it."""
         _, reward, terminated, truncated, info = self.env.step(action)
-        self._sample += 1
-        if info["sample"] != self._sample:
+        if info["sample"] != self._sample + 1:
             raise ValueError(
-                f"the observer was to see sample {self._sample} and was shown sample {info['sample']}: put wrappers "
-                "that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation"
+                f"the observer was to see sample {self._sample + 1} and was shown sample {info['sample']}: put "
+                "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
+                "reset after an error"
             )
         x_hat = self.observer.step(info["y"], self._installed.known(info["u"]))
+        self._sample += 1
         return self._show(x_hat, info), float(reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:  # type: ignore[override]

@@ -82,6 +82,7 @@ class KKLObserver:
 
         Raises ValueError on a wrong shape, NaN or infinity, RuntimeError before :meth:`reset`.
         """
+        rows = np.asarray(rows)
         z = self._rows(rows)
         y0 = np.asarray(y0, dtype=float)
         self._check_output(y0, (int(rows.sum()),))
@@ -118,6 +119,7 @@ class KKLObserver:
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
         else:
+            rows = np.asarray(rows)
             kept = self._rows(rows)
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
@@ -129,6 +131,7 @@ class KKLObserver:
             raise RuntimeError("call reset(y0) before the observer is used")
         z, age = self._z, self._age
         if rows is not None:
+            rows = np.asarray(rows)
             z, age = self._rows(rows)[rows], np.broadcast_to(age, rows.shape)[rows]
         return self._invert(z, age * self.artifact.filter.dt)
 

@@ -9,6 +9,7 @@ import torch
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
 from kkl_gym import ActionRepeat, KKLObservation, KKLVectorEnv, KKLVectorObservation, VectorActionRepeat
@@ -140,7 +141,12 @@ def test_any_vector_environment():
     assert (ours.reset() == theirs.reset()).all()
     assert ours.get_attr("spec", 1)[0].id == "CartPole-v1"
     assert ours.get_attr("render_mode") == [None] * N
-    assert ours.env_method("get_wrapper_attr", "gravity", indices=[0, 2]) == [9.8, 9.8]
+    assert ours.env_method("get_wrapper_attr", "gravity") == [9.8] * N
+    with pytest.raises(ValueError, match="in all rows at once"):
+        ours.env_method("get_wrapper_attr", "gravity", indices=[0, 2])
+    ours.set_attr("gravity", 5.0)
+    assert ours.get_attr("gravity") == [5.0] * N
+    ours.set_attr("gravity", 9.8)
     assert ours.env_is_wrapped(RecordEpisodeStatistics) == [True] * N
     assert ours.env_is_wrapped(KKLVectorObservation) == [False] * N
     for _ in range(2 * STEPS):
@@ -162,7 +168,9 @@ def test_attributes_of_batched_environments(saved):
     assert env.env.unwrapped.max_episode_steps == 3
     with pytest.raises(ValueError, match="for all rows at once"):
         env.set_attr("max_episode_steps", 3, [0])
-    with pytest.raises(AttributeError, match="no environments with a method"):
+    env.set_attr("estimate", "z")
+    assert env.env.estimate == "z"
+    with pytest.raises(AttributeError, match="no environments of their own"):
         env.env_method("step", 0)
     env.close()
 
@@ -178,3 +186,36 @@ def test_options_of_single_rows_are_refused():
     env.set_options([{"x0": [1.0, 1.0]}, {}, {}])
     with pytest.raises(ValueError, match="the same options for all rows"):
         env.reset()
+    env.set_options({"x0": np.array([1.0, 1.5])})  # the wrong ones are forgotten
+    assert env.reset().tolist() == [[1.0, 1.5]] * N
+
+
+def test_nested_infos_arrive_as_stable_baselines3_expects_them():
+    """Monitors report a dictionary where an episode ends."""
+    make = partial(gym.make, "CartPole-v1", max_episode_steps=STEPS)
+    inside = SB3VecEnv(SyncVectorEnv([lambda: Monitor(make())] * N, autoreset_mode="SameStep"))
+    outside = SB3VecEnv(RecordEpisodeStatistics(vector()))
+    for env in (inside, outside):
+        env.seed(0)
+        env.reset()
+        seen = 0
+        for _ in range(2 * STEPS):
+            action = np.zeros(N, dtype=int) if env is inside else np.zeros((N, 1))
+            _, _, done, infos = env.step(action)
+            for info, ended in zip(infos, done, strict=True):
+                assert ("episode" in info) == ended
+                if ended:
+                    seen += 1
+                    assert 1 <= info["episode"]["l"] <= STEPS
+        assert seen >= N
+
+
+def test_observations_are_copies_even_where_the_environment_reuses_its_array():
+    make = partial(gym.make, "CartPole-v1")
+    env = SB3VecEnv(SyncVectorEnv([make] * N, autoreset_mode="SameStep", copy=False))
+    first = env.reset()
+    kept = first.copy()
+    second, *_ = env.step(np.ones(N, dtype=int))
+    assert (first == kept).all()
+    env.step(np.ones(N, dtype=int))
+    assert (second != env.step(np.ones(N, dtype=int))[0]).any()

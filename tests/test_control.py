@@ -90,6 +90,11 @@ def test_impossible_tasks(wrong):
         ControlTask("lorenz", **wrong)
 
 
+def test_play_refuses_environments_that_reset_by_themselves():
+    with pytest.raises(ValueError, match='autoreset_mode="Disabled"'):
+        play(TASKS["lorenz"].make(2), nothing, 3, 0)
+
+
 def test_finding_tasks():
     assert get_task("lorenz", 2.0).measurement_noise == 2.0
     assert get_task("lorenz").measurement_noise == 0.5

@@ -334,6 +334,10 @@ def test_start_box():
     assert np.ptp(starts[:, 0]) > 4
     many = gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"]
     assert (many == starts).all()
+    mine = np.array(box, dtype=float)
+    env = KKLEnv("van_der_pol", start_box=mine)
+    mine[:] = 100.0  # it was copied
+    assert env.reset(seed=0)[0] in env.observation_space
     point = gym.make("KKLVanDerPol-v0", start_box=((1, 1), (2, 2)))
     assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
 

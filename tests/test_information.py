@@ -102,6 +102,21 @@ def test_kalman_filters_follow_a_driven_state():
     assert np.allclose(ours.report(rows)["x_hat"], theirs.decode(rows))
 
 
+def test_rows_that_have_ended_stay_as_they_are():
+    env = make(TASK, "stacked", N, "Disabled")
+    env.reset(seed=0)
+    for action in actions(TASK.steps):
+        obs, _, _, truncated, _ = env.step(action)
+    assert truncated.all()
+    assert (env.step(actions(1)[0])[0] == obs).all()
+    again, _ = env.reset(options={"reset_mask": [True, False, False]})
+    assert (again[1:] == obs[1:]).all()
+    assert (again[0] != obs[0]).any()
+    moved = env.step(actions(1)[0])[0]
+    assert (moved[1:] == obs[1:]).all()
+    assert (moved[0] != again[0]).any()
+
+
 def test_wrong_uses():
     with pytest.raises(ValueError, match="unknown information 'everything'"):
         make(TASK, "everything", N)

@@ -1,5 +1,7 @@
 """Vector environments and wrappers against Gymnasium's own vectors of single environments."""
 
+import copy
+import pickle
 from functools import partial
 
 import gymnasium as gym
@@ -255,6 +257,23 @@ def test_seeds():
     assert (mixed[0] == whole[3]).all()
     assert (mixed[2] == whole[0]).all()
     assert (mixed[[1, 3]] != whole[[1, 3]]).any(1).all()
+    noisy = env.reset(seed=5)[1]["y"]
+    env.step(np.zeros((N, 1)))
+    assert (env.reset(seed=5)[1]["y"] == noisy).all()  # noise begins anew, too
+    after = env.step(np.zeros((N, 1)))[4]["y"]
+    mask = np.array([False, True, False, True])
+    _, info = env.reset(seed=5, options={"reset_mask": mask})
+    assert (info["y"][mask] == noisy[mask]).all()
+    assert (env.step(np.zeros((N, 1)))[4]["y"][mask] == after[mask]).all()
+    assert (env.reset(seed=5)[1]["y"] == noisy).all()
+    env.step(np.zeros((N, 1)))
+    env.reset(seed=[None, 77, None, None], options={"reset_mask": np.array([True, True, False, False])})
+    assert env.unwrapped.np_random_seed == (5, 77, 7, 8)
+    for same in (np.int64(5), np.arange(5, 9), (5, 6, 7, 8), np.array(5)):
+        assert (env.reset(seed=same)[1]["y"] == noisy).all()
+    assert len({id(rng) for rng in env.unwrapped.np_random}) == N
+    with pytest.raises(AttributeError, match="generator of its own"):
+        env.unwrapped.np_random = np.random.default_rng(0)
     alone, _ = gym.make("KKLLorenz-v0").reset(seed=6)
     assert (alone == whole[1]).all()
     assert len(np.unique(vector("lorenz", "NextStep").reset()[0][:, 0])) == N
@@ -271,12 +290,14 @@ def test_starts():
     assert (obs[1] == start).all()
     assert (obs[[0, 2, 3]] == many[[0, 2, 3]]).all()
     assert (info["_x"] == mask).all()
+    obs, _ = env.reset(options={"x0": -many, "reset_mask": [False, False, True, True]})
+    assert (obs == np.concatenate([many[:1], [start], -many[2:]])).all()
 
 
 @pytest.mark.parametrize(("options", "match"), [
     ({"x0": [1.0, 2.0]}, "x0 must be 3 numbers"),
     ({"x0": [[1.0, 2.0, np.nan]] * N}, "x0 must be 3 numbers"),
-    ({"x0": [[1.0, 2.0, 3.0]] * (N + 1)}, "x0 must be 3 numbers"),
+    ({"x0": [[1.0, 2.0, 3.0]] * (N + 1)}, "or that for each of 4 environments"),
     ({"reset_mask": np.zeros(N, bool)}, "reset_mask must be boolean"),
     ({"reset_mask": np.ones(N)}, "reset_mask must be boolean"),
     ({"reset_mask": np.ones(N + 1, bool)}, "reset_mask must be boolean"),
@@ -291,6 +312,17 @@ def test_wrong_reset_options_change_nothing(options, match):
     other = vector("lorenz", "NextStep")
     assert (other.reset(seed=1)[0] == before).all()
     assert (other.step(np.zeros((N, 1)))[0] == after).all()
+
+
+@pytest.mark.parametrize("seed", [[7, -1, 3, 4], [1, 2], -1, 1.5, "seed", [1, 2, 3, 0.5]])
+def test_wrong_seeds_change_nothing(seed):
+    one, two = vector("lorenz", "NextStep"), vector("lorenz", "NextStep")
+    for env in (one, two):
+        env.reset(seed=1)
+    with pytest.raises(ValueError, match="seed"):
+        one.reset(seed=seed)
+    assert one.unwrapped.np_random_seed == two.unwrapped.np_random_seed
+    assert_same(one.step(np.zeros((N, 1)))[4], two.step(np.zeros((N, 1)))[4])
 
 
 @pytest.mark.parametrize("wrong", [np.zeros(N), np.zeros((N + 1, 1)), np.full((N, 1), np.nan), np.zeros((N, 2))])
@@ -326,17 +358,44 @@ def test_reset_is_required():
         env.reset(options={"reset_mask": np.array([True, False])})
 
 
-def test_results_are_copies():
-    env = vector("lorenz", "NextStep")
-    obs, info = env.reset(seed=0)
-    kept = obs.copy(), {key: value.copy() for key, value in info.items()}
-    for _ in range(3):
-        env.step(np.ones((N, 1)))
-    assert (obs == kept[0]).all()
-    assert all((info[key] == value).all() for key, value in kept[1].items())
-    for array in (obs, *info.values()):
-        array[:] = 0
-    assert (env.step(np.ones((N, 1)))[0] != 0).all()
+@modes
+def test_results_are_copies(mode, saved):
+    """Overwriting all that a call returned changes nothing that follows."""
+    one, two = (KKLVectorObservation(vector("van_der_pol", mode, 3), saved()) for _ in range(2))
+
+    def spoil(value):
+        if isinstance(value, dict):
+            for part in value.values():
+                spoil(part)
+        elif value.dtype == object:
+            for part in value:
+                if part is not None:
+                    spoil(part)
+        else:
+            value[:] = 1
+
+    returned = one.reset(seed=0)
+    expected = two.reset(seed=0)
+    for action in actions(8):
+        assert_same(returned[0], expected[0])
+        assert_same(returned[-1], expected[-1])
+        for value in returned:
+            spoil(value)
+        if mode is AutoresetMode.DISABLED and (expected[-1]["sample"] == 3).all():
+            spoil(one.reset(options={"reset_mask": np.ones(N, bool)})[1])
+            two.reset()
+        returned, expected = one.step(action), two.step(action)
+
+
+def test_copies_go_on_identically(saved):
+    env = KKLVectorObservation(vector("lorenz", "SameStep", 7), saved(system="lorenz"))
+    env.reset(seed=0)
+    for action in actions(5):
+        env.step(action)
+    for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        original = copy.deepcopy(env)
+        for action in actions(10, seed=1):
+            assert_same(twin.step(action)[0], original.step(action)[0])
 
 
 def test_the_registered_limit_and_the_default_mode():
@@ -372,7 +431,8 @@ def test_wrong_repeats():
     for repeat in (0, 1.5, True):
         with pytest.raises(ValueError, match="repeat must be"):
             VectorActionRepeat(vector("lorenz", "Disabled"), repeat)
-    for env in (vector("lorenz", "SameStep"), sync("lorenz", "Disabled")):
+    others = RecordEpisodeStatistics(vector("lorenz", "Disabled"))  # its nested infos have no rows
+    for env in (vector("lorenz", "SameStep"), sync("lorenz", "Disabled"), others):
         with pytest.raises(ValueError, match="VectorActionRepeat needs a KKLVectorEnv"):
             VectorActionRepeat(env, 2)
 
@@ -401,6 +461,10 @@ def test_a_blind_map_under_action(saved):
     env.step(np.zeros((N, 1)))
     with pytest.raises(ValueError, match="knows no inputs"):
         env.step(np.ones((N, 1)))
+    with pytest.raises(ValueError, match="reset after an error"):  # it has missed a sample
+        env.step(np.zeros((N, 1)))
+    env.reset(seed=0)
+    env.step(np.zeros((N, 1)))
     env = KKLVectorObservation(vector("van_der_pol", "NextStep"), path, ignore_input=True)
     env.reset(seed=0)
     assert np.isfinite(env.step(np.ones((N, 1)))[0]).all()
@@ -408,3 +472,31 @@ def test_a_blind_map_under_action(saved):
 
 def test_system_instances():
     assert KKLVectorEnv(Lorenz(rho=20.0), 2).plant.system.rho == 20.0
+
+
+def test_masks_as_lists_and_full_masks(saved):
+    env = VectorActionRepeat(KKLVectorObservation(vector("van_der_pol", "Disabled"), saved()), 2)
+    obs, _ = env.reset(seed=0, options={"reset_mask": [True] * N})
+    assert (env.reset(seed=0)[0] == obs).all()
+    env.step(np.zeros((N, 1)))
+    again, _ = env.reset(seed=0, options={"reset_mask": [True, False, False, True]})
+    assert (again[[0, 3]] == obs[[0, 3]]).all()
+    env.step(np.zeros((N, 1)))
+
+
+def test_stepping_past_an_episodes_end_says_so(saved):
+    env = KKLVectorObservation(AsyncVectorEnvLike(vector("van_der_pol", "Disabled", 2)), saved())
+    env.reset(seed=0)
+    env.step(np.zeros((N, 1)))
+    env.step(np.zeros((N, 1)))
+    with pytest.raises(ValueError, match="the episode of environment 0 has ended"):
+        env.step(np.zeros((N, 1)))
+
+
+class AsyncVectorEnvLike(gym.vector.VectorWrapper):
+    """Steps on after the end, as Gymnasium's asynchronous vectors do."""
+
+    def step(self, action):
+        *rest, info = self.env.step(action)
+        info["sample"] = info["sample"] + (info["sample"] == 2) * ~info["_u"]
+        return *rest, info

@@ -213,6 +213,7 @@ def spread(values: np.ndarray) -> str:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the ``kkl-gym`` command."""
+    from training.agents.command import AgentCommand
     from training.benchmark.command import Benchmark
     from training.demo import Demo
     from training.speed import Speed
@@ -221,6 +222,7 @@ def main(arguments: list[str] | None = None) -> None:
         "train": Train,
         "evaluate": Evaluate,
         "benchmark": Benchmark,
+        "agent": AgentCommand,
         "maps": Maps,
         "demo": Demo,
         "speed": Speed,

@@ -1,6 +1,7 @@
 """Gymnasium's vector environments for stable-baselines3, which has vector environments of its own kind."""
 
 from collections.abc import Sequence
+from copy import deepcopy
 from typing import Any
 
 import gymnasium as gym
@@ -41,15 +42,15 @@ class SB3VecEnv(VecEnv):
 
     def reset(self) -> VecEnvObs:
         """Reset all rows, with the seeds and options that were set for the next reset."""
-        options = self._options[0]
-        if any(other != options for other in self._options):
-            raise ValueError("a vector environment takes the same options for all rows: set_options(a dictionary)")
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
-        obs, info = self.env.reset(seed=seeds, options=dict(options) or None)
-        self.reset_infos = [self._row(info, row, self._info_keys) for row in range(self.num_envs)]
+        options = self._options
         self._reset_seeds()
         self._reset_options()
-        return obs  # type: ignore[no-any-return]
+        if any(repr(other) != repr(options[0]) for other in options):
+            raise ValueError("a vector environment takes the same options for all rows: set_options(a dictionary)")
+        obs, info = self.env.reset(seed=seeds, options=dict(options[0]) or None)
+        self.reset_infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
+        return deepcopy(obs)  # type: ignore[no-any-return]
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""
@@ -59,13 +60,12 @@ class SB3VecEnv(VecEnv):
         """Step all rows."""
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
-        infos = [self._row(info, row, self._info_keys) for row in range(self.num_envs)]
+        infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
         for row in np.flatnonzero(done).tolist():
-            final = info.get("final_info", {})
-            infos[row] = self._row(final, row, [key for key in final if not key.startswith("_")])
+            infos[row] = _row(info, row, _keys(info)) | _row(info["final_info"], row, _keys(info["final_info"]))
             infos[row]["terminal_observation"] = info["final_obs"][row]
             infos[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
-        return obs, np.asarray(reward, dtype=np.float32), done, infos
+        return deepcopy(obs), np.asarray(reward, dtype=np.float32), done, infos  # some environments reuse their arrays
 
     def close(self) -> None:
         """Close the environment."""
@@ -77,30 +77,49 @@ class SB3VecEnv(VecEnv):
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each row: its own in Sync and Async vectors, else the vector environment's."""
+        """An attribute of each row: of the vector environment's wrappers, or its own in Sync and Async vectors.
+
+        Raises AttributeError if there is none.
+        """
         rows = list(self._get_indices(indices))
-        base: Any = self.env.unwrapped
-        if hasattr(base, "get_attr"):
-            values = base.get_attr(attr_name)
-            return [values[row] for row in rows]
-        env: Any = self.env
-        while not hasattr(env, attr_name) and hasattr(env, "env"):
-            env = env.env
-        return [getattr(env, attr_name)] * len(rows)
+        owner = self._owner(attr_name)
+        if owner is not None:
+            return [getattr(owner, attr_name)] * len(rows)
+        values = self._rows_of("get_attr", attr_name)(attr_name)
+        return [values[row] for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute of the vector environment; raises ValueError for some rows only."""
+        """Set an attribute where :meth:`get_attr` finds it; raises ValueError for some rows only."""
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("attributes of a vector environment are set for all rows at once")
-        setattr(self.env.unwrapped, attr_name, value)
+        owner = self._owner(attr_name)
+        if owner is not None:
+            setattr(owner, attr_name, value)
+        else:
+            self._rows_of("set_attr", attr_name)(attr_name, [value] * self.num_envs)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
-        """Call a method of each row, in Sync and Async vectors; raises AttributeError in others, which have no rows."""
-        base: Any = self.env.unwrapped
-        if not hasattr(base, "call"):
-            raise AttributeError(f"the rows of {base} are no environments with a method {method_name!r}")
-        results = base.call(method_name, *args, **options)
-        return [results[row] for row in self._get_indices(indices)]
+        """Call a method of each row in Sync and Async vectors.
+
+        Raises AttributeError for other vectors, whose rows are no environments, ValueError for some rows only.
+        """
+        if len(list(self._get_indices(indices))) != self.num_envs:
+            raise ValueError("methods of a vector environment's rows are called in all rows at once")
+        return list(self._rows_of("call", method_name)(method_name, *args, **options))
+
+    def _owner(self, name: str) -> Any:
+        """The wrapper that has set an attribute, else the vector environment; None if its rows are to be asked."""
+        env: Any = self.env
+        while hasattr(env, "env"):
+            if name in vars(env):
+                return env
+            env = env.env
+        return None if hasattr(env, "get_attr") else env
+
+    def _rows_of(self, how: str, name: str) -> Any:
+        if not hasattr(self.env.unwrapped, how):
+            raise AttributeError(f"{self.env} has no {name!r}, and its rows are no environments of their own")
+        return getattr(self.env.unwrapped, how)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
         """Whether a wrapper of this class is around the vector environment."""
@@ -109,10 +128,19 @@ class SB3VecEnv(VecEnv):
             env = env.env
         return [found for _ in self._get_indices(indices)]
 
-    @staticmethod
-    def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
-        """What ``info`` reports of a row; environments need not say for which rows they report a key."""
-        return {key: info[key][row] for key in keys if key in info and (f"_{key}" not in info or info[f"_{key}"][row])}
+
+def _row(info: dict[str, Any], row: int, keys: Sequence[str]) -> dict[str, Any]:
+    """What ``info`` reports of a row; environments need not say for which rows they report a key."""
+    out = {}
+    for key in keys:
+        if key in info and (f"_{key}" not in info or info[f"_{key}"][row]):
+            value = info[key]
+            out[key] = _row(value, row, _keys(value)) if isinstance(value, dict) else value[row]
+    return out
+
+
+def _keys(info: dict[str, Any]) -> list[str]:
+    return [key for key in info if not key.startswith("_") and key not in ("final_obs", "final_info")]
 
 
 __all__ = ["SB3VecEnv"]

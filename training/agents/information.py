@@ -11,6 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
+from kkl_gym.vector import with_mask
 from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, plant_of
 from observers import KKLObserver, load
 from training.agents.tasks import ControlTask, deviation
@@ -52,15 +53,17 @@ class Features(VectorWrapper):
         self.single_observation_space = gym.spaces.Box(-np.inf, np.inf, (width,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
         self._history = np.empty((env.num_envs, stacked, 0))
+        self._still = np.zeros(env.num_envs, dtype=bool)  # rows whose episodes have ended, where nobody resets them
 
     def reset(  # type: ignore[override]
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset the environments and what is remembered of them."""
-        mask = (options or {}).get("reset_mask")
+        options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         first = self._first(info[self._key])
-        self._history = first if mask is None else np.where(mask[:, None, None], first, self._history)
+        self._history = first if mask.all() else np.where(mask[:, None, None], first, self._history)
+        self._still = self._still & ~mask
         return self._shown(), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
@@ -73,12 +76,15 @@ class Features(VectorWrapper):
             values[ended] = info["final_info"][self._key][ended]
         taken = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)[:, : self._taken]
         latest = np.concatenate([self._feature(values), taken], axis=1)
-        self._history = np.concatenate([self._history[:, 1:], latest[:, None]], axis=1)
+        history = np.concatenate([self._history[:, 1:], latest[:, None]], axis=1)
+        self._history = np.where(self._still[:, None, None], self._history, history)
         if ended.any():
             last = self._shown()
             for row in np.flatnonzero(ended):
                 info["final_obs"][row] = last[row].copy()
             self._history[ended] = self._first(info[self._key][ended])
+        else:
+            self._still = terminated | truncated
         return self._shown(), reward, terminated, truncated, info
 
     def _first(self, values: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 from kkl_gym.vector_wrappers import VectorEnv
 
@@ -15,13 +16,13 @@ class Episodes:
     """Episodes side by side, at the instants at which the agent acts.
 
     x : true states, (steps + 1, n, nx); after an escape the last one inside.
-    shown : what the agent saw, (steps + 1, n, ...).
+    x_hat : estimates, (steps + 1, n, nx), where an observer makes them.
     u : inputs, (steps, n, nu).
     escaped : boolean, (n,).
     """
 
     x: np.ndarray
-    shown: np.ndarray
+    x_hat: np.ndarray | None
     u: np.ndarray
     escaped: np.ndarray
 
@@ -31,14 +32,20 @@ def play(env: VectorEnv, policy: Policy, steps: int, seed: int) -> Episodes:
 
     policy : observations (n, ...) in, actions (n, nu) out; rows that have ended are played on in place.
     seed : row i starts from seed + i.
+
+    Raises ValueError if the environment resets by itself.
     """
+    if env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED:
+        raise ValueError(
+            'play needs an environment made with autoreset_mode="Disabled", or episodes would run together'
+        )
     obs, info = env.reset(seed=seed)
-    x, shown, u = [info["x"]], [obs], []
+    x, x_hat, u = [info["x"]], [info.get("x_hat")], []
     escaped = np.zeros(env.num_envs, dtype=bool)
     for _ in range(steps):
         obs, _, terminated, _, info = env.step(policy(obs))
         escaped |= terminated
         x.append(info["x"])
-        shown.append(obs)
+        x_hat.append(info.get("x_hat"))
         u.append(info["u"])
-    return Episodes(np.array(x), np.array(shown), np.array(u), escaped)
+    return Episodes(np.array(x), None if x_hat[0] is None else np.array(x_hat), np.array(u), escaped)

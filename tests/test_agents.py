@@ -1,0 +1,164 @@
+"""Training, saving and playing agents, at toy size."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from stable_baselines3 import PPO, SAC
+
+from kkl_gym import get_system
+from training.agents.command import find
+from training.agents.learn import hyperparameters, learn
+from training.agents.play import play
+from training.agents.policy import Agent, AgentError, fingerprint
+from training.agents.tasks import TASKS, ControlTask, scores
+from training.cli import main
+
+TASK = ControlTask("van_der_pol", measurement_noise=0.2, duration=0.5)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("agent")
+    return learn(TASK, "x_hat", folder, timesteps=1, seed=1), folder
+
+
+@pytest.mark.parametrize(("algorithm", "kind"), [("ppo", PPO), ("sac", SAC)])
+def test_the_policy_is_that_of_stable_baselines3(algorithm, kind, tmp_path, monkeypatch):
+    models = []
+    original = kind.learn
+
+    def keep(self, timesteps, **options):
+        models.append(self)
+        return original(self, timesteps, **options)
+
+    monkeypatch.setattr(kind, "learn", keep)
+    task = TASKS["van_der_pol" if algorithm == "ppo" else "reverse_duffing"]
+    agent = learn(task, "state", tmp_path, timesteps=1, algorithm=algorithm)
+    obs = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    expected, _ = models[0].predict(obs, deterministic=True)
+    assert np.allclose(agent(obs), expected, atol=1e-5)
+    assert np.abs(agent(100 * obs)).max() <= 1.0
+    assert (tmp_path / "progress.csv").read_text().count("\n") >= 1 or algorithm == "sac"
+
+
+def test_equal_seeds_give_equal_agents(learned, tmp_path):
+    agent, _ = learned
+    again = learn(TASK, "x_hat", tmp_path / "a", timesteps=1, seed=1)
+    other = learn(TASK, "x_hat", tmp_path / "b", timesteps=1, seed=2)
+    obs = np.ones((1, 2), np.float32)
+    assert np.array_equal(again(obs), agent(obs))
+    assert not np.array_equal(other(obs), agent(obs))
+
+
+def test_a_saved_agent_plays_the_same(learned):
+    agent, folder = learned
+    read = Agent.read(folder / "agent.safetensors")
+    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v1")
+    assert read.fingerprint == fingerprint("van_der_pol")
+    assert read.training == {"algorithm": "ppo", "seed": 1, "timesteps": 1}
+    episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
+    assert np.array_equal(episodes[0].x, episodes[1].x)
+    assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)
+
+
+def test_a_task_with_starts_of_its_own_survives_saving(learned, tmp_path):
+    agent, _ = learned
+    whole = Agent(agent.network, False, TASKS["van_der_pol"], "state")
+    whole.save(tmp_path / "a.safetensors")
+    assert Agent.read(tmp_path / "a.safetensors").task == TASKS["van_der_pol"]
+
+
+def test_mismatches_are_errors(learned, saved, tmp_path):
+    agent, _ = learned
+    path = tmp_path / "map.safetensors"
+    shutil.copy(saved(system="van_der_pol"), path)
+    own = Agent(agent.network, False, TASK, "x_hat", str(path), fingerprint(str(path)))
+    assert own.make(1)
+    shutil.copy(saved(system="van_der_pol", noise=False), path)
+    with pytest.raises(AgentError, match="another version of the observer"):
+        own.make(1)
+    with pytest.raises(AgentError, match="2 inputs and 1 outputs"):
+        Agent(agent.network, False, TASKS["lorenz"], "state").make(1)
+
+
+def test_damaged_and_foreign_files(learned, saved, tmp_path):
+    _, folder = learned
+    content = (folder / "agent.safetensors").read_bytes()
+    cases = {
+        "truncated": (content[:-7], "damaged"),
+        "empty": (b"", "damaged"),
+        "newer": (content.replace(b'\\"format\\": 1', b'\\"format\\": 9'), "another format"),
+        "incomplete": (content.replace(b'\\"squashed\\"', b'\\"squished\\"'), "incomplete"),
+    }
+    for name, (changed, match) in cases.items():
+        assert changed != content
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(changed)
+        with pytest.raises(AgentError, match=match):
+            Agent.read(path)
+    with pytest.raises(AgentError, match="is no agent"):
+        Agent.read(saved())
+    with pytest.raises(AgentError, match="there is no file"):
+        Agent.read(tmp_path / "none.safetensors")
+    with pytest.raises(AgentError, match="no agent 'nothing' ships"):
+        find("nothing")
+
+
+def test_hyperparameters():
+    assert hyperparameters(TASKS["reverse_duffing"])[0] == "sac"
+    assert hyperparameters(TASKS["lorenz"])[0] == "ppo"
+    assert hyperparameters(TASKS["reverse_duffing"], "ppo")[0] == "ppo"
+    with pytest.raises(ValueError, match=r"sac\.yml has no settings for KKLLorenz-v0"):
+        hyperparameters(TASKS["lorenz"], "sac")
+    with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
+        hyperparameters(TASKS["lorenz"], "dqn")
+
+
+def test_own_systems_get_the_defaults(script):
+    assert hyperparameters(ControlTask(f"{script}:Pendulum"))[0] == "ppo"
+
+
+@pytest.mark.slow
+def test_an_agent_learns():
+    """Half a minute of PPO on the full state of Van der Pol."""
+    import tempfile
+    from pathlib import Path
+
+    torch.set_num_threads(2)
+    task = TASKS["van_der_pol"]
+    with tempfile.TemporaryDirectory() as folder:
+        agent = learn(task, "state", Path(folder), timesteps=200_000)
+    x = play(agent.make(50), agent, task.steps, 0).x
+    assert scores(get_system(task.system), x).mean() > -0.25
+
+
+def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
+    folder = tmp_path / "agents" / "lorenz-y-0"
+    assert Agent.read(folder / "agent.safetensors").information == "y"
+    with pytest.raises(SystemExit, match="holds an agent already"):
+        main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
+    main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "3", "--out", "pictures"])
+    assert "score" in capsys.readouterr().out
+    with Image.open(tmp_path / "pictures" / "lorenz-y.gif") as animation:
+        assert animation.n_frames > 20
+    with Image.open(tmp_path / "pictures" / "lorenz-y.png") as figure:
+        assert figure.size[0] > 200
+    with pytest.raises(SystemExit, match="episodes must be positive"):
+        main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "0"])
+    with pytest.raises(SystemExit, match="no control task"):
+        main(["agent", "train", "pendulum"])
+
+
+def test_metadata_is_json(learned):
+    from safetensors import safe_open
+
+    _, folder = learned
+    with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
+        described = json.loads(opened.metadata()["kkl-gym-agent"])
+    assert described["task"]["system"] == "van_der_pol"

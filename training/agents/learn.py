@@ -1,0 +1,149 @@
+"""Train an agent with stable-baselines3 on a control task."""
+
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from gymnasium.wrappers.vector import TransformReward
+from rich.progress import Progress
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecMonitor
+from torch import nn
+
+from kkl_gym import ENV_IDS, get_system
+from observers import MLP
+from training.agents.bridge import SB3VecEnv
+from training.agents.information import Information, make
+from training.agents.policy import Agent, fingerprint, versioned
+from training.agents.tasks import ControlTask
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC}
+TRAINING_SEED = 10_000  # of the first row's first episode, times one more than the agent's seed
+
+
+def learn(
+    task: ControlTask,
+    information: Information,
+    folder: Path,
+    seed: int = 0,
+    timesteps: int | None = None,
+    observer: str | None = None,
+    algorithm: str | None = None,
+    progress: Progress | None = None,
+) -> Agent:
+    """Train one agent; the learning curve is written to FOLDER/progress.csv.
+
+    Parameters
+    ----------
+    task, information, observer : as for :func:`training.agents.information.make`.
+    seed : of networks, exploration and episodes.
+    timesteps : actions in all rows together; None takes what hyperparameters/ALGORITHM.yml says.
+    algorithm : "ppo" or "sac"; None takes the one that the task has hyperparameters for.
+    progress : where to show a bar.
+
+    Raises ValueError on an unknown algorithm.
+    """
+    name, settings = hyperparameters(task, algorithm)
+    n_envs, planned = settings.pop("n_envs"), settings.pop("n_timesteps")
+    timesteps = planned if timesteps is None else timesteps
+    named = versioned(observer or get_system(task.system).name) if information in ("x_hat", "z") else None
+    env = TransformReward(make(task, information, n_envs, observer=named), _cost(task.repeat))
+    vec_env = VecMonitor(SB3VecEnv(env))
+    vec_env.seed(TRAINING_SEED * (seed + 1))
+    rate = settings.pop("learning_rate")
+    if isinstance(rate, str):
+        rate = _linear(float(rate.removeprefix("lin_")))
+    settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
+    model = ALGORITHMS[name](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
+    model.set_logger(configure(str(folder), ["csv"]))
+    model.learn(timesteps, callback=_Bar(progress, f"{task.system} {information} {seed}", timesteps))
+    model.logger.close()
+    vec_env.close()
+    agent = Agent(
+        network=_policy(model),
+        squashed=name == "sac",
+        task=task,
+        information=information,
+        observer=named,
+        fingerprint=None if named is None else fingerprint(named),
+        training={"algorithm": name, "seed": seed, "timesteps": timesteps},
+    )
+    agent.save(folder / "agent.safetensors")
+    return agent
+
+
+def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[str, dict[str, Any]]:
+    """The algorithm and its settings for a task; a system of the user's gets the defaults.
+
+    Raises ValueError if the algorithm is unknown or has no settings for the task.
+    """
+    env_id = ENV_IDS.get(get_system(task.system).name)
+    for name in ALGORITHMS if algorithm is None else [algorithm]:
+        if name not in ALGORITHMS:
+            raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
+        known = _read(name)
+        for key in (env_id, "default"):
+            if key in known and (key != "default" or algorithm is not None or env_id is None):
+                return name, dict(known[key])
+    raise ValueError(f"hyperparameters/{algorithm}.yml has no settings for {env_id or task.system}")
+
+
+@cache
+def _read(name: str) -> dict[str, Any]:
+    text = files("training.agents").joinpath("hyperparameters", f"{name}.yml").read_text()
+    return dict(yaml.safe_load(text))
+
+
+def _cost(repeat: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Minus the cost c from the environment's reward 1/(1 + 4c), summed over ``repeat`` samples.
+
+    The environment's reward is flat far from the target, where c still tells an agent which way to go.
+    """
+
+    def reward(total: np.ndarray) -> np.ndarray:
+        minus_cost: np.ndarray = (1.0 - repeat / np.maximum(total, 1e-6)) / 4.0
+        return minus_cost
+
+    return reward
+
+
+def _linear(start: float) -> Callable[[float], float]:
+    return lambda remaining: start * remaining
+
+
+def _policy(model: BaseAlgorithm) -> MLP:
+    """The deterministic policy's layers."""
+    if isinstance(model, SAC):
+        body: Any = [*model.actor.latent_pi, model.actor.mu]
+    else:
+        policy: Any = model.policy
+        body = [*policy.mlp_extractor.policy_net, policy.action_net]
+    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
+    with torch.no_grad():
+        return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], "tanh")
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()
+
+
+class _Bar(BaseCallback):
+    """Progress by actions."""
+
+    def __init__(self, progress: Progress | None, name: str, total: int) -> None:
+        super().__init__()
+        self._progress = progress
+        self._bar = None if progress is None else progress.add_task(name, total=total)
+
+    def _on_step(self) -> bool:
+        if self._progress is not None and self._bar is not None:
+            self._progress.update(self._bar, completed=self.num_timesteps)
+        return True

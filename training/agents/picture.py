@@ -1,0 +1,58 @@
+"""Pictures of closed-loop episodes."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from kkl_gym import get_system
+from kkl_gym.rendering import Canvas
+from training.agents.play import Episodes
+from training.agents.tasks import ControlTask
+
+SHOWN = 5  # episodes in a figure
+FRAMES = 150  # of an animation, at most
+SECONDS = 10.0  # that it lasts
+TRUTH, ESTIMATE, TARGET = "k", "C6", "C2"
+
+
+def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
+    """States, estimates, target and input over time."""
+    system = get_system(task.system)
+    shown = min(SHOWN, episodes.x.shape[1])
+    figure = Figure(figsize=(2.6 * shown, 1.6 * (system.nx + system.nu)), layout="constrained")
+    axes = figure.subplots(system.nx + system.nu, shown, sharex=True, sharey="row", squeeze=False)
+    t = np.arange(len(episodes.x)) * task.period
+    for column in range(shown):
+        for i in range(system.nx):
+            ax = axes[i, column]
+            ax.axhline(system.target[i], color=TARGET, lw=1.0, label="target")
+            if episodes.x_hat is not None:
+                ax.plot(t, episodes.x_hat[:, column, i], color=ESTIMATE, lw=0.8, label="estimate")
+            ax.plot(t, episodes.x[:, column, i], color=TRUTH, lw=1.0, label="state")
+        for j in range(system.nu):
+            ax = axes[system.nx + j, column]
+            ax.step(t[:-1], episodes.u[:, column, j], where="post", color="C0", lw=0.8)
+            ax.set_ylim(-1.1 * system.u_max[j], 1.1 * system.u_max[j])
+        axes[-1, column].set_xlabel("t in s")
+    for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
+        axes[i, 0].set_ylabel(name)
+    axes[0, 0].legend(loc="upper right", fontsize="x-small")
+    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {task.measurement_noise:g}")
+    figure.savefig(path, dpi=110)
+
+
+def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
+    """The phase portrait of the first episode as a GIF."""
+    system = get_system(task.system)
+    x = episodes.x[:, 0]
+    x_hat = None if episodes.x_hat is None else episodes.x_hat[:, 0]
+    canvas = Canvas(system, x_hat is not None)
+    every = max(1, round(len(x) / FRAMES))
+    frames = [
+        Image.fromarray(canvas.draw(x[:k], () if x_hat is None else x_hat[:k], episodes.u[k - 1, 0])).quantize(32)
+        for k in range(1, len(x), every)
+    ]
+    duration = round(1000 * SECONDS / len(frames))
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
