@@ -33,6 +33,6 @@ def test_own_system_from_the_command_line(tmp_path, capsys):
 
 
 def test_sb3_agent():
-    reward = example("sb3_agent")(steps=1024)
-    assert example("sb3_agent")(steps=1024) == reward  # everything random is seeded
-    assert example("sb3_agent")(steps=1024, seed=1) != reward
+    reward = example("sb3_agent")(num_envs=2, steps=256)
+    assert example("sb3_agent")(num_envs=2, steps=256) == reward  # everything random is seeded
+    assert example("sb3_agent")(num_envs=2, steps=256, seed=1) != reward
