@@ -30,7 +30,7 @@ def main(env_id: str = "KKLVanDerPol-v0", steps: int = 20_480, num_envs: int = 1
     """
     envs = VecNormalize(VecMonitor(make_envs(env_id, num_envs)), norm_reward=False)
     envs.seed(seed)
-    agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=512, gamma=0.99, seed=seed, device="cpu")
+    agent = PPO("MlpPolicy", envs, n_steps=128, batch_size=256, gamma=0.99, seed=seed, device="cpu")
     agent.learn(steps)
     envs.training = False  # the scaling stays as it was learned
     envs.seed(seed + 1000)  # episodes that training has not seen
