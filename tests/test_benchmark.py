@@ -16,13 +16,14 @@ from rich.console import Console
 import training.benchmark.command as command
 from kkl_gym import get_system
 from training.benchmark.command import Benchmark
-from training.benchmark.jobs import Job, run_all
+from training.benchmark.jobs import Job, run_job
 from training.benchmark.protocol import Protocol, measure, noisy_output, run, step_time, validate
 from training.benchmark.tables import _number, summarise
 from training.data import output
 from training.evaluate import EVALUATION_SEED, VALIDATION_SEED, starts, unseen_runs
 from training.methods import METHODS, Budget, Method, get_method
 from training.metrics import component_smape, rmse, settling_time, smape
+from training.parallel import run_all
 
 TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
@@ -316,7 +317,7 @@ def test_a_job_that_another_process_works_on_is_left_alone(toy, tmp_path):
     job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, None, SHORT)
     job.folder.mkdir()
     with FileLock(job.folder / ".lock"):
-        ((_, failure, _),) = run_all([job], 1)
+        ((_, failure, _),) = run_all(run_job, [job], 1)
     assert "another process is at work" in str(failure)
     assert not trainings.exists()
 
@@ -326,7 +327,7 @@ def test_a_training_that_blows_up_leaves_no_checkpoint(toy, tmp_path):
     script = Path(name.rpartition(":")[0])
     script.write_text(script.read_text() + EXPLOSIVE)
     job = Job("lorenz", f"{script}:Explosive", tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    ((_, failure, _),) = run_all([job], 1)
+    ((_, failure, _),) = run_all(run_job, [job], 1)
     assert isinstance(failure, FloatingPointError)
     assert not any(path.is_dir() for path in job.folder.iterdir())
 
@@ -336,7 +337,7 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, 1.0, SHORT)
     job.claim()
     (job.folder / "configuration-0.json").write_text('{"configuration": {"shift": 1.0}, "score": 1e-9}')
-    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
+    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0"]
 
 
@@ -405,7 +406,7 @@ def test_worker_processes_do_what_one_process_does(toy, tmp_path):
         for workers in (1, 2)
     }
     for workers, mine in jobs.items():
-        assert [failure for _, failure, _ in run_all(mine, workers)] == [None, None]
+        assert [failure for _, failure, _ in run_all(run_job, mine, workers)] == [None, None]
     for alone, together in zip(*jobs.values(), strict=True):
         assert (alone.folder / "errors.csv").read_bytes() == (together.folder / "errors.csv").read_bytes()
 

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from kkl_gym.systems import SYSTEMS, get_system
-from training.benchmark.jobs import Job, run_all
+from training.benchmark.jobs import Job, run_job
 from training.benchmark.protocol import Protocol, step_time
 from training.benchmark.tables import draw, write_table
 from training.files import write
 from training.methods import METHODS, Budget, get_method
+from training.parallel import run_all
 
 BUDGETS = {
     "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, seconds=300.0),
@@ -76,7 +77,7 @@ class Benchmark:
         failures = []
         with _progress(console) as progress:
             task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
-            for job, failure, running in run_all(todo, min(self.jobs, max(1, len(todo)))):
+            for job, failure, running in run_all(run_job, todo, min(self.jobs, max(1, len(todo)))):
                 if failure:
                     failures.append(f"{job.name}: {failure}")
                     progress.console.print(f"[red]failed[/red] {failures[-1]} ({job.folder / 'failure.txt'})")

@@ -3,14 +3,8 @@
 import hashlib
 import inspect
 import json
-import multiprocessing
-import os
 import shutil
-import threading
-import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -172,42 +166,3 @@ def _train(job: Job, method: Method[Any], configuration: Configuration, budget: 
         method.save(trained, path)
         shutil.rmtree(folder)
     return method.load(path), float(timing.read_text())
-
-
-def run_all(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Exception | None, list[str]]]:
-    """Run jobs in worker processes; yields each with its failure, if any, and the names of those that run next."""
-    if workers == 1:
-        for job in jobs:
-            yield job, _failure(lambda job=job: run_job(job)), []  # type: ignore[misc]
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with, initargs=(os.getpid(),)) as pool:
-        futures: dict[Future[None], Job] = {pool.submit(run_job, job): job for job in jobs}
-        try:
-            while futures:
-                finished, _ = wait(futures, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    job = futures.pop(future)
-                    yield job, _failure(future.result), [job.name for job in list(futures.values())[:workers]]
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-
-
-def _end_with(parent: int) -> None:
-    """End this process when its parent is gone, even if that was killed."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _failure(call: Callable[[], None]) -> Exception | None:
-    try:
-        call()
-    except Exception as error:  # whatever a method does wrong, the others go on
-        return error
-    return None
