@@ -11,7 +11,7 @@ from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
 from training.agents.command import find
-from training.agents.learn import hyperparameters, learn
+from training.agents.learn import hyperparameters, learn, learn_recurrent
 from training.agents.play import play
 from training.agents.policy import Agent, AgentError, fingerprint
 from training.agents.tasks import TASKS, ControlTask, scores
@@ -116,10 +116,25 @@ def test_hyperparameters():
         hyperparameters(TASKS["lorenz"], "sac")
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
         hyperparameters(TASKS["lorenz"], "dqn")
+    with pytest.raises(ValueError, match="algorithm must be one of ppo, sac"):
+        learn(TASKS["lorenz"], "y", None, algorithm="ppo_lstm")
+    with pytest.raises(ValueError, match="timesteps must be positive"):
+        learn(TASKS["lorenz"], "y", None, timesteps=0)
 
 
 def test_own_systems_get_the_defaults(script):
     assert hyperparameters(ControlTask(f"{script}:Pendulum"))[0] == "ppo"
+
+
+def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
+    policy = learn_recurrent(TASK, "y", tmp_path, timesteps=1)
+    obs = np.ones((3, 2), np.float32)  # y and the action before
+    first = policy()
+    one, two = first(obs), first(obs)
+    assert one.shape == (3, 1)
+    assert not np.allclose(one, two)
+    again = policy()
+    assert np.array_equal(again(obs), one)
 
 
 @pytest.mark.slow

@@ -12,12 +12,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from kkl_gym import get_system
+from training.agents.compare import EVALUATION_SEED, Compare
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.policy import Agent, AgentError
 from training.agents.tasks import get_task, scores, successes
-
-EVALUATION_SEED = 0  # the first of a hundred or so; training begins at 10,000
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,9 @@ class AgentCommand:
     """Agents that act on what an observer shows."""
 
     command: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Train, tyro.conf.subcommand("train")] | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        Annotated[Train, tyro.conf.subcommand("train")]
+        | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
     ]
 
     def run(self, console: Console) -> None:

@@ -124,12 +124,15 @@ def make(
     num_envs: int,
     autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     observer: str | None = None,
+    with_action: bool = False,
 ) -> Features:
     """A task in which the agent knows what ``information`` says, in units of about one.
 
     "state": the true state. "x_hat" and "z": of the learned observer, z as its network sees it. "ekf": the estimate of
     an extended Kalman filter with the exact model. "y": the latest noisy output. "stacked": the last ``STACKED`` of
     them, each with the action before it. States and outputs are taken from the target, over their scale.
+
+    with_action : whether "state" and "y" come with the action before them.
 
     Raises ValueError on an unknown name.
     """
@@ -138,11 +141,12 @@ def make(
     system = get_system(task.system)
     scaled = partial(deviation, system)
     if information == "state":
-        return Features(task.make(num_envs, None, autoreset_mode), "x", scaled, system.nx)
+        env = task.make(num_envs, None, autoreset_mode)
+        return Features(env, "x", scaled, system.nx, with_action=with_action)
     if information in ("y", "stacked"):
         stacked = STACKED if information == "stacked" else 1
         env = task.make(num_envs, None, autoreset_mode)
-        return Features(env, "y", output_deviation(system), system.ny, stacked, with_action=stacked > 1)
+        return Features(env, "y", output_deviation(system), system.ny, stacked, with_action or stacked > 1)
     if information == "ekf":
         env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
         return Features(env, "x_hat", scaled, system.nx)

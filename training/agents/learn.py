@@ -4,13 +4,14 @@ from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import yaml
 from gymnasium.wrappers.vector import TransformReward
 from rich.progress import Progress
+from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
@@ -21,11 +22,13 @@ from torch import nn
 from kkl_gym import ENV_IDS, get_system
 from observers import MLP
 from training.agents.bridge import SB3VecEnv
-from training.agents.information import Information, make
+from training.agents.information import Features, Information, make
+from training.agents.play import Policy
 from training.agents.policy import Agent, fingerprint, versioned
 from training.agents.tasks import ControlTask
 
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
+FEEDFORWARD = ("ppo", "sac")  # whose policies are perceptrons, which ship
 TRAINING_SEED = 10_000  # of the first row's first episode, times one more than the agent's seed
 
 
@@ -51,22 +54,13 @@ def learn(
 
     Raises ValueError on an unknown algorithm.
     """
+    if algorithm is not None and algorithm not in FEEDFORWARD:
+        raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
     name, settings = hyperparameters(task, algorithm)
-    n_envs, planned = settings.pop("n_envs"), settings.pop("n_timesteps")
-    timesteps = planned if timesteps is None else timesteps
     named = versioned(observer or get_system(task.system).name) if information in ("x_hat", "z") else None
-    env = TransformReward(make(task, information, n_envs, observer=named), _cost(task.repeat))
-    vec_env = VecMonitor(SB3VecEnv(env))
-    vec_env.seed(TRAINING_SEED * (seed + 1))
-    rate = settings.pop("learning_rate")
-    if isinstance(rate, str):
-        rate = _linear(float(rate.removeprefix("lin_")))
-    settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
-    model = ALGORITHMS[name](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
-    model.set_logger(configure(str(folder), ["csv"]))
-    model.learn(timesteps, callback=_Bar(progress, f"{task.system} {information} {seed}", timesteps))
-    model.logger.close()
-    vec_env.close()
+    env = make(task, information, settings.pop("n_envs"), observer=named)
+    timesteps = settings["n_timesteps"] if timesteps is None else timesteps
+    model = _fit(name, settings, env, task.repeat, timesteps, seed, folder, progress, f"{task.system} {information}")
     agent = Agent(
         network=_policy(model),
         squashed=name == "sac",
@@ -80,13 +74,77 @@ def learn(
     return agent
 
 
+def learn_recurrent(
+    task: ControlTask,
+    of: Literal["y", "state"],
+    folder: Path,
+    seed: int = 0,
+    timesteps: int | None = None,
+    progress: Progress | None = None,
+) -> Callable[[], Policy]:
+    """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before.
+
+    The parameters are those of :func:`learn`. Returns what makes a policy, with a memory of its own, for one play.
+    """
+    name, settings = hyperparameters(task, "ppo_lstm")
+    env = make(task, of, settings.pop("n_envs"), with_action=True)
+    timesteps = settings["n_timesteps"] if timesteps is None else timesteps
+    model = _fit(name, settings, env, task.repeat, timesteps, seed, folder, progress, f"{task.system} recurrent {of}")
+
+    def policy() -> Policy:
+        memory: dict[str, Any] = {"state": None, "episode_start": None}
+
+        def act(obs: np.ndarray) -> np.ndarray:
+            if memory["episode_start"] is None:
+                memory["episode_start"] = np.ones(len(obs), dtype=bool)
+            action, memory["state"] = model.predict(obs, deterministic=True, **memory)
+            memory["episode_start"] = np.zeros(len(obs), dtype=bool)
+            bounded: np.ndarray = np.clip(action, -1.0, 1.0)
+            return bounded
+
+        return act
+
+    return policy
+
+
+def _fit(
+    algorithm: str,
+    settings: dict[str, Any],
+    env: Features,
+    repeat: int,
+    timesteps: int,
+    seed: int,
+    folder: Path,
+    progress: Progress | None,
+    description: str,
+) -> BaseAlgorithm:
+    """Train on minus the cost, with the learning curve in FOLDER/progress.csv."""
+    if timesteps < 1:
+        raise ValueError(f"timesteps must be positive, got {timesteps}")
+    settings = {key: value for key, value in settings.items() if key != "n_timesteps"}
+    vec_env = VecMonitor(SB3VecEnv(TransformReward(env, _cost(repeat))))
+    vec_env.seed(TRAINING_SEED * (seed + 1))
+    rate = settings.pop("learning_rate")
+    if isinstance(rate, str):
+        rate = _linear(float(rate.removeprefix("lin_")))
+    settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
+    model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
+    model.set_logger(configure(str(folder), ["csv"]))
+    try:
+        model.learn(timesteps, callback=_Bar(progress, f"{description} {seed}", timesteps))
+    finally:
+        model.logger.close()
+        vec_env.close()
+    return model
+
+
 def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[str, dict[str, Any]]:
     """The algorithm and its settings for a task; a system of the user's gets the defaults.
 
     Raises ValueError if the algorithm is unknown or has no settings for the task.
     """
     env_id = ENV_IDS.get(get_system(task.system).name)
-    for name in ALGORITHMS if algorithm is None else [algorithm]:
+    for name in FEEDFORWARD if algorithm is None else [algorithm]:
         if name not in ALGORITHMS:
             raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
         known = _read(name)
@@ -116,7 +174,7 @@ def _cost(repeat: int) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def _linear(start: float) -> Callable[[float], float]:
-    return lambda remaining: start * remaining
+    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
 
 
 def _policy(model: BaseAlgorithm) -> MLP:
