@@ -31,7 +31,7 @@ BUDGETS = {
 PROTOCOL = Protocol()
 QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
 VALIDATION = Protocol(trajectories=20, duration=20.0)
-SEARCH = 0.1  # of the budget's seconds, for each configuration that is compared
+SEARCH = 0.2  # of the budget's seconds, for each configuration that is compared
 
 
 @dataclass(frozen=True)
