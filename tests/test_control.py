@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kkl_gym import SYSTEMS, get_system
-from training.agents.controllers import controller, linear_quadratic
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
+from training.controllers import controller, linear_quadratic
 from training.derivatives import linearised
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)

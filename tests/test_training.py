@@ -16,10 +16,10 @@ from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from observers import Artifact, KKLObserver, LinearFilter
 from training import errors, preset, smape, train, unseen_runs
 from training.config import Config, override, spectrum
-from training.data import output, record, recording_ages, run_filter
+from training.data import output, record, record_closed_loop, recording_ages, run_filter
 from training.evaluate import starts
 from training.forward import ForwardProblem, on_tensors, truncation_time
-from training.inverse import AGE_UNIT, NOISE_UNIT, TrajectorySampler, coordinates
+from training.inverse import AGE_UNIT, NOISE_UNIT, ClosedLoopSampler, TrajectorySampler, coordinates
 from training.networks import Network
 from training.noise import noise_covariance, root, stationary_covariance
 from training.pipeline import output_matrix
@@ -204,6 +204,76 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
+
+
+# Closed loop
+
+
+@pytest.fixture(scope="module")
+def closed_loop(sampler):
+    open_loop, _, linear = sampler
+    network = Network(len(open_loop.coordinates.noise_gain) + 2, 2, 8, 1, "tanh")
+    artifact = Artifact(linear, open_loop.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
+    seen = []
+
+    def act(x_hat):
+        seen.append(x_hat)
+        return np.tanh(x_hat[:, :1])
+
+    ages = recording_ages(0, 200, 30)
+    data = record_closed_loop(VanDerPol(), artifact, act, 60, 200, ages, np.random.default_rng(1))
+    return ClosedLoopSampler(open_loop, data, linear.dt, CPU), data, artifact, seen
+
+
+def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(closed_loop):
+    _, data, artifact, seen = closed_loop
+    assert data.x.shape == (len(data.ages), len(data.level), 2)
+    assert data.z.shape == (len(data.ages), len(data.level), artifact.filter.size)
+    assert 50 <= len(data.level) <= 60
+    assert len(np.unique(data.level)) >= 5
+    assert ((data.level >= 0) & (data.level <= 1.0)).all()
+    start = KKLObserver(artifact, 0.0).reset(data.x[0, data.level == 0, :1])
+    assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen) or not len(start)
+    states = {tuple(row) for row in data.x.reshape(-1, 2).round(6).tolist()}
+    assert not any(tuple(row) in states for x_hat in seen for row in x_hat.round(6).tolist())
+
+
+def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop):
+    sampler, data, artifact, _ = closed_loop
+    inputs, x, weight, cell = sampler(torch.Generator().manual_seed(0))
+    assert len(inputs) == len(x) == len(weight) == len(cell) == 4096
+    assert (cell[:2048] < sampler.open_loop.cells).all()
+    assert ((cell[2048:] >= sampler.open_loop.cells) & (cell[2048:] < sampler.cells)).all()
+    network, inverse = artifact.inverse.mlp, artifact.inverse
+    for row in range(2048, 4096, 200):
+        state = x[row].numpy() * inverse.x_scale + inverse.x_offset
+        slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
+        observer = KKLObserver(artifact, float(data.level[trajectory]))
+        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
+        expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
+        np.testing.assert_allclose(shown, expected, atol=1e-3)
+        at_run_time = cell[row] - sampler.open_loop.cells
+        assert (at_run_time % 7 == 0) == (data.level[trajectory] == 0)
+
+
+def test_closing_the_loop_is_a_second_stage(tmp_path):
+    system = Oscillator()
+    config = toy(system, duration=5.0, closed_loop=20)
+    result = train(system, config, tmp_path)
+    assert list(result.losses) == ["inverse", "closed-loop"]
+    assert result.artifact.training["closed_loop"] == 20
+    again = train(system, config, tmp_path, resume=True)
+    for a, b in zip(result.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights, strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="no inputs"):
+        train(Autonomous(), toy(Autonomous(), closed_loop=20, inverse_steps=5), tmp_path / "b")
+
+
+@dataclass(frozen=True)
+class Autonomous(Oscillator):
+    name: ClassVar[str] = "autonomous"
+    u_max: ClassVar[tuple[float, ...]] = ()
+    G: ClassVar[tuple[tuple[float, ...], ...]] = ()
 
 
 # Forward map
@@ -444,6 +514,7 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
         ({"noise_max": float("nan")}, "noise_max"),
+        ({"closed_loop": 5}, "closed_loop"),
     ],
 )
 def test_impossible_configurations(change, message):

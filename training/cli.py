@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -16,7 +16,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, get_system
 from observers import Artifact, shipped
 from observers.artifact import resolve
-from training.config import Config, Method, Preset, override, preset
+from training.config import CLOSED_LOOP, Config, Method, Preset, override, preset
 from training.evaluate import Domain, errors, unseen_runs
 
 Value = TypeVar("Value")
@@ -38,6 +38,8 @@ class Train:
     """fast: at most ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
+    closed_loop: bool = False
+    """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware)."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: dict[str, float] = field(default_factory=dict)
@@ -93,8 +95,10 @@ class Train:
         names = {entry.name for entry in fields(Config)}
         config = override(
             preset(system, self.method, self.preset),
-            {key: value for key, value in vars(self).items() if key in names and key != "method"},
+            {key: value for key, value in vars(self).items() if key in names and key not in ("method", "closed_loop")},
         )
+        if self.closed_loop:
+            config = replace(config, closed_loop=CLOSED_LOOP)
         device = None if self.device == "auto" else torch.device(self.device)
         result = train(system, config, folder, self.resume, device, console)
         path = folder / f"{name}.safetensors"

@@ -10,6 +10,7 @@ from kkl_gym.system import System
 
 Method = Literal["input-aware", "spinn"]
 Preset = Literal["fast", "paper"]
+CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,9 @@ class Config:
     """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
     truncation: float = 1e-6
     """epsilon in t*: what may be left of z0 where the forward map's data begins (paper, sec. 5.2)."""
+    closed_loop: int = 0
+    """Trajectories of a controller that acts on the estimate, on which the inverse of an input-aware map is fitted a
+    second time, beside the others; 0 for no second time."""
     cap: float | None = None
     """CPU seconds for all networks together, if they must end before their steps are done."""
     seed: int = 0
@@ -76,6 +80,11 @@ class Config:
             raise ValueError(f"batch must be a multiple of 32 and at least 64, got {self.batch}")
         if self.seed < 0 or self.physics_weight < 0:
             raise ValueError(f"seed = {self.seed} and physics_weight = {self.physics_weight} must not be negative")
+        if self.closed_loop and (self.closed_loop < 10 or self.method != "input-aware"):
+            raise ValueError(
+                f"closed_loop must be 0 or at least 10, and needs method 'input-aware'; got {self.closed_loop}, "
+                f"{self.method!r}"
+            )
         if (self.method == "spinn") != (self.forward_steps > 0):
             raise ValueError(f"method {self.method!r} does not go with forward_steps = {self.forward_steps}")
 

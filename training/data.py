@@ -5,12 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import advance_batch, simulate
 from kkl_gym.system import System
-from observers import LinearFilter
+from observers import Artifact, KKLObserver, LinearFilter
+from training.controllers import Controller
 from training.signals import random_inputs
 
 CHUNK = 500  # trajectories simulated at once
+EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
+HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 
 
 @dataclass(frozen=True)
@@ -101,3 +104,69 @@ def run_filter(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndar
         if k in slot:
             out[slot[k]] = z
     return out
+
+
+@dataclass(frozen=True)
+class ClosedLoop(Trajectories):
+    """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw.
+
+    level : standard deviation of the measurement noise along each trajectory, (n,).
+    """
+
+    level: np.ndarray
+
+
+def record_closed_loop(
+    system: System,
+    artifact: Artifact,
+    controller: Controller,
+    n: int,
+    steps: int,
+    ages: np.ndarray,
+    rng: np.random.Generator,
+    report: Callable[[int], None] = lambda done: None,
+) -> ClosedLoop:
+    """Simulate n trajectories from starts in the training box, in which the controller acts on x_hat, with exploration.
+
+    Never on the true state: such inputs would tell the observer, which filters them, what it is to find out by itself.
+    For the same reason noise is not added afterwards, but is what the observer and through it the controller saw.
+    Chunks of trajectories differ in noise level, some having none, and in how long an action is held; rows in how much
+    is added to it. Trajectories that leave the declared bounds are dropped, so that there may be fewer than n.
+    """
+    dt = artifact.filter.dt
+    low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
+    u_max = np.array(system.u_max)
+    xs, zs, levels = [], [], []
+    chunk = max(1, min(CHUNK, n // 10))
+    for first in range(0, n, chunk):
+        count = min(chunk, n - first)
+        position = rng.uniform(-0.2, 1.0)
+        level = 0.0 if position < 0 else float(artifact.inverse.noise_max * 100 ** (np.sqrt(position) - 1))
+        hold = int(rng.choice(HOLDS))
+        amplitude = EXPLORATION * rng.random((count, 1))
+        observer = KKLObserver(artifact, level)
+        x = rng.uniform(*system.box(), (count, system.nx)).T.copy()
+        inside = np.ones(count, dtype=bool)
+        x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
+        slot = {int(age): i for i, age in enumerate(ages)}
+        no_noise = np.zeros_like(x)
+        u = np.zeros((count, system.nu))
+        for k in range(steps + 1):
+            y = output(system, x.T) + level * rng.standard_normal((count, system.ny))
+            if k == 0:
+                observer.reset(y)
+            else:
+                observer.advance(y, u)
+            if k in slot:
+                x_rows[slot[k]], z_rows[slot[k]] = x.T, observer.z
+            if k % hold == 0:
+                action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (count, system.nu))
+                u = np.clip(action, -1.0, 1.0) * u_max
+            after = advance_batch(system, x, np.ascontiguousarray(u.T), no_noise, dt)
+            inside &= ((after >= low) & (after <= high)).all(0)
+            x = np.where(inside, after, x)
+        xs.append(x_rows[:, inside])
+        zs.append(z_rows[:, inside])
+        levels.append(np.full(int(inside.sum()), level))
+        report(first + count)
+    return ClosedLoop(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))

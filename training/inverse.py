@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from observers import InverseMap, LinearFilter
-from training.data import Trajectories
+from training.data import ClosedLoop, Trajectories
 from training.networks import Network, tensor
 from training.noise import noise_covariance, root, stationary_covariance
 
@@ -90,8 +90,7 @@ class TrajectorySampler:
         for i in range(m):
             self._modes[i] = tensor(self.coordinates(data.z[i]), device)
         self._x = tensor((data.x - self.x_offset) / self.x_scale, device)
-        size_of_x = ((data.x / self.x_scale) ** 2).sum(-1)
-        self._weight = tensor(data.x.shape[-1] / (size_of_x + 0.1 * data.x.shape[-1]), device)
+        self._weight = self.weight(data.x, device)
         self._gain = tensor(gain, device)
         # Noise in units of the stationary one, so that its covariances are well conditioned.
         unit = self.coordinates.whiten / np.where(gain > 0, gain, 1.0)[:, None]
@@ -99,9 +98,8 @@ class TrajectorySampler:
         saturated = np.minimum(data.ages, late)
         self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
         self._age = tensor(data.ages * linear.dt, device)
-        position = np.log1p(data.ages) / np.log1p(data.ages[-1])
-        self._age_cell = torch.as_tensor(np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1))
-        self._age_cell = self._age_cell.to(device)
+        self._oldest = data.ages[-1]
+        self._age_cell = self.age_cell(data.ages, device)
         self.cells = self.AGE_CELLS * (1 + self.LEVELS)
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -132,6 +130,17 @@ class TrajectorySampler:
             cell.reshape(batch),
         )
 
+    def weight(self, x: np.ndarray, device: torch.device) -> torch.Tensor:
+        """Of states (..., nx) in the loss: errors count relative to the state's size."""
+        nx = x.shape[-1]
+        return tensor(nx / (((x / self.x_scale) ** 2).sum(-1) + 0.1 * nx), device)
+
+    def age_cell(self, ages: np.ndarray, device: torch.device) -> torch.Tensor:
+        """Cells of ages in samples."""
+        position = np.log1p(ages) / np.log1p(self._oldest)
+        cell = np.minimum((position * self.AGE_CELLS).astype(int), self.AGE_CELLS - 1)
+        return torch.as_tensor(cell).to(device)
+
     def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
         """The map that a network trained on these batches makes."""
         return InverseMap(
@@ -147,6 +156,45 @@ class TrajectorySampler:
             age_unit=AGE_UNIT,
             age_max=self.age_max,
         )
+
+
+class ClosedLoopSampler:
+    """Batches half from open-loop trajectories, half from closed-loop ones, with the noise that these already hold."""
+
+    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, dt: float, device: torch.device) -> None:
+        self.open_loop = open_loop
+        coordinates, gain = open_loop.coordinates, open_loop.coordinates.noise_gain
+        shrink = 1.0 + (data.level[:, None] * gain) ** 2
+        self._modes = tensor(coordinates(data.z) / shrink, device)
+        self._x = tensor((data.x - open_loop.x_offset) / open_loop.x_scale, device)
+        self._level = tensor(np.log1p(data.level / NOISE_UNIT), device)
+        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / AGE_UNIT), device)
+        self._weight = open_loop.weight(data.x, device)
+        self._age_cell = open_loop.age_cell(data.ages, device)
+        position = np.log10(np.maximum(data.level / open_loop.noise_max, 1e-9)) / 2 + 1  # over two decades, as there
+        level_cell = np.where(data.level > 0, 1 + np.clip(position * open_loop.LEVELS, 0, open_loop.LEVELS - 1), 0)
+        self._level_cell = torch.as_tensor(level_cell.astype(int), device=device)
+        self.cells = 2 * open_loop.cells
+
+    def __call__(self, generator: torch.Generator) -> Batch:
+        """One batch."""
+        inputs, x, weight, cell = self.open_loop(generator)
+        m, n, _ = self._x.shape
+        half, device = len(x) // 2, self._x.device
+        ages = torch.randint(m, (half,), generator=generator, device=device)
+        rows = torch.randint(n, (half,), generator=generator, device=device)
+        closed = torch.cat([self._modes[ages, rows], self._level[rows, None], self._age[ages, None]], -1)
+        closed_cell = self._age_cell[ages] * (1 + self.open_loop.LEVELS) + self._level_cell[rows]
+        return (
+            torch.cat([inputs[:half], closed]),
+            torch.cat([x[:half], self._x[ages, rows]]),
+            torch.cat([weight[:half], self._weight[ages, rows]]),
+            torch.cat([cell[:half], self.open_loop.cells + closed_cell]),
+        )
+
+    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
+        """The map that a network trained on these batches makes."""
+        return self.open_loop.inverse_map(network, linear)
 
 
 class ForwardMapSampler:
@@ -211,10 +259,13 @@ class ForwardMapSampler:
         )
 
 
+Sampler = TrajectorySampler | ClosedLoopSampler | ForwardMapSampler
+
+
 class InverseProblem(nn.Module):
     """The inverse network with the running mean square error of each cell."""
 
-    def __init__(self, network: Network, sampler: TrajectorySampler | ForwardMapSampler, device: torch.device) -> None:
+    def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
         self.network = network
         self.sampler = sampler

@@ -20,17 +20,23 @@ import kkl_gym
 from kkl_gym.system import System
 from observers import Artifact, LinearFilter
 from training.config import Config
-from training.data import output, record, recording_ages
+from training.controllers import controller
+from training.data import output, record, record_closed_loop, recording_ages
 from training.files import write
 from training.forward import ForwardProblem, truncation_time
-from training.inverse import ForwardMapSampler, InverseProblem, TrajectorySampler
+from training.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.networks import Network
 from training.optimise import Stage, optimise
 
 # First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
 TRAINING_SEED = 1
 # Of each stage in the cap on CPU time: a step of the forward map costs three of the inverse map's.
-SHARES = {"input-aware": {"inverse": 1.0}, "spinn": {"forward": 0.75, "inverse": 0.25}}
+SHARES = {
+    "input-aware": {"inverse": 1.0},
+    "closed-loop": {"inverse": 0.5, "closed-loop": 0.5},
+    "spinn": {"forward": 0.75, "inverse": 0.25},
+}
+CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,8 @@ def train(
     ):
 
         def run(name: str, problem: Any, count: int) -> None:
-            cap = math.inf if config.cap is None else config.cap * SHARES[config.method][name]
+            shares = SHARES["closed-loop" if config.closed_loop else config.method]
+            cap = math.inf if config.cap is None else config.cap * shares[name]
             stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed, cap)
             losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)
 
@@ -98,7 +105,7 @@ def train(
             system, linear, config.trajectories, steps, ages, rng, lambda done: progress.update(task, completed=done)
         )
         forward = None
-        sampler: TrajectorySampler | ForwardMapSampler
+        sampler: Sampler
         if config.method == "input-aware":
             sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
         else:
@@ -111,28 +118,45 @@ def train(
         inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
         run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)
 
-    artifact = Artifact(
-        filter=linear,
-        inverse=sampler.inverse_map(inverse, linear),
-        system=system.name,
-        parameters=system.parameters,
-        forward=forward.forward_map() if forward else None,
-        C=output_matrix(system),
-        training={
-            **dataclasses.asdict(config),
-            "seconds": round(time.monotonic() - started),
-            "device": device.type,
-            "threads": torch.get_num_threads(),
-            "resumed": resume,
-        },
-        versions={
-            "kkl-gym": kkl_gym.__version__,
-            "python": platform.python_version(),
-            "torch": torch.__version__,
-            "numpy": np.__version__,
-        },
-    )
-    return Result(artifact, losses, forward)
+        def artifact() -> Artifact:
+            return Artifact(
+                filter=linear,
+                inverse=sampler.inverse_map(inverse, linear),
+                system=system.name,
+                parameters=system.parameters,
+                forward=forward.forward_map() if forward else None,
+                C=output_matrix(system),
+                training={
+                    **dataclasses.asdict(config),
+                    "seconds": round(time.monotonic() - started),
+                    "device": device.type,
+                    "threads": torch.get_num_threads(),
+                    "resumed": resume,
+                },
+                versions={
+                    "kkl-gym": kkl_gym.__version__,
+                    "python": platform.python_version(),
+                    "torch": torch.__version__,
+                    "numpy": np.__version__,
+                },
+            )
+
+        if config.closed_loop and isinstance(sampler, TrajectorySampler):
+            steps = min(steps, round(CLOSED_LOOP_SECONDS / config.dt))
+            task = progress.add_task("closing the loop", total=config.closed_loop)
+            driven = record_closed_loop(
+                system,
+                artifact(),
+                controller(system),
+                config.closed_loop,
+                steps,
+                recording_ages(0, steps, config.samples),
+                rng,
+                lambda done: progress.update(task, completed=done),
+            )
+            sampler = ClosedLoopSampler(sampler, driven, config.dt, device)
+            run("closed-loop", InverseProblem(inverse, sampler, device), config.inverse_steps)
+    return Result(artifact(), losses, forward)
 
 
 def describe(system: System) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Classical controllers that know the state: what an agent is measured against."""
+"""Classical state feedback: what an agent is measured against, and what drives closed-loop training data."""
 
 from collections.abc import Callable
 
