@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,12 @@ from PIL import Image
 from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
+from training.agents import SB3VecEnv
 from training.agents.command import find
-from training.agents.learn import hyperparameters, learn, learn_recurrent
+from training.agents.compare import EVALUATION_SEED
+from training.agents.learn import WORST, Cost, hyperparameters, learn, learn_recurrent
 from training.agents.play import play
-from training.agents.policy import Agent, AgentError, fingerprint
+from training.agents.policy import Agent, AgentError, fingerprint, rules
 from training.agents.tasks import TASKS, ControlTask, scores
 from training.cli import main
 
@@ -42,7 +45,6 @@ def test_the_policy_is_that_of_stable_baselines3(algorithm, kind, tmp_path, monk
     expected, _ = models[0].predict(obs, deterministic=True)
     assert np.allclose(agent(obs), expected, atol=1e-5)
     assert np.abs(agent(100 * obs)).max() <= 1.0
-    assert (tmp_path / "progress.csv").read_text().count("\n") >= 1 or algorithm == "sac"
 
 
 def test_equal_seeds_give_equal_agents(learned, tmp_path):
@@ -59,7 +61,8 @@ def test_a_saved_agent_plays_the_same(learned):
     read = Agent.read(folder / "agent.safetensors")
     assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v1")
     assert read.fingerprint == fingerprint("van_der_pol")
-    assert read.training == {"algorithm": "ppo", "seed": 1, "timesteps": 1}
+    assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 64 * 64)
+    assert (folder / "progress.csv").read_text().startswith("time/")
     episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
     assert np.array_equal(episodes[0].x, episodes[1].x)
     assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)
@@ -67,7 +70,7 @@ def test_a_saved_agent_plays_the_same(learned):
 
 def test_a_task_with_starts_of_its_own_survives_saving(learned, tmp_path):
     agent, _ = learned
-    whole = Agent(agent.network, False, TASKS["van_der_pol"], "state")
+    whole = replace(agent, task=TASKS["van_der_pol"], information="state")
     whole.save(tmp_path / "a.safetensors")
     assert Agent.read(tmp_path / "a.safetensors").task == TASKS["van_der_pol"]
 
@@ -76,13 +79,21 @@ def test_mismatches_are_errors(learned, saved, tmp_path):
     agent, _ = learned
     path = tmp_path / "map.safetensors"
     shutil.copy(saved(system="van_der_pol"), path)
-    own = Agent(agent.network, False, TASK, "x_hat", str(path), fingerprint(str(path)))
+    own = replace(agent, observer=str(path), fingerprint=fingerprint(str(path)))
     assert own.make(1)
     shutil.copy(saved(system="van_der_pol", noise=False), path)
     with pytest.raises(AgentError, match="another version of the observer"):
         own.make(1)
+    path.unlink()
+    with pytest.raises(AgentError, match="observer cannot be read"):
+        own.make(1)
+    with pytest.raises(AgentError, match="must name its observer"):
+        replace(agent, observer=None).make(1)
+    with pytest.raises(AgentError, match="trained with target = "):
+        replace(agent, rules={**agent.rules, "target": [1.0, 1.0]}).make(1)
+    lorenz = replace(agent, task=TASKS["lorenz"], information="state", observer=None, rules=rules(TASKS["lorenz"]))
     with pytest.raises(AgentError, match="2 inputs and 1 outputs"):
-        Agent(agent.network, False, TASKS["lorenz"], "state").make(1)
+        lorenz.make(1)
 
 
 def test_damaged_and_foreign_files(learned, saved, tmp_path):
@@ -93,6 +104,7 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         "empty": (b"", "damaged"),
         "newer": (content.replace(b'\\"format\\": 1', b'\\"format\\": 9'), "another format"),
         "incomplete": (content.replace(b'\\"squashed\\"', b'\\"squished\\"'), "incomplete"),
+        "unknown": (content.replace(b'\\"x_hat\\"', b'\\"x_hut\\"'), "knows 'x_hut', none of"),
     }
     for name, (changed, match) in cases.items():
         assert changed != content
@@ -106,6 +118,48 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         Agent.read(tmp_path / "none.safetensors")
     with pytest.raises(AgentError, match="no agent 'nothing' ships"):
         find("nothing")
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "ppo_lstm"])
+def test_training_never_sees_the_episodes_of_the_evaluation(algorithm, tmp_path, monkeypatch):
+    """stable-baselines3 seeds environments when a model is made; each agent has seeds of its own all the same."""
+    seeds = []
+    reset = SB3VecEnv.reset
+
+    def keep(self):
+        seeds.append(list(self._seeds))
+        return reset(self)
+
+    monkeypatch.setattr(SB3VecEnv, "reset", keep)
+    task = TASKS["reverse_duffing"]
+    for seed in (0, 1):
+        if algorithm == "ppo_lstm":
+            learn_recurrent(task, "y", tmp_path / str(seed), seed, 1)
+        else:
+            learn(task, "y", tmp_path / str(seed), seed, 1, algorithm=algorithm)
+    first, second = seeds
+    evaluation = range(EVALUATION_SEED, EVALUATION_SEED + 10_000)
+    assert not set(first) & set(second)
+    assert not any(one in evaluation for one in (*first, *second))
+
+
+def test_rewards_are_minus_the_cost_and_escaping_never_pays():
+    task = ControlTask("rossler", period=0.05, duration=20.0, start_box=((-44, -44), (-17, -17), (212, 212)))
+    ours, bare = Cost(task.make(1), task), task.make(1)
+    ours.reset(seed=0)
+    bare.reset(seed=0)
+    rewards = []
+    for _ in range(task.steps):
+        _, reward, terminated, _, info = ours.step(np.zeros((1, 1)))
+        _, total, *_ = bare.step(np.zeros((1, 1)))
+        rewards.append(reward[0])
+        if terminated[0]:
+            break
+        assert reward[0] == pytest.approx(-min((task.repeat / total[0] - 1) / 4, WORST))
+    assert terminated[0]
+    done = len(rewards)
+    assert done == np.ceil(info["final_info"]["sample"][0] / task.repeat)
+    assert rewards[-1] == -WORST * (task.steps - done + 1)  # as if it stayed there
 
 
 def test_hyperparameters():
@@ -160,12 +214,16 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
         main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
     main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "3", "--out", "pictures"])
     assert "score" in capsys.readouterr().out
-    with Image.open(tmp_path / "pictures" / "lorenz-y.gif") as animation:
+    with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.gif") as animation:
         assert animation.n_frames > 20
-    with Image.open(tmp_path / "pictures" / "lorenz-y.png") as figure:
+    with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.png") as figure:
         assert figure.size[0] > 200
     with pytest.raises(SystemExit, match="episodes must be positive"):
         main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "0"])
+    own = replace(Agent.read(folder / "agent.safetensors"), task=ControlTask("some.py:Evil"))
+    own.save("own.safetensors")
+    with pytest.raises(SystemExit, match=r"if you trust that, give --system some\.py:Evil"):
+        main(["agent", "evaluate", "own.safetensors"])
     with pytest.raises(SystemExit, match="no control task"):
         main(["agent", "train", "pendulum"])
 

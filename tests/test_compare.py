@@ -2,13 +2,17 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
-from training.agents.compare import KNOWS, MORE_NOISE, Compare, interval, normalised, report, run_case
+import training.agents.compare
+import training.agents.learn
+from training.agents.compare import KNOWS, MORE_NOISE, Compare, interval, middle, normalised, report, run_case
+from training.agents.tasks import TASKS
 
 
 def toy(out, **options):
@@ -24,20 +28,68 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
     assert (results.score <= 0).all()
     assert np.isfinite(results.to_numpy()[:, 4:].astype(float)).all()
     table = (out / "table.md").read_text()
-    assert "| full state | 1.00" in table
-    assert "Partial" not in table
+    assert "Partial: 212 of 216 agents are missing" in table
     assert (out / "scores.png").stat().st_size > 1000
     before = {path: path.stat().st_mtime_ns for path in out.glob("jobs/**/result.json")}
     shutil.rmtree(out / "jobs" / "lorenz-0.5" / "y" / "1")
-    toy(out, knows=("state", "y")).run(Console())
+    toy(out, knows=("y",)).run(Console())  # a narrower run reports all that is there
     again = pd.read_csv(out / "results.csv")
     assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all is seeded
     changed = [path for path in before if path.stat().st_mtime_ns != before[path]]
     assert [path.parts[-3:-1] for path in changed] == [("y", "1")]
-    report(out, 5)
-    assert "Partial: 4 of 5 agents" in (out / "table.md").read_text()
-    with pytest.raises(ValueError, match="of another comparison"):
+    with pytest.raises(ValueError, match="of another comparison: episodes = 3, not 4"):
         toy(out, knows=("y",), episodes=4).run(Console())
+
+
+def test_table_and_figure_from_the_results_alone(tmp_path):
+    rows = [
+        {"system": "lorenz", "noise": 0.5, "knows": knows, "seed": seed, "score": score + 0.01 * seed, "success": 0.5,
+         "idle": -0.6, "seconds": 60.0}
+        for knows, score, seeds in (("state", -0.2, 4), ("y", -0.4, 4), ("recurrent", -0.3, 1))
+        for seed in range(seeds)
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
+    report(tmp_path)
+    table = (tmp_path / "table.md").read_text()
+    assert "| full state | 1.00 [0." in table
+    assert "| y | 0.52 [0." in table
+    assert ", 50 %, 4 |" in table
+    assert "| y, recurrent agent | 0.72, 50 %, 1 |" in table  # too few for an interval
+    assert "full state 1.0" in table.splitlines()[-1]
+    assert (tmp_path / "scores.png").stat().st_size > 1000
+    only_y = pd.DataFrame(rows).query("knows != 'state'")
+    only_y.to_csv(tmp_path / "results.csv", index=False)
+    report(tmp_path)
+    assert "| y | – |" in (tmp_path / "table.md").read_text()  # nothing to measure it by
+
+
+def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path, monkeypatch):
+    (case,) = toy(tmp_path, knows=("y",), seeds=1).cases()
+    run_case(case)
+    assert case.done
+    with monkeypatch.context() as patch:
+        patch.setitem(TASKS, "lorenz", replace(TASKS["lorenz"], tolerance=0.3))
+        with pytest.raises(ValueError, match="of another comparison: task"):
+            assert not case.done
+    with monkeypatch.context() as patch:
+        read = training.agents.learn._read
+        patch.setattr(training.agents.learn, "_read", lambda name: {**read(name), "KKLLorenz-v0": {"gamma": 0.5}})
+        with pytest.raises(ValueError, match="of another comparison: hyperparameters"):
+            assert not case.done
+    assert case.done
+
+
+def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
+    def interrupted(run, jobs, workers):
+        run(jobs[0])
+        yield jobs[0], None, []
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training.agents.compare, "run_all", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        toy(tmp_path, knows=("state", "y")).run(Console())
+    assert len(pd.read_csv(tmp_path / "results.csv")) == 1
+    assert "Partial: 215 of 216 agents are missing" in (tmp_path / "table.md").read_text()
 
 
 def test_a_recurrent_agent_is_a_case_like_others(tmp_path):
@@ -56,25 +108,26 @@ def test_cases():
 
 
 def test_normalised_scores_by_hand():
-    results = pd.DataFrame(
-        {
-            "system": "lorenz",
-            "noise": 0.5,
-            "knows": ["state", "state", "y"],
-            "score": [-0.1, -0.3, -0.4],
-            "idle": -0.6,
-        }
-    )
-    assert normalised(results).normalised.tolist() == pytest.approx([1.25, 0.75, 0.5])
+    assert normalised(np.array([-0.1, -0.3, -0.4]), -0.2, -0.6).tolist() == pytest.approx([1.25, 0.75, 0.5])
+    assert np.isnan(normalised(np.array([-0.1]), -0.6, -0.6)).all()  # the best is no better than nothing
 
 
-def test_interquartile_mean_and_interval():
-    middle, low, high = interval(np.array([0.0, 1.0, 2.0, 3.0, 100.0]))
-    assert middle == 2.0
-    assert 0 <= low <= middle <= high
-    assert interval(np.array([0.7])) == (0.7, 0.7, 0.7)
+def test_interquartile_means_and_intervals():
+    assert middle(np.array([0.0, 1.0, 2.0, 3.0, 100.0])) == 2.0
+    best = np.array([0.0, 0.0, 0.0, 0.0])
+    found, low, high = interval(np.array([-0.2, -0.3, -0.4, -0.5]), best, -1.0)
+    assert found == pytest.approx(0.65)
+    assert 0.5 <= low < found < high <= 0.8
+    varied = np.array([-0.2, -0.1, 0.1, 0.2])
+    assert interval(varied, varied, -1.0)[0] == 1.0
+    wider = interval(np.array([-0.2, -0.3, -0.4, -0.5]), varied, -1.0)
+    assert wider[2] - wider[1] > high - low  # those that it is measured by are uncertain, too
+    assert np.isnan(interval(np.array([-0.2, -0.3]), best, -1.0)[1:]).all()
 
 
 def test_wrong_numbers(tmp_path):
     with pytest.raises(ValueError, match="must be positive"):
         toy(tmp_path, seeds=0).run(Console())
+    for wrong in ({"systems": ("lorenz", "lorenz")}, {"knows": ("y", "y")}, {"knows": ()}):
+        with pytest.raises(ValueError, match="each once"):
+            toy(tmp_path, **wrong).run(Console())

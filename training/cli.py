@@ -39,7 +39,8 @@ class Train:
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     closed_loop: bool = False
-    """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware)."""
+    """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware);
+    takes twice as long. Writes NAME-closed-loop."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: dict[str, float] = field(default_factory=dict)
@@ -91,6 +92,7 @@ class Train:
         torch.set_num_threads(self.threads)
         system = get_system(self.system, self.parameters)
         name = system.name if self.method == "input-aware" else f"{system.name}-{self.method}"
+        name += "-closed-loop" if self.closed_loop else ""
         folder = self.out or Path("runs") / name
         names = {entry.name for entry in fields(Config)}
         config = override(
@@ -218,6 +220,7 @@ def spread(values: np.ndarray) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point of the ``kkl-gym`` command."""
     from training.agents.command import AgentCommand
+    from training.agents.compare import Compare
     from training.benchmark.command import Benchmark
     from training.demo import Demo
     from training.speed import Speed
@@ -240,9 +243,12 @@ def main(arguments: list[str] | None = None) -> None:
     )
     try:
         command.run(console)
+    except ModuleNotFoundError as error:
+        sys.exit(f"kkl-gym: {error}; pip install 'kkl-gym[agents]' has everything")
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"kkl-gym: {error}")
     except KeyboardInterrupt:
         hint = "; --resume goes on from the last checkpoint" if isinstance(command, Train) else ""
-        hint = "; the same command goes on" if isinstance(command, Benchmark) else hint
+        goes_on = isinstance(command, Benchmark) or isinstance(getattr(command, "command", None), Compare)
+        hint = "; the same command goes on" if goes_on else hint
         sys.exit(f"kkl-gym: interrupted{hint}")

@@ -14,6 +14,8 @@ from training.signals import random_inputs
 CHUNK = 500  # trajectories simulated at once
 EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
+GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
+QUIET = 0.2  # share of closed-loop trajectories without noise
 
 
 @dataclass(frozen=True)
@@ -130,17 +132,19 @@ def record_closed_loop(
 
     Never on the true state: such inputs would tell the observer, which filters them, what it is to find out by itself.
     For the same reason noise is not added afterwards, but is what the observer and through it the controller saw.
-    Chunks of trajectories differ in noise level, some having none, and in how long an action is held; rows in how much
-    is added to it. Trajectories that leave the declared bounds are dropped, so that there may be fewer than n.
+    Groups of trajectories differ in noise level, a fifth having none, and in how long an action is held; rows in how
+    much is added to it. Trajectories that leave the declared bounds are dropped, so that there may be fewer than n.
+
+    Raises ValueError if that happens to more than half of them.
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     u_max = np.array(system.u_max)
     xs, zs, levels = [], [], []
-    chunk = max(1, min(CHUNK, n // 10))
-    for first in range(0, n, chunk):
-        count = min(chunk, n - first)
-        position = rng.uniform(-0.2, 1.0)
+    groups = np.array_split(np.arange(n), min(n, GROUPS))
+    for i, group in enumerate(groups):
+        count = len(group)
+        position = ((i + rng.random()) / len(groups) - QUIET) / (1 - QUIET)
         level = 0.0 if position < 0 else float(artifact.inverse.noise_max * 100 ** (np.sqrt(position) - 1))
         hold = int(rng.choice(HOLDS))
         amplitude = EXPLORATION * rng.random((count, 1))
@@ -168,5 +172,11 @@ def record_closed_loop(
         xs.append(x_rows[:, inside])
         zs.append(z_rows[:, inside])
         levels.append(np.full(int(inside.sum()), level))
-        report(first + count)
+        report(int(group[-1]) + 1)
+    kept = sum(map(len, levels))
+    if 2 * kept < n:
+        raise ValueError(
+            f"of {n} trajectories under the controller only {kept} stayed within bounds = {system.bounds}; widen them, "
+            "or shrink X"
+        )
     return ClosedLoop(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))

@@ -270,7 +270,9 @@ class InverseProblem(nn.Module):
         self.network = network
         self.sampler = sampler
         self.register_buffer("error", torch.ones(sampler.cells, device=device))
+        self.register_buffer("visited", torch.zeros(sampler.cells, dtype=torch.bool, device=device))
         self.error: torch.Tensor
+        self.visited: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Mean square error of a batch, each cell relative to its own running error.
@@ -287,7 +289,9 @@ class InverseProblem(nn.Module):
         mean = torch.zeros_like(self.error).index_add_(0, cell, detached) / count.clamp(min=1.0)
         keep = torch.where(count > 0, 0.99, 1.0)
         self.error.mul_(keep).add_((1 - keep) * mean)
-        return {"loss": (square / self.error[cell]).mean(), "error": self.error.log().mean().exp().sqrt()}
+        self.visited |= count > 0  # there may be cells without data
+        error = self.error[self.visited].log().mean().exp().sqrt()
+        return {"loss": (square / self.error[cell]).mean(), "error": error}
 
 
 def settling_time(linear: LinearFilter) -> float:

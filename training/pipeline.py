@@ -106,6 +106,7 @@ def train(
         )
         forward = None
         sampler: Sampler
+        feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
         if config.method == "input-aware":
             sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
         else:
@@ -141,13 +142,13 @@ def train(
                 },
             )
 
-        if config.closed_loop and isinstance(sampler, TrajectorySampler):
+        if feedback and isinstance(sampler, TrajectorySampler):
             steps = min(steps, round(CLOSED_LOOP_SECONDS / config.dt))
             task = progress.add_task("closing the loop", total=config.closed_loop)
             driven = record_closed_loop(
                 system,
                 artifact(),
-                controller(system),
+                feedback,
                 config.closed_loop,
                 steps,
                 recording_ages(0, steps, config.samples),

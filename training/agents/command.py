@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from kkl_gym import get_system
+from kkl_gym import SYSTEMS, get_system
 from training.agents.compare import EVALUATION_SEED, Compare
 from training.agents.information import Information
 from training.agents.play import Episodes, play
@@ -72,6 +72,8 @@ class Evaluate:
     """A system whose agent ships with the package, or an agent.safetensors file."""
     episodes: int = 100
     """Episodes that score and success are taken over."""
+    system: str | None = None
+    """Class of the agent's system if that is none of the package's: script.py:Class, as its file names it."""
     out: Path = Path("agents")
     """Folder for NAME.png and NAME.gif."""
 
@@ -82,11 +84,15 @@ class Evaluate:
         if self.episodes < 1:
             raise ValueError(f"episodes must be positive, got {self.episodes}")
         agent = Agent.read(find(self.agent))
+        task = agent.task
+        if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
+            raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
         episodes = show(console, agent, self.episodes)
-        name = f"{agent.task.system}-{agent.information}"
+        system = get_system(task.system).name
+        name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.training.get('seed', 0)}"
         self.out.mkdir(parents=True, exist_ok=True)
-        draw(agent.task, episodes, self.out / f"{name}.png")
-        animate(agent.task, episodes, self.out / f"{name}.gif")
+        draw(task, episodes, self.out / f"{name}.png")
+        animate(task, episodes, self.out / f"{name}.gif")
         console.print(f"wrote {name}.png and {name}.gif in {self.out}")
 
 

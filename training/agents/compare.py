@@ -1,8 +1,9 @@
 """What knowing is worth: agents on every information set, several seeds each, on the same unseen episodes."""
 
 import json
+import os
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -18,6 +19,7 @@ import kkl_gym
 from kkl_gym import get_system
 from training.agents.information import make
 from training.agents.play import Policy, play
+from training.agents.policy import fingerprint, rules, versioned
 from training.agents.tasks import TASKS, get_task, scores, successes
 from training.files import write
 from training.parallel import run_all
@@ -36,7 +38,9 @@ LABELS = {
 }
 MORE_NOISE = {"van_der_pol": 0.2, "lorenz": 2.0}
 RECURRENT_SEEDS = 3
-EVALUATION_SEED = 0  # first of the evaluation's episodes; training begins at 10,000
+MANY = 1000  # seeds, more than anyone trains
+PROTOCOL = 1  # changes where results must not be mixed with earlier ones
+EVALUATION_SEED = 10**9  # of the first of the evaluation's episodes; training's are far below
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,22 @@ class Case:
     @property
     def identity(self) -> dict[str, Any]:
         """What must not differ between a result that is there and one that is asked for."""
-        return {"episodes": self.episodes, "timesteps": self.timesteps, "version": kkl_gym.__version__}
+        from training.agents.learn import hyperparameters
+
+        task = get_task(self.system, self.measurement_noise)
+        recurrent = self.knows.startswith("recurrent")
+        observer = versioned(task.system) if self.knows in ("x_hat", "z") else None
+        described = {
+            "protocol": PROTOCOL,
+            "episodes": self.episodes,
+            "timesteps": self.timesteps,
+            "task": asdict(task),
+            "rules": rules(task),
+            "hyperparameters": hyperparameters(task, "ppo_lstm" if recurrent else None),
+            "observer": None if observer is None else [observer, fingerprint(observer)],
+            "version": kkl_gym.__version__,
+        }
+        return dict(json.loads(json.dumps(described)))
 
     @property
     def done(self) -> bool:
@@ -70,9 +89,13 @@ class Case:
         path = self.folder / "result.json"
         if not path.exists():
             return False
-        found = json.loads(path.read_text())["identity"]
-        if found != self.identity:
-            raise ValueError(f"{path} is of another comparison: {found}, not {self.identity}; choose another --out")
+        found, asked = json.loads(path.read_text())["identity"], self.identity
+        for name, value in asked.items():
+            if found.get(name) != value:
+                raise ValueError(
+                    f"{path} is of another comparison: {name} = {found.get(name)}, not {value}; choose another --out, "
+                    "or remove it"
+                )
         return True
 
 
@@ -151,21 +174,27 @@ class Compare:
         """Run what is missing, then report."""
         if min(self.seeds, self.episodes, self.jobs) < 1:
             raise ValueError("seeds, episodes and jobs must be positive")
+        for names in (self.systems, self.knows):
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"give systems and what agents know, each once; got {names}")
         cases = self.cases()
         todo = [case for case in cases if not case.done]
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         failures = []
-        with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-            bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
-            for case, failure, _ in run_all(run_case, todo, min(self.jobs, max(1, len(todo)))):
-                if failure:
-                    failures.append(f"{case.name}: {failure}")
-                progress.console.print(f"[red]failed[/red] {failures[-1]}" if failure else f"finished {case.name}")
-                progress.advance(bar)
-        if any(case.done for case in cases):
-            collect(cases).to_csv(self.out / "results.csv", index=False)
-            report(self.out, len(cases))
-            console.print(f"wrote results.csv, table.md and scores.png in {self.out}")
+        try:
+            with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+                bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
+                for case, failure, _ in run_all(run_case, todo, min(self.jobs, max(1, len(todo)))):
+                    if failure:
+                        failures.append(f"{case.name}: {failure}")
+                    progress.console.print(f"[red]failed[/red] {failures[-1]}" if failure else f"finished {case.name}")
+                    progress.advance(bar)
+        finally:  # also after an interruption
+            results = collect(self.out, self.episodes, self.timesteps)
+            if len(results):
+                write(self.out / "results.csv", results.to_csv(index=False))
+                report(self.out)
+                console.print(f"wrote results.csv, table.md and scores.png in {self.out}")
         if failures:
             raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
 
@@ -192,11 +221,12 @@ class Compare:
         ]
 
 
-def collect(cases: list[Case]) -> pd.DataFrame:
-    """One row for each agent that is done."""
+def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
+    """One row for each agent in the folder, whoever trained it; raises ValueError if some are of another comparison."""
+    plan = Compare(seeds=MANY, episodes=episodes, timesteps=timesteps, out=out).cases()
     idle_scores: dict[tuple[str, float], float] = {}
     rows = []
-    for case in cases:
+    for case in plan:
         if not case.done:
             continue
         key = (case.system, case.measurement_noise)
@@ -218,53 +248,68 @@ def collect(cases: list[Case]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def normalised(results: pd.DataFrame) -> pd.DataFrame:
-    """With a column ``normalised``: 0 is zero input, 1 the mean of the agents that know the full state."""
-    best = results[results.knows == "state"].groupby(["system", "noise"]).score.mean()
-    out = results.copy()
-    top = np.array([best.get(key, np.nan) for key in zip(results.system, results.noise, strict=True)])
-    out["normalised"] = (results.score - results.idle) / (top - results.idle)
-    return out
+def normalised(scores: np.ndarray, top: float, idle: float) -> np.ndarray:
+    """0 is zero input, 1 is ``top``; NaN if that is no better than zero input."""
+    return (scores - idle) / (top - idle) if top > idle else np.full(np.shape(scores), np.nan)
 
 
-def interval(values: np.ndarray) -> tuple[float, float, float]:
-    """Interquartile mean over agents and its bootstrap 95 % interval."""
-    from scipy.stats import bootstrap, trim_mean
+def middle(values: np.ndarray, axis: int = -1) -> Any:
+    """Interquartile mean."""
+    from scipy.stats import trim_mean
 
-    values = np.asarray(values, dtype=float)
-    middle = float(trim_mean(values, 0.25))
-    if len(set(values)) < 2:
-        return middle, middle, middle
-    found = bootstrap(
-        (values,), lambda v, axis: trim_mean(v, 0.25, axis=axis), method="percentile", rng=np.random.default_rng(0)
-    ).confidence_interval
-    return middle, float(found.low), float(found.high)
+    return trim_mean(values, 0.25, axis=axis)
 
 
-def report(out: Path, planned: int) -> None:
+def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
+    """Interquartile mean of the normalised scores of agents, with a bootstrap 95 % interval.
+
+    values, best : scores of these agents and of those that know the full state, one for each agent; both are resampled.
+    The interval is NaN for fewer than three agents. With five it covers about nine times in ten, for which bootstrap
+    intervals of so few are known.
+    """
+    found = float(normalised(middle(values), float(middle(best)), idle))
+    if min(len(values), len(best)) < 3:
+        return found, np.nan, np.nan
+    rng = np.random.default_rng(0)
+    same = values is best
+    draws = []
+    for _ in range(2000):
+        tops = rng.choice(best, len(best))
+        mine = tops if same else rng.choice(values, len(values))
+        reference = float(middle(best)) if same else float(middle(tops))
+        draws.append(float(normalised(middle(mine), reference, idle)))
+    low, high = np.nanquantile(draws, [0.025, 0.975])
+    return found, float(low), float(high)
+
+
+def report(out: Path) -> None:
     """Table and figure from results.csv alone."""
-    results = normalised(pd.read_csv(out / "results.csv"))
-    partial = "" if len(results) == planned else f" Partial: {len(results)} of {planned} agents."
+    results = pd.read_csv(out / "results.csv")
+    missing = len(Compare().cases()) - len(results)
+    partial = f" Partial: {missing} of {len(Compare().cases())} agents are missing." if missing > 0 else ""
     tasks = list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
     lines = [
         "# Agents",
         "",
-        "Normalised score: 0 is zero input, 1 the mean of the agents that know the full state. Interquartile mean over "
-        f"agents [bootstrap 95 % interval], success rate in %, agents.{partial}",
+        "Normalised score: 0 is zero input, 1 the interquartile mean of the agents that know the full state. "
+        "Interquartile mean over agents [bootstrap 95 % interval], success rate in %, number of agents. Observers see "
+        f"every sample of y; agents on y see it once for each action.{partial}",
         "",
         "| | " + " | ".join(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks) + " |",
         "|---" * (1 + len(tasks)) + "|",
     ]
+    cells = _cells(results, tasks)
     for knows in KNOWS:
-        cells = []
-        for system, noise in tasks:
-            group = results[(results.system == system) & (results.noise == noise) & (results.knows == knows)]
-            if group.empty or group.normalised.isna().any():
-                cells.append("–")
+        row = []
+        for task in tasks:
+            cell = cells.get((*task, knows))
+            if cell is None:
+                row.append("–")
                 continue
-            middle, low, high = interval(group.normalised.to_numpy())
-            cells.append(f"{middle:.2f} [{low:.2f}, {high:.2f}], {100 * group.success.mean():.0f} %, {len(group)}")
-        lines.append(f"| {LABELS[knows]} | " + " | ".join(cells) + " |")
+            found, low, high = cell["interval"]
+            spread = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
+            row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
+        lines.append(f"| {LABELS[knows]} | " + " | ".join(row) + " |")
     minutes = results.groupby("knows").seconds.mean() / 60
     spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in KNOWS if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
@@ -272,22 +317,45 @@ def report(out: Path, planned: int) -> None:
     _draw(out / "scores.png", results, tasks, partial)
 
 
+def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
+    """What table and figure show for each task and kind of agent."""
+    cells = {}
+    for system, noise in tasks:
+        here = results[(results.system == system) & (results.noise == noise)]
+        best = here[here.knows == "state"].score.to_numpy()
+        if not len(best):  # nothing to measure the others by
+            continue
+        idle_score = float(here.idle.iloc[0])
+        for knows, group in here.groupby("knows"):
+            values = best if knows == "state" else group.score.to_numpy()
+            found = interval(values, best, idle_score)
+            if np.isfinite(found[0]):
+                cells[system, noise, str(knows)] = {
+                    "interval": found,
+                    "agents": normalised(values, float(middle(best)), idle_score),
+                    "success": group.success.mean(),
+                }
+    return cells
+
+
 def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], partial: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")
     axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
-    for ax, (system, noise) in zip(axes, tasks, strict=True):
+    cells = _cells(results, tasks)
+    for ax, task in zip(axes, tasks, strict=True):
         for place, knows in enumerate(reversed(KNOWS)):
-            group = results[(results.system == system) & (results.noise == noise) & (results.knows == knows)]
-            values = group.normalised.to_numpy()
-            if len(values) and np.isfinite(values).all():
-                middle, low, high = interval(values)
-                ax.plot(values, np.full(len(values), place), ".", color="0.6", markersize=4)
+            cell = cells.get((*task, knows))
+            if cell is not None:
+                found, low, high = cell["interval"]
+                ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color="0.6", markersize=4)
                 ax.plot([low, high], [place, place], color="C0", lw=2)
-                ax.plot(middle, place, "o", color="C0")
+                ax.plot(found, place, "o", color="C0")
         ax.axvline(1.0, color="0.8", lw=0.8)
-        ax.set(title=f"{system.replace('_', ' ')}, noise {noise:g}", xlabel="normalised score")
+        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]:g}", xlabel="normalised score")
         ax.set_yticks(range(len(KNOWS)), [LABELS[knows] for knows in reversed(KNOWS)])
     figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
-    figure.savefig(path, dpi=110)
+    temporary = path.with_name(f".{path.name}.new.png")
+    figure.savefig(temporary, dpi=110)
+    os.replace(temporary, path)

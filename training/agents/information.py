@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.vector import with_mask
-from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, plant_of
+from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load
 from training.agents.tasks import ControlTask, deviation
 from training.derivatives import linearised
@@ -24,7 +24,7 @@ STACKED = 8  # outputs, each with the action before it
 EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second
 
 Infos = dict[str, Any]
-Feature = Callable[[np.ndarray], np.ndarray]
+Feature = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
 class Features(VectorWrapper):
@@ -33,20 +33,26 @@ class Features(VectorWrapper):
     Parameters
     ----------
     env : with ``autoreset_mode`` SAME_STEP or DISABLED, as :class:`kkl_gym.VectorActionRepeat` offers them.
-    key : of ``info``.
-    feature : ``info[key]``, (n, ...), in, (n, width) out.
+    keys : of ``info``, what the feature is made of.
+    feature : a mapping of the keys to (n, ...) in, (n, width) out.
     width : of the feature.
     stacked : steps shown, the latest last; before an episode's first step, its first feature and action 0.
     with_action : whether each feature has the action before it appended.
     """
 
     def __init__(
-        self, env: VectorEnv, key: str, feature: Feature, width: int, stacked: int = 1, with_action: bool = False
+        self,
+        env: VectorEnv,
+        keys: Sequence[str],
+        feature: Feature,
+        width: int,
+        stacked: int = 1,
+        with_action: bool = False,
     ) -> None:
         super().__init__(env)
         if env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP:
             raise ValueError("Features needs an environment that resets in the same step or not at all")
-        self._key, self._feature, self._stacked = key, feature, stacked
+        self._keys, self._feature, self._stacked = tuple(keys), feature, stacked
         (nu,) = env.single_action_space.shape or (0,)
         self._taken = nu if with_action else 0
         width = stacked * (width + self._taken)
@@ -61,7 +67,7 @@ class Features(VectorWrapper):
         """Reset the environments and what is remembered of them."""
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
-        first = self._first(info[self._key])
+        first = self._first(info)
         self._history = first if mask.all() else np.where(mask[:, None, None], first, self._history)
         self._still = self._still & ~mask
         return self._shown(), info
@@ -69,11 +75,11 @@ class Features(VectorWrapper):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Step the environments."""
         _, reward, terminated, truncated, info = self.env.step(actions)
-        values = info[self._key]
+        values = {key: info[key] for key in self._keys}
         ended = info.get("_final_info", np.zeros(self.num_envs, dtype=bool))
         if ended.any():
-            values = values.copy()
-            values[ended] = info["final_info"][self._key][ended]
+            for key, value in values.items():
+                values[key] = np.where(column(ended, value), info["final_info"][key], value)
         taken = np.clip(np.asarray(actions, dtype=float), -1.0, 1.0)[:, : self._taken]
         latest = np.concatenate([self._feature(values), taken], axis=1)
         history = np.concatenate([self._history[:, 1:], latest[:, None]], axis=1)
@@ -82,12 +88,12 @@ class Features(VectorWrapper):
             last = self._shown()
             for row in np.flatnonzero(ended):
                 info["final_obs"][row] = last[row].copy()
-            self._history[ended] = self._first(info[self._key][ended])
+            self._history[ended] = self._first({key: info[key][ended] for key in self._keys})
         else:
             self._still = terminated | truncated
         return self._shown(), reward, terminated, truncated, info
 
-    def _first(self, values: np.ndarray) -> np.ndarray:
+    def _first(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         feature = self._feature(values)
         one = np.concatenate([feature, np.zeros((len(feature), self._taken))], axis=1)
         return np.repeat(one[:, None], self._stacked, axis=1)
@@ -126,11 +132,12 @@ def make(
     observer: str | None = None,
     with_action: bool = False,
 ) -> Features:
-    """A task in which the agent knows what ``information`` says, in units of about one.
+    """A task in which the agent knows what ``information`` says, in units of about one, taken from the target.
 
-    "state": the true state. "x_hat" and "z": of the learned observer, z as its network sees it. "ekf": the estimate of
-    an extended Kalman filter with the exact model. "y": the latest noisy output. "stacked": the last ``STACKED`` of
-    them, each with the action before it. States and outputs are taken from the target, over their scale.
+    "state": the true state. "x_hat": the learned observer's estimate. "z": its filter's state as its network sees it,
+    with the time since reset. "ekf": the estimate of an extended Kalman filter with the exact model. These observers
+    see every sample. "y": the noisy output when the agent acts. "stacked": the last ``STACKED`` of those, each with
+    the action before it.
 
     with_action : whether "state" and "y" come with the action before them.
 
@@ -139,34 +146,46 @@ def make(
     if information not in INFORMATION:
         raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
     system = get_system(task.system)
-    scaled = partial(deviation, system)
+
+    def of(key: str) -> Feature:
+        return lambda info: deviation(system, info[key])
+
     if information == "state":
         env = task.make(num_envs, None, autoreset_mode)
-        return Features(env, "x", scaled, system.nx, with_action=with_action)
+        return Features(env, ["x"], of("x"), system.nx, with_action=with_action)
     if information in ("y", "stacked"):
         stacked = STACKED if information == "stacked" else 1
         env = task.make(num_envs, None, autoreset_mode)
-        return Features(env, "y", output_deviation(system), system.ny, stacked, with_action or stacked > 1)
+        return Features(env, ["y"], output_deviation(system), system.ny, stacked, with_action or stacked > 1)
     if information == "ekf":
         env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
-        return Features(env, "x_hat", scaled, system.nx)
+        return Features(env, ["x_hat"], of("x_hat"), system.nx)
     if information == "x_hat":
         env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
-        return Features(env, "x_hat", scaled, system.nx)
+        return Features(env, ["x_hat"], of("x_hat"), system.nx)
     env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, estimate="z"), autoreset_mode)
-    matrix, feature = modes(load(observer or system.name, task.measurement_noise))
-    return Features(env, "z", feature, matrix.shape[1])
+    feature, width = modes(load(observer or system.name, task.measurement_noise), system)
+    return Features(env, ["z", "sample"], feature, width)
 
 
 def output_deviation(system: System) -> Feature:
     """(y - h(target)) over the size that the states' scales give to y, to first order."""
     _, _, C = linearised(system, system.target)
     y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
-    return lambda value: (value - y) / size
+    size = np.where(size > 0, size, 1.0)  # an output that is flat at the target
+    return lambda info: (info["y"] - y) / size
 
 
-def modes(observer: KKLObserver) -> tuple[np.ndarray, Feature]:
-    """z in the coordinates in front of the observer's network: centred, whitened, weighted against noise."""
-    inverse = observer.artifact.inverse
+def modes(observer: KKLObserver, system: System) -> tuple[Feature, int]:
+    """z as the observer's network sees it, but from its value at the target, and the age; and their number."""
+    inverse, linear = observer.artifact.inverse, observer.artifact.filter
     matrix = (inverse.gain(observer.measurement_noise)[:, None] * inverse.whiten).T
-    return matrix, lambda z: (z - inverse.z_offset) @ matrix
+    rest = linear.start(np.array(system.h(system.target), dtype=float))
+
+    def feature(info: Mapping[str, np.ndarray]) -> np.ndarray:
+        shown: np.ndarray = (info["z"] - rest) @ matrix
+        if inverse.features[-1] != "age":
+            return shown
+        return np.column_stack([shown, inverse.age_feature(info["sample"] * linear.dt)])
+
+    return feature, matrix.shape[1] + (inverse.features[-1] == "age")

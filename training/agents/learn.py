@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import yaml
-from gymnasium.wrappers.vector import TransformReward
 from rich.progress import Progress
 from sb3_contrib import RecurrentPPO
 from stable_baselines3 import PPO, SAC
@@ -20,16 +19,17 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
+from kkl_gym.vector_wrappers import VectorEnv, VectorWrapper
 from observers import MLP
 from training.agents.bridge import SB3VecEnv
 from training.agents.information import Features, Information, make
 from training.agents.play import Policy
-from training.agents.policy import Agent, fingerprint, versioned
+from training.agents.policy import Agent, fingerprint, rules, versioned
 from training.agents.tasks import ControlTask
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
 FEEDFORWARD = ("ppo", "sac")  # whose policies are perceptrons, which ship
-TRAINING_SEED = 10_000  # of the first row's first episode, times one more than the agent's seed
+TRAINING_SEED = 10_000  # of the first row, times one more than the agent's seed; evaluation's is far away
 
 
 def learn(
@@ -58,9 +58,9 @@ def learn(
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
     name, settings = hyperparameters(task, algorithm)
     named = versioned(observer or get_system(task.system).name) if information in ("x_hat", "z") else None
-    env = make(task, information, settings.pop("n_envs"), observer=named)
+    env = make(task, information, settings["n_envs"], observer=named)
     timesteps = settings["n_timesteps"] if timesteps is None else timesteps
-    model = _fit(name, settings, env, task.repeat, timesteps, seed, folder, progress, f"{task.system} {information}")
+    model = _fit(name, settings, env, task, timesteps, seed, folder, progress, f"{task.system} {information}")
     agent = Agent(
         network=_policy(model),
         squashed=name == "sac",
@@ -68,7 +68,8 @@ def learn(
         information=information,
         observer=named,
         fingerprint=None if named is None else fingerprint(named),
-        training={"algorithm": name, "seed": seed, "timesteps": timesteps},
+        rules=rules(task),
+        training={"algorithm": name, **settings, "seed": seed, "timesteps": model.num_timesteps},
     )
     agent.save(folder / "agent.safetensors")
     return agent
@@ -87,9 +88,9 @@ def learn_recurrent(
     The parameters are those of :func:`learn`. Returns what makes a policy, with a memory of its own, for one play.
     """
     name, settings = hyperparameters(task, "ppo_lstm")
-    env = make(task, of, settings.pop("n_envs"), with_action=True)
+    env = make(task, of, settings["n_envs"], with_action=True)
     timesteps = settings["n_timesteps"] if timesteps is None else timesteps
-    model = _fit(name, settings, env, task.repeat, timesteps, seed, folder, progress, f"{task.system} recurrent {of}")
+    model = _fit(name, settings, env, task, timesteps, seed, folder, progress, f"{task.system} recurrent {of}")
 
     def policy() -> Policy:
         memory: dict[str, Any] = {"state": None, "episode_start": None}
@@ -111,7 +112,7 @@ def _fit(
     algorithm: str,
     settings: dict[str, Any],
     env: Features,
-    repeat: int,
+    task: ControlTask,
     timesteps: int,
     seed: int,
     folder: Path,
@@ -121,15 +122,15 @@ def _fit(
     """Train on minus the cost, with the learning curve in FOLDER/progress.csv."""
     if timesteps < 1:
         raise ValueError(f"timesteps must be positive, got {timesteps}")
-    settings = {key: value for key, value in settings.items() if key != "n_timesteps"}
-    vec_env = VecMonitor(SB3VecEnv(TransformReward(env, _cost(repeat))))
-    vec_env.seed(TRAINING_SEED * (seed + 1))
+    settings = {key: value for key, value in settings.items() if key not in ("n_envs", "n_timesteps")}
+    vec_env = VecMonitor(SB3VecEnv(Cost(env, task)))
     rate = settings.pop("learning_rate")
     if isinstance(rate, str):
         rate = _linear(float(rate.removeprefix("lin_")))
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
     model.set_logger(configure(str(folder), ["csv"]))
+    vec_env.seed(TRAINING_SEED * (seed + 1))  # only now: the model has just seeded it with ``seed``
     try:
         model.learn(timesteps, callback=_Bar(progress, f"{description} {seed}", timesteps))
     finally:
@@ -160,17 +161,31 @@ def _read(name: str) -> dict[str, Any]:
     return dict(yaml.safe_load(text))
 
 
-def _cost(repeat: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Minus the cost c from the environment's reward 1/(1 + 4c), summed over ``repeat`` samples.
+WORST = 10.0  # of the cost, three scales off in every state; beyond it, networks would learn little else
 
-    The environment's reward is flat far from the target, where c still tells an agent which way to go.
+
+class Cost(VectorWrapper):
+    """Rewards minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
+
+    The environment's reward is flat far from the target, where c still tells an agent which way to go. A state that
+    escapes is taken to stay where it left for the rest of the episode, so that escaping never pays.
     """
 
-    def reward(total: np.ndarray) -> np.ndarray:
-        minus_cost: np.ndarray = (1.0 - repeat / np.maximum(total, 1e-6)) / 4.0
-        return minus_cost
+    def __init__(self, env: VectorEnv, task: ControlTask) -> None:
+        super().__init__(env)
+        self._task = task
 
-    return reward
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Step, and replace the rewards."""
+        obs, total, terminated, truncated, info = self.env.step(actions)
+        samples = np.full(self.num_envs, self._task.repeat)
+        remaining = np.zeros(self.num_envs)
+        if terminated.any():
+            age = info["final_info"]["sample"]
+            samples = np.where(terminated, (age - 1) % self._task.repeat + 1, samples)
+            remaining = np.where(terminated, self._task.steps - np.ceil(age / self._task.repeat), 0.0)
+        cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
+        return obs, -cost * (1.0 + remaining), terminated, truncated, info
 
 
 def _linear(start: float) -> Callable[[float], float]:

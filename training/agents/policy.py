@@ -13,10 +13,12 @@ from gymnasium.vector import AutoresetMode
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
+from kkl_gym import get_system
 from observers import MLP
-from observers.artifact import resolve, shipped
-from training.agents.information import Features, Information, make
+from observers.artifact import ArtifactError, resolve, shipped
+from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, STACKED, Features, Information, make
 from training.agents.tasks import ControlTask
+from training.pipeline import describe
 
 FORMAT = 1
 _KEY = "kkl-gym-agent"
@@ -36,6 +38,7 @@ class Agent:
     information : what it is shown.
     observer : name and version of the shipped map, or path of the file, that it was trained on; None without.
     fingerprint : SHA-256 of that file.
+    rules : what else its observations follow from, see :func:`rules`.
     training : how it was trained.
     """
 
@@ -45,6 +48,7 @@ class Agent:
     information: Information
     observer: str | None = None
     fingerprint: str | None = None
+    rules: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
@@ -56,10 +60,17 @@ class Agent:
     def make(self, num_envs: int, autoreset_mode: str | AutoresetMode = AutoresetMode.DISABLED) -> Features:
         """The environment that the agent was trained in.
 
-        Raises AgentError if its observer's file has changed or the policy does not fit the environment.
+        Raises AgentError if its observer, the system's equations or what its observations are made of have changed, or
+        the policy does not fit the environment.
         """
+        if self.information in ("x_hat", "z") and self.observer is None:
+            raise AgentError(f"an agent that knows {self.information} must name its observer")
         if self.observer is not None and fingerprint(self.observer) != self.fingerprint:
             raise AgentError(f"the agent was trained on another version of the observer {self.observer!r}")
+        now = rules(self.task)
+        for name in now:
+            if self.rules.get(name) != now[name]:
+                raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is {now[name]} now")
         env = make(self.task, self.information, num_envs, autoreset_mode, self.observer)
         sizes = (env.single_observation_space.shape[0], env.single_action_space.shape[0])  # type: ignore[index]
         if sizes != (self.network.inputs, self.network.outputs):
@@ -81,6 +92,7 @@ class Agent:
             "information": self.information,
             "observer": self.observer,
             "fingerprint": self.fingerprint,
+            "rules": dict(self.rules),
             "training": dict(self.training),
         }
         target = Path(path)
@@ -115,11 +127,27 @@ class Agent:
             task = described.pop("task")
             if task["start_box"] is not None:
                 task["start_box"] = tuple(tuple(ends) for ends in task["start_box"])
+            if described["information"] not in INFORMATION:
+                raise AgentError(f"{path} knows {described['information']!r}, none of {', '.join(INFORMATION)}")
             return cls(network=network, task=ControlTask(**task), **described)
         except AgentError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise AgentError(f"{path} is incomplete: {error!r}") from error
+
+
+def rules(task: ControlTask) -> dict[str, Any]:
+    """What an agent's observations follow from beside its task and observer: equations, target, scale, constants."""
+    system = get_system(task.system)
+    described = {
+        "equations": describe(system)["equations"],
+        "target": system.target,
+        "scale": system.scale,
+        "process_noise": system.process_noise,
+        "stacked": STACKED,
+        "ekf_process_noise": EKF_PROCESS_NOISE,
+    }
+    return dict(json.loads(json.dumps(described)))
 
 
 def versioned(observer: str) -> str:
@@ -128,5 +156,8 @@ def versioned(observer: str) -> str:
 
 
 def fingerprint(observer: str) -> str:
-    """SHA-256 of an observer's file."""
-    return hashlib.sha256(resolve(observer).read_bytes()).hexdigest()
+    """SHA-256 of an observer's file; raises AgentError if there is none."""
+    try:
+        return hashlib.sha256(resolve(observer).read_bytes()).hexdigest()
+    except (OSError, ArtifactError) as error:
+        raise AgentError(f"the agent's observer cannot be read: {error}") from error
