@@ -191,6 +191,6 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     def _next_noise(self) -> tuple[list[float], list[float]]:
         """One sample of (w, v)."""
         if not self._noise:
-            w, v = self.plant.noise(self.np_random)
-            self._noise = [*zip(w.T.tolist()[::-1], v.T.tolist()[::-1], strict=True)]
+            w, v = self.plant.noise(*self.plant.draw_noise(self.np_random))
+            self._noise = [*zip(w.tolist()[::-1], v.tolist()[::-1], strict=True)]
         return self._noise.pop()

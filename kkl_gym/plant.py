@@ -58,15 +58,16 @@ class Plant:
         self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
-        self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)[:, None]
+        self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
-    def noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``NOISE_BLOCK`` samples of process and measurement noise, (nx, samples) and (ny, samples)."""
-        w = rng.random((self.system.nx, NOISE_BLOCK))
-        w -= 0.5
-        w *= self._w_range
-        return w, self.measurement_noise * rng.standard_normal((self.system.ny, NOISE_BLOCK))
+    def draw_noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """``NOISE_BLOCK`` samples for :meth:`noise` to scale, (samples, nx) and (samples, ny)."""
+        return rng.random((NOISE_BLOCK, self.system.nx)), rng.standard_normal((NOISE_BLOCK, self.system.ny))
+
+    def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Process noise w and measurement noise v of what was drawn, (n, nx) and (n, ny)."""
+        return (drawn_w - 0.5) * self._w_range, drawn_v * self.measurement_noise
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
         """A start uniform in ``start_box``, (nx,)."""

@@ -15,6 +15,7 @@ from kkl_gym.simulate import advance_batch
 from kkl_gym.system import Box, System
 
 Infos = dict[str, Any]
+ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
 
 
 class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -74,8 +75,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._target = np.array(self.system.target)[:, None]
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # Blocks of noise [w, v] and where in its block each row is; at first, past the end.
-        self._blocks = np.empty((nx + ny, NOISE_BLOCK, num_envs))
+        # Blocks of noise yet to be scaled, and where in its block each row is; at first, past the end.
+        self._drawn_w, self._drawn_v = (np.empty((NOISE_BLOCK, num_envs, width)) for width in (nx, ny))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
@@ -239,17 +240,24 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
         used = self._used[rows]
         if used.max() == NOISE_BLOCK:
-            empty = used == NOISE_BLOCK
-            fresh = [np.concatenate(self.plant.noise(self._rng(row))) for row in rows[empty].tolist()]
-            self._blocks[:, :, rows[empty]] = np.stack(fresh, axis=-1)
-            used[empty] = 0
+            self._draw(rows[used == NOISE_BLOCK])
+            used[used == NOISE_BLOCK] = 0
         self._used[rows] = used + 1
         first = used[0]
         if len(rows) == self.num_envs and (used == first).all():
-            drawn = self._blocks[:, first]
+            drawn = self._drawn_w[first], self._drawn_v[first]
         else:
-            drawn = self._blocks[:, used, rows]
-        return drawn[: self.system.nx], drawn[self.system.nx :]
+            drawn = self._drawn_w[used, rows], self._drawn_v[used, rows]
+        w, v = self.plant.noise(*drawn)
+        return np.ascontiguousarray(w.T), v.T
+
+    def _draw(self, rows: np.ndarray) -> None:
+        """New blocks of noise for some rows: drawn row by row, stored sample by sample, a few rows at a time."""
+        for first in range(0, len(rows), ROWS_AT_ONCE):
+            some = rows[first : first + ROWS_AT_ONCE]
+            w, v = zip(*(self.plant.draw_noise(self._rng(row)) for row in some.tolist()), strict=True)
+            at: Any = slice(some[0], some[-1] + 1) if len(rows) == self.num_envs else some
+            self._drawn_w[:, at], self._drawn_v[:, at] = np.stack(w, axis=1), np.stack(v, axis=1)
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
