@@ -181,12 +181,13 @@ def test_measure_marks_the_lost_and_the_escaped():
 
 def test_methods_that_are_slow_get_the_first_trajectories():
     system, dt = get_system("van_der_pol"), 0.05
-    runs = unseen_runs(system, dt, 2, 1.0, 0, "X")
+    many = unseen_runs(system, dt, 100, 1.0, 0, "X")
+    runs = many.first(2)
+    assert runs.inside.tolist() == [True, True]
     method = Oracle(runs.x)
     method.trajectories = 2
     frame = measure(method, None, system, dt, Protocol(domains=("X",), trajectories=100, duration=1.0))
     assert len(frame) == 2 * 2
-    many = unseen_runs(system, dt, 100, 1.0, 0, "X")
     np.testing.assert_array_equal(many.x[:, :2], runs.x)
     few, all_of_them = (noisy_output(system, one, 0.5, 100, (0,)) for one in (runs, many))
     np.testing.assert_array_equal(all_of_them[:, :2], few)

@@ -53,6 +53,11 @@ class Runs:
         """Number of trajectories that left the bounds."""
         return int((~self.inside).sum())
 
+    def first(self, n: int) -> "Runs":
+        """The first n of those drawn. (Alone they might differ: rounding depends on the batch, and chaos on it.)"""
+        inside = self.inside[:n]
+        return Runs(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside)
+
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
     """Starts (n, nx), uniform in the training box X, or in a multiple of X (as in the paper) without X itself."""

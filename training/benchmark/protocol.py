@@ -65,7 +65,7 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
     frames = []
     for i, domain in enumerate(protocol.domains):
         seed = (EVALUATION_SEED, protocol.seed, 1, i)
-        runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, domain)
+        runs = unseen_runs(system, dt, protocol.trajectories, protocol.duration, protocol.seed, domain).first(n)
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.noise:
             y = noisy_output(system, runs, noise, protocol.trajectories, seed)
@@ -95,7 +95,10 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
     The geometric mean over the noise levels that it is tuned for of the median SMAPE over all steps, in percent.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
-    runs = unseen_runs(system, dt, n, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED)
+    everyone = unseen_runs(
+        system, dt, protocol.trajectories, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED
+    )
+    runs = everyone.first(n)
     if not runs.inside.any():
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
     seed = (VALIDATION_SEED, protocol.seed, 1)
