@@ -62,7 +62,7 @@ def test_a_saved_agent_plays_the_same(learned):
     assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v1")
     assert read.fingerprint == fingerprint("van_der_pol")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 64 * 64)
-    assert (folder / "progress.csv").read_text().startswith("time/")
+    assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
     episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
     assert np.array_equal(episodes[0].x, episodes[1].x)
     assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)

@@ -604,6 +604,9 @@ def test_demo_and_maps(tmp_path, capsys):
 def test_speed_measures_every_environment(capsys):
     from training.speed import Speed
 
-    ratios = Speed(steps=20, turns=1).run(Console())
-    assert len(ratios) == 9
+    ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
+    assert len(ratios) == 9 + 13
+    printed = capsys.readouterr().out
+    assert "simulation" in printed
+    assert "KKLLorenz-v0, z" in printed
     assert all(ratio > 0 for ratio in ratios.values())
