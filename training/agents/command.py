@@ -144,4 +144,6 @@ def find(name: str) -> Path:
 
 def _shipped() -> list[Any]:
     folder = files("training.agents").joinpath("shipped")
+    if not folder.is_dir():  # no agent ships yet
+        return []
     return sorted((path for path in folder.iterdir() if path.name.endswith(".safetensors")), key=lambda path: path.name)
