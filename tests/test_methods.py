@@ -71,6 +71,16 @@ def test_forward_map_of_a_linear_system_is_the_sylvester_solution(name, steps, t
     assert np.sqrt(((back - x) ** 2).mean() / (x**2).mean()) < max(3 * tolerance, 0.05)  # T's error, magnified
 
 
+def test_ae_is_trained_in_full_for_the_cutoff_that_did_best(tmp_path):
+    method, system, artifact, _ = trained_on_oscillator("ae", tmp_path / "a", steps=3)
+    settled = method.settled(method.configurations(system)[0], artifact)
+    assert settled["cutoff"] == artifact.training["cutoff"]
+    task = Task(system, replace(SMALL, steps=3), tmp_path / "b")
+    again = method.train(task, {**settled, "cutoff": 1.25})
+    assert again.training["cutoff"] == 1.25
+    assert not list((tmp_path / "b").glob("every-cutoff*"))
+
+
 def late_error(x, x_hat):
     """Over the second half, relative to the size of the motion."""
     late = slice(len(x) // 2, None)

@@ -20,6 +20,8 @@ from training.methods import METHODS, Budget, Configuration, Method, Task, get_m
 from training.optimise import seconds_spent
 from training.pipeline import describe
 
+FAILED = 200.0  # the worst SMAPE there is, for a configuration whose training blows up
+
 
 @dataclass(frozen=True)
 class Job:
@@ -144,10 +146,15 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
                 trained, _ = _train(job, method, configuration, budget, f"configuration-{i}")
                 score = validate(method, trained, system, job.budget.dt, job.validation)
             except FloatingPointError:  # a training that blows up is no candidate
-                score = 200.0
+                score = FAILED
             write(path, json.dumps({"configuration": dict(configuration), "score": score}) + "\n")
         scores.append(float(json.loads(path.read_text())["score"]))
-    return configurations[scores.index(min(scores))], scores
+    best = scores.index(min(scores))
+    if min(scores) == FAILED:
+        return configurations[best], scores
+    budget = replace(job.budget, seconds=job.search)
+    trained, _ = _train(job, method, configurations[best], budget, f"configuration-{best}")  # loads what is there
+    return method.settled(configurations[best], trained), scores
 
 
 def _train(job: Job, method: Method[Any], configuration: Configuration, budget: Budget, name: str) -> tuple[Any, float]:

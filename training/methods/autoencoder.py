@@ -43,17 +43,23 @@ class AE(KKLMethod):
         """The cutoff that the criterion gives, and faster ones: it knows nothing of how well T can be learned."""
         return tuple({"cutoff_factor": factor} for factor in (10.0, 3.0, 1.0))
 
+    def settled(self, configuration: Configuration, trained: Artifact) -> Configuration:
+        """The cutoff that did well: what the criterion says moves with the time that the maps are learned for."""
+        return {**configuration, "cutoff": trained.training["cutoff"]}
+
     def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """Learn for every cutoff, choose one, learn for it."""
+        """Learn for every cutoff, choose one, learn for it; the first two only where the cutoff is not settled yet."""
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
         low, high = system.box()
         rate = float(np.median(np.broadcast_to(system.rate(task.rng.uniform(low, high, (1000, system.nx)).T), 1000)))
-        every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
-        task.fit("every-cutoff", every, every.loss, learning_rate=LEARNING_RATE, share=TUNING)
-        chosen = configuration["cutoff_factor"] * every.best_cutoff()
+        chosen, share = configuration.get("cutoff"), 1.0
+        if chosen is None:
+            every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
+            task.fit("every-cutoff", every, every.loss, learning_rate=LEARNING_RATE, share=TUNING)
+            chosen, share = configuration["cutoff_factor"] * every.best_cutoff(), 1 - TUNING
         problem = _Problem(task, chosen, chosen)
-        task.fit("one-cutoff", problem, problem.loss, learning_rate=LEARNING_RATE, share=1 - TUNING)
+        task.fit("one-cutoff", problem, problem.loss, learning_rate=LEARNING_RATE, share=share)
         z_offset, z_scale = problem.z_offset.cpu().numpy().astype(float), problem.z_scale.cpu().numpy().astype(float)
         scaling = (problem.x_offset, problem.x_scale, z_offset, z_scale)
         told = float(problem.feature(torch.tensor(chosen)))

@@ -145,6 +145,10 @@ class Method(ABC, Generic[Trained]):
         """At most three; the benchmark takes the one that does best on validation trajectories."""
         return ({},)
 
+    def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
+        """What the full training is given, after a short one with this configuration did best."""
+        return configuration
+
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
         """Learn what the observer needs; may raise FloatingPointError if training fails."""
