@@ -66,7 +66,7 @@ class Plant:
         return rng.random((NOISE_BLOCK, self.system.nx)), rng.standard_normal((NOISE_BLOCK, self.system.ny))
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Process noise w and measurement noise v of what was drawn, (n, nx) and (n, ny)."""
+        """Process noise w and measurement noise v of what was drawn, (..., nx) and (..., ny)."""
         return (drawn_w - 0.5) * self._w_range, drawn_v * self.measurement_noise
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:

@@ -10,8 +10,8 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from kkl_gym.compiled import batch_step
 from kkl_gym.plant import NOISE_BLOCK, Plant
-from kkl_gym.simulate import advance_batch
 from kkl_gym.system import Box, System
 
 Infos = dict[str, Any]
@@ -75,8 +75,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._target = np.array(self.system.target)[:, None]
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # Blocks of noise yet to be scaled, and where in its block each row is; at first, past the end.
-        self._drawn_w, self._drawn_v = (np.empty((NOISE_BLOCK, num_envs, width)) for width in (nx, ny))
+        # A block of noise for each row, and where in its block the row is; at first, past the end.
+        self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, ny))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
@@ -196,7 +196,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         whole = len(rows) == self.num_envs
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
-        x = advance_batch(self.system, before, u, w, self.plant.dt)
+        x = batch_step(self.system)(before, u, w, self.plant.dt)
         within = (x >= self._low) & (x <= self._high)
         if within.all():
             inside = np.ones_like(within[0])
@@ -245,19 +245,17 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._used[rows] = used + 1
         first = used[0]
         if len(rows) == self.num_envs and (used == first).all():
-            drawn = self._drawn_w[first], self._drawn_v[first]
-        else:
-            drawn = self._drawn_w[used, rows], self._drawn_v[used, rows]
-        w, v = self.plant.noise(*drawn)
-        return np.ascontiguousarray(w.T), v.T
+            return self._w[first], self._v[first]
+        return self._w[used, :, rows].T, self._v[used, :, rows].T
 
     def _draw(self, rows: np.ndarray) -> None:
         """New blocks of noise for some rows: drawn row by row, stored sample by sample, a few rows at a time."""
         for first in range(0, len(rows), ROWS_AT_ONCE):
             some = rows[first : first + ROWS_AT_ONCE]
-            w, v = zip(*(self.plant.draw_noise(self._rng(row)) for row in some.tolist()), strict=True)
+            drawn = zip(*(self.plant.draw_noise(self._rng(row)) for row in some.tolist()), strict=True)
             at: Any = slice(some[0], some[-1] + 1) if len(rows) == self.num_envs else some
-            self._drawn_w[:, at], self._drawn_v[:, at] = np.stack(w, axis=1), np.stack(v, axis=1)
+            for block, values in zip((self._w, self._v), self.plant.noise(*map(np.array, drawn)), strict=True):
+                block[:, :, at] = values.transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])

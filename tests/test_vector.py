@@ -21,6 +21,7 @@ from kkl_gym import (
     VectorActionRepeat,
 )
 from kkl_gym.plant import NOISE_BLOCK
+from kkl_gym.simulate import advance_batch
 
 everyone = pytest.mark.parametrize("name", ENV_IDS)
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -112,6 +113,12 @@ def test_rows_are_single_environments(name, mode, observe):
     ends = compare(vector(name, mode, observe=observe), sync(name, mode, observe=observe), 60, mode)
     assert len({k for k, _ in ends}) > 2  # at different times
     assert {row for _, row in ends} == set(range(N))
+
+
+def test_rows_are_single_environments_without_numba(monkeypatch):
+    monkeypatch.setattr(kkl_gym.vector, "batch_step", lambda system: partial(advance_batch, system))
+    mode = AutoresetMode.SAME_STEP
+    assert compare(vector("van_der_pol", mode), sync("van_der_pol", mode), 60, mode)
 
 
 @modes

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
-from kkl_gym.simulate import advance_batch
+from kkl_gym.compiled import batch_step
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
@@ -118,7 +118,7 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
     if isinstance(base, kkl_gym.KKLVectorEnv):
         system, x = base.plant.system, info["x"].T.copy()
         u, w = np.zeros((system.nu, x.shape[1])), np.zeros_like(x)
-        shares["simulation"] = _share(lambda: advance_batch(system, x, u, w, base.plant.dt), step)
+        shares["simulation"] = _share(lambda: batch_step(system)(x, u, w, base.plant.dt), step)
     if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
         shares["network"] = _share(env.observer.decode, step)
     return shares

@@ -1,0 +1,132 @@
+import functools
+import importlib.util
+import math
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from kkl_gym import SYSTEMS, System, get_system
+from kkl_gym.compiled import batch_step, compiled_step
+from kkl_gym.elementary import cos, sin, tanh
+from kkl_gym.simulate import advance_batch
+
+DT = 0.01
+
+
+@dataclass(frozen=True)
+class Unicycle(System):
+    """Inputs through a matrix that depends on the state, two outputs, a numerical rate."""
+
+    drift: float = 0.3
+
+    name = "unicycle"
+    X = ((-1, 1), (-1, 1), (-3, 3))
+    bounds = ((-10, 10), (-10, 10), (-30, 30))
+    u_max = (2.0, 3.0)
+
+    def f(self, x):
+        return self.drift * tanh(x[1]), -self.drift * x[0] ** 3, 0.0 * x[2]
+
+    def g(self, x):
+        return (cos(x[2]), 0.0), (sin(x[2]), 0.0), (0.0, 1.0)
+
+    def h(self, x):
+        return x[0], x[1]
+
+
+class Branching(Unicycle):
+    """Equations that single states and symbols cannot share."""
+
+    name = "branching"
+
+    def f(self, x):
+        return np.where(x[1] > 0, x[1], 0.0), -x[0], 0.0 * x[2]
+
+
+@dataclass(frozen=True)
+class Autonomous(System):
+    name = "autonomous"
+    X = ((0.5, 1),)
+    bounds = ((-5, 5),)
+
+    def f(self, x):
+        return (1.0 / (x[0] - 1.0),)
+
+    def h(self, x):
+        return (x[0],)
+
+    def rate(self, x):
+        return 1.0
+
+
+systems = pytest.mark.parametrize("system", [*(get_system(name) for name in SYSTEMS), Unicycle()])
+
+
+def batch(system, n=200, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(*system.box(2), (n, system.nx)).T
+    return x, rng.uniform(-1, 1, (system.nu, n)), rng.uniform(-1, 1, x.shape)
+
+
+@systems
+@pytest.mark.parametrize("dt", [DT, 0.2])
+def test_compiled_is_numpys_step(system, dt):
+    x, u, w = batch(system)
+    before = x.copy()
+    expected = advance_batch(system, x, u, w, dt)
+    got = compiled_step(system)(x, u, w, dt)
+    assert got.flags.c_contiguous
+    assert (x == before).all()
+    assert np.allclose(got, expected, rtol=1e-11, atol=1e-11, equal_nan=True)
+
+
+def test_any_memory_layout_and_no_rows():
+    system = Unicycle()
+    x, u, w = batch(system, 5)
+    expected = batch_step(system)(x, u, w, DT)
+    assert (batch_step(system)(*map(np.asfortranarray, (x, u, w)), DT) == expected).all()
+    assert (batch_step(system)(x[:, ::2], u[:, ::2], w[:, ::2], DT) == expected[:, ::2]).all()
+    assert batch_step(system)(x[:, :0], u[:, :0], w[:, :0], DT).shape == (3, 0)
+
+
+@systems
+def test_lost_rows_are_nan_without_warning_and_leave_the_others(system):
+    x, u, w = batch(system, 4)
+    expected = batch_step(system)(x, u, w, DT)
+    for wild in (math.nan, math.inf, 1e200):
+        x[:, 1] = wild
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            got = batch_step(system)(x, u, w, DT)
+        assert not np.isfinite(got[:, 1]).all()
+        assert (got[:, [0, 2, 3]] == expected[:, [0, 2, 3]]).all()
+
+
+def test_division_by_zero_and_no_inputs():
+    got = compiled_step(Autonomous())(np.array([[1.0, 0.5]]), np.zeros((0, 2)), np.zeros((1, 2)), DT)
+    assert not np.isfinite(got[0, 0])
+    assert got[0, 1] == pytest.approx(advance_batch(Autonomous(), np.array([[0.5]]), [], np.zeros((1, 1)), DT)[0, 0])
+
+
+def test_parameters_are_the_systems_own():
+    x, u, w = batch(Unicycle(), 3)
+    fast, slow = (batch_step(Unicycle(drift))(x, u, w, DT) for drift in (3.0, 0.0))
+    assert not np.allclose(fast, slow)
+
+
+def test_numpy_where_equations_cannot_be_compiled():
+    with pytest.raises(TypeError):
+        compiled_step(Branching())
+    step = batch_step(Branching())
+    assert isinstance(step, functools.partial)
+    x, u, w = batch(Branching(), 3)
+    assert (step(x, u, w, DT) == advance_batch(Branching(), x, u, w, DT)).all()
+
+
+@pytest.mark.parametrize("missing", ["numba", "sympy"])
+def test_numpy_where_a_library_is_missing(monkeypatch, missing):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == missing else find(name))
+    assert isinstance(batch_step(Unicycle(drift=0.123)), functools.partial)
