@@ -1,6 +1,7 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
 try:
+    from training.certificates import Certificate, certify
     from training.config import Config, preset
     from training.evaluate import errors, unseen_runs
     from training.metrics import smape
@@ -10,4 +11,4 @@ except ModuleNotFoundError as error:
         f'{error}: training and the kkl-gym command need pip install "kkl-gym[train]"', name=error.name
     ) from None
 
-__all__ = ["Config", "Result", "errors", "preset", "smape", "train", "unseen_runs"]
+__all__ = ["Certificate", "Config", "Result", "certify", "errors", "preset", "smape", "train", "unseen_runs"]

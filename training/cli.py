@@ -222,6 +222,7 @@ def main(arguments: list[str] | None = None) -> None:
     from training.agents.command import AgentCommand
     from training.agents.compare import Compare
     from training.benchmark.command import Benchmark
+    from training.certificates.command import Certify
     from training.demo import Demo
     from training.speed import Speed
 
@@ -230,6 +231,7 @@ def main(arguments: list[str] | None = None) -> None:
         "evaluate": Evaluate,
         "benchmark": Benchmark,
         "agent": AgentCommand,
+        "certify": Certify,
         "maps": Maps,
         "demo": Demo,
         "speed": Speed,

@@ -1,0 +1,273 @@
+"""Certificates on a linear system, where everything is known in closed form, and on the shipped maps."""
+
+import dataclasses
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from linear_system import C, F, Oscillator, sylvester
+from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+
+import observers
+from kkl_gym import System, get_system
+from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+from observers.artifact import resolve
+from training import certify
+from training.certificates.certify import residual
+from training.certificates.gains import h2, h_infinity, theorem_gain
+from training.certificates.generalisation import generalisation_term, pseudo_dimension_bound
+from training.certificates.smooth import Smooth, decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
+from training.cli import main
+from training.data import output
+
+A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
+M = sylvester(A, B)
+M_inv = np.linalg.pinv(M)
+
+
+def linear_observer(spoiled=1.0, A=A):
+    """The exact observer of the oscillator; ``spoiled`` scales its T_inv."""
+    zeros, ones = np.zeros, np.ones
+    return Artifact(
+        filter=LinearFilter(A, B, 0.01),
+        inverse=InverseMap(
+            MLP([(spoiled * M_inv).astype(np.float32)], [zeros(2, np.float32)], "tanh"),
+            ("z_y",), zeros(3), np.eye(3), zeros(3), zeros(2), ones(2),
+        ),
+        forward=ForwardMap(
+            MLP([M.astype(np.float32)], [zeros(3, np.float32)], "tanh"), zeros(2), ones(2), zeros(3), ones(3)
+        ),
+        system="oscillator",
+        parameters={},
+        training={"physics_weight": 0.5, "trajectories": 100, "samples": 200},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return certify(linear_observer(), Oscillator(), 0.5, process_noise=0.0, trajectories=50)
+
+
+def test_exact_maps_have_no_risk(exact):
+    # what is left is the hold's error between samples, of order dt^2, and float32
+    assert exact.error < 1e-9
+    assert exact.forward.data_risk < 1e-9
+    assert exact.forward.pde_risk < 1e-12
+    assert exact.forward.reconstruction_risk < 1e-12
+    assert list(exact.forward.residual.values()) == sorted(exact.forward.residual.values())
+
+
+def test_the_residual_is_that_of_the_equation():
+    wrong = dataclasses.replace(linear_observer(), forward=ForwardMap(
+        MLP([(M + 0.1).astype(np.float32)], [np.full(3, 0.2, np.float32)], "tanh"),
+        np.array([0.3, 0.0]), np.array([2.0, 1.0]), np.zeros(3), np.array([1.0, 1.0, 3.0]),
+    ))  # fmt: skip
+    x = np.random.default_rng(0).uniform(-1, 1, (10, 2))
+    T = np.diag([1, 1, 3.0]) @ (M + 0.1) @ np.diag([0.5, 1.0])
+    offset = np.diag([1, 1, 3.0]) @ (0.2 - (M + 0.1) @ [0.15, 0.0])
+    expected = x @ (T @ F - A @ T - B @ C).T - A @ offset
+    assert np.allclose(residual(wrong, Oscillator(), x), expected, atol=1e-6)
+
+
+def test_sensitivities_of_a_linear_observer(exact):
+    assert exact.lipschitz_lower == pytest.approx(np.linalg.norm(M_inv, 2), rel=1e-6)
+    assert exact.lipschitz_upper == pytest.approx(np.linalg.norm(M_inv, 2), rel=1e-6)
+    assert exact.output_lipschitz == 1.0
+    assert exact.gain_theorem == pytest.approx(np.sqrt(3.0))  # cond(V) = 1, |B| = sqrt(3), 1
+    # the noise in x_hat: the Lyapunov equation of the filter, written for [z, last y]
+    linear = LinearFilter(A, B, 0.01)
+    phi = np.block([[linear.transition, linear.early_y], [np.zeros((1, 3)), np.zeros((1, 1))]])
+    drive = np.vstack([linear.late_y, [[1.0]]])
+    P = solve_discrete_lyapunov(phi, drive @ drive.T)[:3, :3]
+    assert exact.gain_h2 == pytest.approx(np.sqrt(np.trace(P)), rel=1e-9)
+    predicted = 0.5 * np.sqrt(np.trace(M_inv @ P @ M_inv.T))
+    assert exact.predicted_noise_error == pytest.approx(predicted, rel=1e-5)
+    assert exact.measured_noise_error == pytest.approx(predicted, rel=0.03)
+
+
+def test_h2_tends_to_the_continuous_one():
+    # white noise on samples dt apart is continuous white noise of intensity dt
+    P = solve_continuous_lyapunov(A, -B @ B.T)
+    for dt, tolerance in ((0.01, 0.02), (0.001, 0.002)):
+        assert h2(LinearFilter(A, B, dt)) == pytest.approx(np.sqrt(dt * np.trace(P)), rel=tolerance)
+
+
+@pytest.mark.parametrize("poles", [A, np.array([[-0.2, 5.0, 0.0], [-5.0, -0.2, 0.0], [0.0, 0.0, -3.0]])])
+def test_h_infinity_by_bisection(poles):
+    """A gain bounds the norm if no frequency reaches it: the symplectic pencil has no eigenvalue on the circle."""
+    linear = LinearFilter(poles, B, 0.01)
+    phi, E, L = linear.transition, linear.early_y, linear.late_y
+    # z_k = s_k + L y_k with s_k+1 = Phi s_k + (Phi L + E) y_k
+    drive, n = phi @ L + E, 3
+
+    def reached(gain):
+        R = gain**2 * np.eye(1) - L.T @ L
+        if np.linalg.eigvalsh(R)[0] <= 0:
+            return True
+        G = drive @ np.linalg.solve(R, drive.T)
+        closed = phi + drive @ np.linalg.solve(R, L.T)
+        Q = np.eye(n) + L @ np.linalg.solve(R, L.T)
+        left = np.block([[np.eye(n), -G], [np.zeros((n, n)), closed.T]])
+        right = np.block([[closed, np.zeros((n, n))], [-Q, np.eye(n)]])
+        return bool((np.abs(np.abs(np.linalg.eigvals(np.linalg.solve(left, right))) - 1.0) < 1e-7).any())
+
+    low, high = 0.0, 1e3
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if reached(middle) else (low, middle)
+    assert h_infinity(linear) == pytest.approx(high, rel=1e-5)
+    assert h_infinity(linear) <= theorem_gain(linear)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_lipschitz_constants_bracket_the_truth(activation):
+    rng = np.random.default_rng(0)
+    for trial in range(5):
+        sizes = (4, 20, 15, 3)
+        weights = tuple(rng.normal(size=(b, a)) for a, b in pairwise(sizes))
+        network = Smooth(weights, tuple(rng.normal(size=b) for b in sizes[1:]), activation)
+        x = 3 * rng.normal(size=(2000, 4))
+        lower, at = lipschitz_lower(network, x)
+        upper = lipschitz_upper(network, 100)
+        assert (x == at).all(1).any()
+        pairs = np.linalg.norm(network(x[:1000]) - network(x[1000:]), axis=1)
+        assert (pairs <= upper * np.linalg.norm(x[:1000] - x[1000:], axis=1)).all()
+        assert lower <= upper < norm_product(network), trial
+
+
+def test_lipschitz_constants_that_are_known():
+    assert lipschitz_upper(Smooth((np.diag([3.0, 2.0]),), (np.zeros(2),), "tanh")) == pytest.approx(3.0)
+    # one neuron, at its steepest in zero: |w2| |w1|; and layers of orthonormal rows, at their steepest together
+    neuron = Smooth((np.array([[3.0, 4.0]]), np.array([[2.0]])), (np.zeros(1), np.zeros(1)), "tanh")
+    assert lipschitz_upper(neuron) == pytest.approx(10.0, rel=1e-3)
+    assert lipschitz_lower(neuron, np.zeros((1, 2)))[0] == pytest.approx(10.0)
+    turns = [np.linalg.qr(np.random.default_rng(i).normal(size=(6, 6)))[0] for i in range(3)]
+    rotation = Smooth((turns[0], np.eye(6), turns[2]), (np.zeros(6),) * 3, "tanh")
+    assert lipschitz_upper(rotation) == pytest.approx(1.0, rel=1e-3)
+    assert lipschitz_upper(Smooth((np.zeros((2, 3)), np.zeros((1, 2))), (np.zeros(2), np.ones(1)), "silu")) == 0.0
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_jacobians_by_differences(activation):
+    rng = np.random.default_rng(1)
+    network = Smooth((rng.normal(size=(7, 3)), rng.normal(size=(5, 7)), rng.normal(size=(2, 5))),
+                     (rng.normal(size=7), rng.normal(size=5), rng.normal(size=2)), activation)  # fmt: skip
+    x, eps = rng.normal(size=(4, 3)), 1e-6
+    for j in range(3):
+        step = eps * np.eye(3)[j]
+        assert np.allclose(network.jacobian(x)[..., j], (network(x + step) - network(x - step)) / (2 * eps), atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "rossler-spinn"])
+def test_the_smooth_maps_are_the_observers(name):
+    observer = observers.load(name, 0.3)
+    y = np.random.default_rng(2).normal(size=(1, 1))
+    observer.reset(y)
+    for _ in range(3000):  # beyond the greatest age that the map tells apart
+        x_hat = observer.step(y)
+    assert np.allclose(decoder(observer.artifact, 0.3)(observer.z), x_hat, atol=1e-4)
+    if observer.artifact.forward is not None:
+        x = np.random.default_rng(3).normal(size=(5, 3))
+        assert np.allclose(encoder(observer.artifact.forward)(x), observer.artifact.forward(x), atol=1e-5)
+
+
+def test_a_wrong_filter_violates_the_bound_without_noise(exact):
+    """The bound is that of the maps for A; the observer then runs with another one."""
+    spoiled = certify(linear_observer(1.05), Oscillator(), 0.0, process_noise=0.0, trajectories=50)
+    assert 0 < spoiled.error <= spoiled.forward.bound
+    wrong = certify(linear_observer(1.05, A=1.3 * A), Oscillator(), 0.0, process_noise=0.0, trajectories=50)
+    assert wrong.error > 5 * spoiled.forward.bound
+    assert wrong.forward.data_risk > 1e-3  # which a certificate of that observer says
+
+
+def test_bounds_of_the_paper_are_put_together_as_printed():
+    found = certify(linear_observer(1.1), Oscillator(), 0.2, process_noise=0.1, psi=0.7, trajectories=20)
+    forward = found.forward
+    assert found.noise_bound == pytest.approx(0.6)
+    assert found.process_noise == pytest.approx(0.1 * np.sqrt(2))
+    assert forward.physics_risk == pytest.approx(forward.data_risk + 0.5 * forward.pde_risk)
+    l2 = found.lipschitz_upper**2
+    assert forward.bound == pytest.approx(4 * forward.reconstruction_risk + 4 * l2 * forward.physics_risk)
+    noise = 2 * l2 * found.gain_theorem**2 * (found.output_lipschitz * 0.7 + 0.6) ** 2
+    assert found.noise_term == pytest.approx(noise)
+    assert forward.noisy_bound == pytest.approx(forward.bound + noise)
+    assert found.noisy_error < forward.noisy_bound
+
+
+@pytest.mark.parametrize("name", [
+    "reverse_duffing-spinn", "van_der_pol",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in (
+        "reverse_duffing", "van_der_pol-spinn", "rossler", "rossler-spinn", "lorenz", "lorenz-spinn")),
+])  # fmt: skip
+def test_shipped_maps(name):
+    system = get_system(name.removesuffix("-spinn"))
+    found = certify(Artifact.read(resolve(name)), system, 0.5, trajectories=60)
+    assert 0.5 < found.predicted_noise_error / found.measured_noise_error < 2.0
+    assert found.lipschitz_lower <= found.lipschitz_upper
+    assert found.gain_h2 < found.gain_h_infinity <= found.gain_theorem
+    assert (found.forward is not None) == name.endswith("-spinn")
+    if found.forward is not None:
+        assert found.error <= found.forward.bound
+        assert found.noisy_error <= found.forward.noisy_bound
+    text = json.dumps(found.as_json(), allow_nan=False)
+    assert json.loads(text)["inverse_term"] is None  # infinite
+
+
+def test_generalisation_terms():
+    mlp = MLP([np.zeros((3, 2), np.float32), np.zeros((1, 3), np.float32)], [np.zeros(3), np.zeros(1)], "tanh")
+    d, q, t = 13, 3, 2 * 13 + 15 + 3 + 1
+    expected = (d * (q + 1)) ** 2 + 11 * d * (q + 1) * (t + np.log2(9 * d * (q + 1)))
+    assert pseudo_dimension_bound(mlp) == pytest.approx(expected)
+    assert generalisation_term(2.0, 100, 99, 0.05) == np.inf
+    by_hand = 2 * np.sqrt(200 * np.log(np.e * 100) / 1e4) + 2 * np.sqrt(np.log(20) / 2e4)
+    assert generalisation_term(2.0, 100, 10_000, 0.05) == pytest.approx(by_hand)
+
+
+def test_bad_requests():
+    with pytest.raises(observers.ArtifactError, match="system"):
+        certify(linear_observer(), get_system("van_der_pol"))
+    for wrong in ({"measurement_noise": -1.0}, {"measurement_noise": np.nan}, {"process_noise": -0.1}, {"psi": np.inf},
+                  {"trajectories": 1}, {"delta": 0.0}, {"delta": 1.0}, {"seed": -1}):  # fmt: skip
+        with pytest.raises(ValueError, match=r"must|need"):
+            certify(linear_observer(), Oscillator(), **wrong)
+    with pytest.raises(ValueError, match="beyond"):
+        certify(Artifact.read(resolve("van_der_pol")), get_system("van_der_pol"), 2.0)
+    with pytest.raises(ValueError, match="no forward map"):
+        residual(Artifact.read(resolve("van_der_pol")), get_system("van_der_pol"), np.zeros((1, 2)))
+
+
+def test_motions_that_leave_are_an_error():
+    class Leaving(Oscillator):
+        name = "oscillator"
+        bounds = ((-1.01, 1.01), (-1.01, 1.01))
+
+    with pytest.raises(ValueError, match="stayed within"):
+        certify(linear_observer(), Leaving(), 0.1, process_noise=5.0, trajectories=10)
+
+
+def test_output_of_a_nonlinear_h():
+    class Squared(Oscillator):
+        name = "oscillator"
+
+        def h(self, x):
+            return (x[0] ** 2,)
+
+    from training.certificates.certify import output_lipschitz
+
+    assert isinstance(Squared(), System)
+    assert output_lipschitz(Squared(), np.random.default_rng(0)) == pytest.approx(2.0, rel=0.01)
+    assert output(Squared(), np.array([[0.5, 0.0]])) == pytest.approx(0.25)
+
+
+def test_command(tmp_path, capsys):
+    linear_observer(1.02).save(tmp_path / "mine.safetensors")
+    script = __file__.replace("test_certificates", "linear_system")
+    main(["certify", str(tmp_path / "mine.safetensors"), "--system", f"{script}:Oscillator", "--trajectories", "10",
+          "--measurement-noise", "0.1", "--out", str(tmp_path / "out")])  # fmt: skip
+    assert json.loads((tmp_path / "out" / "certificate.json").read_text())["observer"] == "mine"
+    assert (tmp_path / "out" / "certificate.png").stat().st_size > 10_000
+    printed = capsys.readouterr().out
+    assert "bound of the rms error" in printed
+    with pytest.raises(SystemExit, match="unknown observer"):
+        main(["certify", "nobody"])

@@ -1,0 +1,29 @@
+"""The terms C_eta and C_theta of the paper's theorem 1: what may be lost between the sample and the population."""
+
+import math
+
+from observers import MLP
+
+
+def pseudo_dimension_bound(mlp: MLP) -> float:
+    """An upper bound of the pseudo-dimension of {(x, y) -> |y - mlp(x)|^2} over all weights.
+
+    Anthony and Bartlett, Neural Network Learning (1999), theorem 8.14: a set of functions of d parameters, each
+    computed by t operations (sums, products, quotients, comparisons) of which q are exponentials, has
+    VC dimension at most (d (q + 1))^2 + 11 d (q + 1) (t + log2(9 d (q + 1))). The pseudo-dimension is the VC dimension
+    of the functions' subgraphs, which a last comparison with a given threshold makes of them. A unit of tanh or
+    x sigmoid(x) takes one exponential and at most four more operations.
+    """
+    parameters = sum(weight.size + bias.size for weight, bias in zip(mlp.weights, mlp.biases, strict=True))
+    units = sum(len(bias) for bias in mlp.biases[:-1])
+    operations = 2 * parameters + 5 * units + 3 * mlp.outputs + 1
+    product = parameters * (units + 1)
+    return float(product**2 + 11 * product * (operations + math.log2(9 * product)))
+
+
+def generalisation_term(largest_loss: float, pseudo_dimension: float, samples: int, delta: float) -> float:
+    """M sqrt(2 d ln(e N/d) / N) + M sqrt(ln(1/delta) / 2N) (paper, sec. 4.2), infinite where N < d: it says nothing."""
+    if samples < pseudo_dimension:
+        return math.inf
+    complexity = math.sqrt(2 * pseudo_dimension * math.log(math.e * samples / pseudo_dimension) / samples)
+    return largest_loss * (complexity + math.sqrt(math.log(1 / delta) / (2 * samples)))
