@@ -27,6 +27,7 @@ class Installed:
         estimate: str,
         measurement_noise: float | None,
         ignore_input: bool,
+        monitor: bool,
     ) -> None:
         if estimate not in ("x", "z"):
             raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
@@ -36,7 +37,9 @@ class Installed:
         self.observer: KKLObserver = load(
             system.name if observer is None else observer,
             plant.measurement_noise if measurement_noise is None else measurement_noise,
+            monitor,
         )
+        self._monitor = monitor
         self.observer.artifact.check(system.name, system.parameters, plant.dt, system.ny, system.nu)
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
@@ -67,9 +70,13 @@ class Installed:
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """z and, unless only z is shown, x_hat; of all rows or of some."""
-        z = self.observer.z if rows is None else self.observer.z[rows]
-        return {"z": z} if self.estimate == "z" else {"z": z, "x_hat": self.observer.decode(rows)}
+        """z and, unless only z is shown, x_hat; the score, if it is kept; of all rows or of some."""
+        found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
+        if self.estimate == "x":
+            found["x_hat"] = self.observer.decode(rows)
+        if self._monitor:
+            found["score"] = self.observer.score if rows is None else self.observer.score[rows]
+        return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """x_hat or z as an observation: float32, within the space."""

@@ -149,14 +149,14 @@ class KKLVectorObservation(VectorEstimate):
     """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
 
     Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
-    in every autoreset mode. ``info`` gains ``z`` and, with ``estimate="x"``, ``x_hat``, a row for each environment;
-    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
+    in every autoreset mode. ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a
+    row for each environment; so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
 
     Parameters
     ----------
     env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
-    observer, estimate, measurement_noise, ignore_input : as for :class:`kkl_gym.KKLObservation`; with "z" the network
-        is not evaluated.
+    observer, estimate, measurement_noise, ignore_input, monitor : as for :class:`kkl_gym.KKLObservation`; with "z" the
+        network is not evaluated, unless there is a monitor.
 
     Raises
     ------
@@ -171,8 +171,9 @@ class KKLVectorObservation(VectorEstimate):
         estimate: Literal["x", "z"] = "x",
         measurement_noise: float | None = None,
         ignore_input: bool = False,
+        monitor: bool = False,
     ) -> None:
-        installed = Installed(plant_of(env), observer, estimate, measurement_noise, ignore_input)
+        installed = Installed(plant_of(env), observer, estimate, measurement_noise, ignore_input, monitor)
         super().__init__(env, installed)
         self.observer = installed.observer
         self.estimate = estimate

@@ -16,7 +16,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     """Shows a learned observer's estimate in place of the state.
 
     The observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment applied. ``info`` gains
-    ``x_hat`` (nx,) and ``z``, the filter's state, both float64.
+    ``x_hat`` (nx,) and ``z``, the filter's state, both float64, and with ``monitor`` ``score``, above 1 where the
+    samples do not fit the estimates (a faulty sensor, states that the map was not made for).
 
     Parameters
     ----------
@@ -27,6 +28,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         [z_y, z_u], within the bounds that bounded outputs and inputs imply.
     measurement_noise : the noise level that the observer assumes; None takes the environment's.
     ignore_input : use a map that knows no inputs (the paper's) although the agent acts.
+    monitor : whether to keep the score, see :attr:`observers.KKLObserver.score`.
 
     Raises
     ------
@@ -42,6 +44,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         estimate: Literal["x", "z"] = "x",
         measurement_noise: float | None = None,
         ignore_input: bool = False,
+        monitor: bool = False,
     ) -> None:
         observer = None if observer is None else os.fspath(observer)
         RecordConstructorArgs.__init__(
@@ -50,14 +53,16 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             estimate=estimate,
             measurement_noise=measurement_noise,
             ignore_input=ignore_input,
+            monitor=monitor,
         )
         gym.Wrapper.__init__(self, env)
         base = env.unwrapped
         if not isinstance(base, KKLEnv):
             raise ValueError(f"KKLObservation needs a kkl_gym environment, got {base}")
-        self._installed = Installed(base.plant, observer, estimate, measurement_noise, ignore_input)
+        self._installed = Installed(base.plant, observer, estimate, measurement_noise, ignore_input, monitor)
         self.observer = self._installed.observer
         self.estimate = estimate
+        self._monitor = monitor
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
         self.observation_space = self._installed.space
 
@@ -91,6 +96,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def _show(self, x_hat: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         z = self.observer.z
         info["x_hat"], info["z"] = x_hat, z
+        if self._monitor:
+            info["score"] = float(self.observer.score)
         if self.render_mode is not None:
             self._trail.append(x_hat.tolist())
         return self._installed.shown(info)

@@ -2,6 +2,7 @@
 
 from observers.artifact import Artifact, ArtifactError, ForwardMap, InverseMap, shipped
 from observers.filter import LinearFilter
+from observers.monitor import Limits, Monitor
 from observers.network import MLP
 from observers.observer import KKLObserver, load
 
@@ -12,7 +13,9 @@ __all__ = [
     "ForwardMap",
     "InverseMap",
     "KKLObserver",
+    "Limits",
     "LinearFilter",
+    "Monitor",
     "load",
     "shipped",
 ]

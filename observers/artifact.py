@@ -16,11 +16,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from observers.filter import LinearFilter
+from observers.monitor import Limits
 from observers.network import MLP
 
 FORMAT = 1
 FEATURES = ("z_y", "z_u", "measurement_noise", "age")
 _KEY = "kkl-gym"
+_LIMITS = ("levels", "mean", "low", "high")
+_LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
 
 class ArtifactError(ValueError):
@@ -115,7 +118,8 @@ class Artifact:
     system : name of the system.
     parameters : its physical parameters.
     forward : T, where one was learned.
-    C : (ny, nx) where the output is linear, h(x) = C x: what coasting needs.
+    C : (ny, nx) where the output is linear, h(x) = C x: what coasting and monitoring need.
+    limits : of the residual y - C x_hat in sound operation, where they were found.
     training : how it was made: method, preset, configuration, seed, measures.
     versions : of the libraries that made it.
     """
@@ -126,6 +130,7 @@ class Artifact:
     parameters: Mapping[str, float]
     forward: ForwardMap | None = None
     C: np.ndarray | None = None
+    limits: Limits | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -137,6 +142,8 @@ class Artifact:
             )
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
+        if self.limits is not None and (self.C is None or self.limits.mean.shape[1] != self.ny):
+            raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C with as many outputs")
 
     @property
     def nx(self) -> int:
@@ -206,6 +213,9 @@ class Artifact:
             for name in ("x_offset", "x_scale", "z_offset", "z_scale"):
                 tensors[f"forward.{name}"] = np.ascontiguousarray(getattr(self.forward, name), dtype=float)
             meta["forward"] = {"activation": self.forward.mlp.activation}
+        if self.limits is not None:
+            tensors |= {f"limits.{name}": np.ascontiguousarray(getattr(self.limits, name)) for name in _LIMITS}
+            meta["limits"] = {name: getattr(self.limits, name) for name in _LIMIT_SCALARS}
         target = Path(path)
         target.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
@@ -265,6 +275,7 @@ class Artifact:
             parameters=meta["system"]["parameters"],
             forward=forward,
             C=tensors.get("C"),
+            limits=_get_limits(tensors, meta["limits"]) if "limits" in meta else None,
             training=meta["training"],
             versions=meta["versions"],
         )
@@ -274,6 +285,12 @@ def _put_mlp(tensors: dict[str, np.ndarray], prefix: str, mlp: MLP) -> None:
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
         tensors[f"{prefix}.{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
         tensors[f"{prefix}.{i}.bias"] = np.ascontiguousarray(bias, dtype=np.float32)
+
+
+def _get_limits(tensors: Mapping[str, np.ndarray], described: Mapping[str, float]) -> Limits:
+    arrays = {name: tensors[f"limits.{name}"] for name in _LIMITS}
+    scalars = {name: described[name] for name in _LIMIT_SCALARS}
+    return Limits(**arrays, **scalars)  # type: ignore[arg-type]
 
 
 def _get_mlp(tensors: Mapping[str, np.ndarray], prefix: str, activation: str) -> MLP:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, resolve
+from observers.monitor import Monitor
 
 _LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
@@ -23,16 +24,22 @@ class KKLObserver:
     ----------
     artifact : what was learned.
     measurement_noise : standard deviation of the noise on each sample of the output, for maps that ask for it.
+    monitor : whether to watch if the samples fit the estimates, see :attr:`score`.
 
     Raises
     ------
-    ValueError : if the noise level is negative or beyond what the map was trained for.
+    ValueError : if the noise level is negative or beyond what the map was trained for, or if the artifact holds no
+        limits for a monitor.
     """
 
-    def __init__(self, artifact: Artifact, measurement_noise: float = 0.5) -> None:
+    def __init__(self, artifact: Artifact, measurement_noise: float = 0.5, monitor: bool = False) -> None:
+        if monitor and artifact.limits is None:
+            raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
         self.artifact = artifact
+        self._monitored = monitor
         self.measurement_noise = measurement_noise
         self._z: np.ndarray | None = None
+        self._x_hat: np.ndarray | None = None  # where the monitor has already made the network say it
         self._age: Any = 0  # samples since reset, an array where rows have restarted
 
     @property
@@ -57,6 +64,8 @@ class KKLObserver:
         self._conditions: list[Any] = []
         if "measurement_noise" in inverse.features:
             self._conditions.append(float(inverse.noise_feature(level)))
+        limits = self.artifact.limits
+        self._monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
 
     @property
     def z(self) -> np.ndarray:
@@ -69,8 +78,24 @@ class KKLObserver:
         """Forget the past and take in the first sample, (..., ny); returns the first estimate, (..., nx)."""
         y0 = np.array(y0, dtype=float)  # a copy: it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1])
-        self._z, self._y, self._age = self.artifact.filter.start(y0), y0, 0
+        self._z, self._y, self._age, self._x_hat = self.artifact.filter.start(y0), y0, 0, None
+        if self._monitor is not None:
+            self._monitor.reset(y0.shape[:-1])
         return self.decode()
+
+    @property
+    def score(self) -> np.ndarray:
+        """How well the samples since reset fit the estimates, (...,): above 1 something is wrong.
+
+        The running mean and mean square of y - C x_hat over their limits in sound operation; 0 right after reset, as it
+        was while samples are missing. A sensor's bias, freezing or dropping out raise it, and states that
+        the map was not made for. See :class:`observers.monitor.Limits` for what a score above 1 is worth.
+
+        Raises RuntimeError before :meth:`reset` or without ``monitor=True``.
+        """
+        if self._monitor is None or self._z is None:
+            raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
+        return self._monitor.score
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
         """Forget the past in some rows of the batch and take in their first samples.
@@ -90,6 +115,9 @@ class KKLObserver:
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, 0, self._age)
+        self._x_hat = None
+        if self._monitor is not None:
+            self._monitor.restart(rows)
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the sample y, (..., ny), that followed the input u, (..., nu); returns the estimate, (..., nx).
@@ -110,6 +138,7 @@ class KKLObserver:
             raise RuntimeError("call reset(y0) before step(y)")
         batch = self._z.shape[:-1]
         u = self._input(u, batch)
+        missing = y is None
         if y is None:
             y = self._predicted_output(self._z, u)
         else:
@@ -124,11 +153,17 @@ class KKLObserver:
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
+        self._x_hat = None
+        if self._monitor is not None and not missing:
+            self._x_hat = self.decode()
+            self._monitor.update(self._y - self._x_hat @ self.artifact.C.T, rows)  # type: ignore[union-attr]
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """The estimate T_inv(z) as things stand, (..., nx), or of some rows of the batch only, (number of rows, nx)."""
         if self._z is None:
             raise RuntimeError("call reset(y0) before the observer is used")
+        if self._x_hat is not None:
+            return self._x_hat.copy() if rows is None else self._x_hat[rows]
         z, age = self._z, self._age
         if rows is not None:
             rows = np.asarray(rows)
@@ -233,15 +268,15 @@ def _finite(values: np.ndarray) -> bool:
     return bool((np.abs(values) <= _LARGEST).all())
 
 
-def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5) -> KKLObserver:
+def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5, monitor: bool = False) -> KKLObserver:
     """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
 
     A name without a version is the newest; ``"van_der_pol-v1"`` is that version for good.
 
     Raises ArtifactError (a ValueError) if there is none or the file is damaged, ValueError on a noise level out
-    of range.
+    of range, or if it holds no limits and a monitor is asked for.
     """
-    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise)
+    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise, monitor)
 
 
 __all__ = ["ArtifactError", "KKLObserver", "load"]

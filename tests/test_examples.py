@@ -24,7 +24,7 @@ def test_own_system_from_the_command_line(tmp_path, capsys):
 
     system = f"{EXAMPLES / 'own_system.py'}:Pendulum"
     sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 50"
-    main(["train", system, *sizes.split(), "--threads", "1", "--out", str(tmp_path)])
+    main(["train", system, *sizes.split(), "--threads", "1", "--no-monitor", "--out", str(tmp_path)])
     path = str(tmp_path / "pendulum.safetensors")
     main(["evaluate", path, "--system", system, "--trajectories", "3", "--duration", "8"])
     assert "2X" in capsys.readouterr().out

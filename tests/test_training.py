@@ -569,7 +569,7 @@ def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monke
 
     monkeypatch.chdir(tmp_path)
     toy_sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 50"
-    main(["train", "van_der_pol", *toy_sizes.split(), "--threads", "1"])
+    main(["train", "van_der_pol", *toy_sizes.split(), "--threads", "1", "--no-monitor"])
     path = tmp_path / "runs" / "van_der_pol" / "van_der_pol.safetensors"
     assert path.exists()
     assert (path.parent / "report.png").stat().st_size > 10_000

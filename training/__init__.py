@@ -1,6 +1,7 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
 try:
+    from training.calibrate import calibrate
     from training.certificates import Certificate, certify
     from training.config import Config, preset
     from training.evaluate import errors, unseen_runs
@@ -11,4 +12,15 @@ except ModuleNotFoundError as error:
         f'{error}: training and the kkl-gym command need pip install "kkl-gym[train]"', name=error.name
     ) from None
 
-__all__ = ["Certificate", "Config", "Result", "certify", "errors", "preset", "smape", "train", "unseen_runs"]
+__all__ = [
+    "Certificate",
+    "Config",
+    "Result",
+    "calibrate",
+    "certify",
+    "errors",
+    "preset",
+    "smape",
+    "train",
+    "unseen_runs",
+]

@@ -41,6 +41,9 @@ class Train:
     closed_loop: bool = False
     """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware);
     takes twice as long. Writes NAME-closed-loop."""
+    monitor: bool = True
+    """Find limits for the observer's monitor as well, which takes a minute or two; left out where the output is not
+    linear."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: dict[str, float] = field(default_factory=dict)
@@ -82,6 +85,7 @@ class Train:
 
     def run(self, console: Console) -> Path:
         """Train; returns the artifact's path."""
+        from training.calibrate import calibrate
         from training.pipeline import train
         from training.report import write_report
 
@@ -104,7 +108,10 @@ class Train:
         device = None if self.device == "auto" else torch.device(self.device)
         result = train(system, config, folder, self.resume, device, console)
         path = folder / f"{name}.safetensors"
-        result.artifact.save(path)
+        result.artifact.save(path)  # before anything else may fail
+        if self.monitor and result.artifact.C is not None:
+            with console.status("finding the monitor's limits"):
+                calibrate(result.artifact, system, seed=config.seed).save(path)
         console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
         write_report(folder / "report.png", result, system)
         console.print(f"wrote {folder / 'report.png'}")

@@ -1,0 +1,225 @@
+"""The residual's limits, and faults that exceed them."""
+
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from conftest import random_artifact
+from linear_system import Oscillator, sylvester
+
+from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
+from observers import MLP, Artifact, ArtifactError, InverseMap, KKLObserver, Limits, LinearFilter, Monitor
+from training.calibrate import MARGIN, WARM_UP, calibrate, sound_runs
+from training.data import output
+
+ONES, ZEROS = np.ones, np.zeros
+
+
+def limits(ny=1, **changes):
+    values = {
+        "levels": np.array([0.0, 1.0]),
+        "mean": np.array([[0.3] * ny, [0.5] * ny]),
+        "low": np.array([[0.0] * ny, [0.4] * ny]),
+        "high": np.array([[0.1] * ny, [2.1] * ny]),
+        "window": 0.1,
+        "warm_up": 0.05,
+        "false_alarms": 0.01,
+        "duration": 50.0,
+    }
+    return Limits(**(values | changes))
+
+
+def test_running_means_by_hand():
+    monitor = Monitor(limits(), 1.0, 0.01)
+    monitor.reset(())
+    a = 1 - np.exp(-0.1)
+    rng = np.random.default_rng(0)
+    mean, square = 0.0, 1.0
+    for k, r in enumerate(rng.normal(0.3, 1.0, 40), 1):
+        monitor.update(np.array([r]))
+        mean, square = mean + a * (r - mean), square + a * (r**2 - square)
+        expected = max(abs(mean) / 0.5, square / 2.1, 0.4 / square)
+        assert monitor.score == pytest.approx(expected if k > 5 else 0.0)
+
+
+def test_limits_between_levels_add_as_variances():
+    mean, low, high = limits().at(0.5)
+    assert mean == pytest.approx(np.sqrt(0.75 * 0.09 + 0.25 * 0.25))
+    assert low == pytest.approx(0.1)
+    assert high == pytest.approx(0.75 * 0.1 + 0.25 * 2.1)
+    with pytest.raises(ValueError, match="beyond"):
+        limits().at(1.01)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"levels": np.array([0.1, 1.0])}, {"levels": np.array([0.0, 0.0])}, {"levels": np.array([0.0])},
+    {"mean": np.array([[0.3], [0.0]])}, {"low": np.array([[-1.0], [0.0]])}, {"high": np.array([[0.1], [0.3]])},
+    {"window": 0.0}, {"warm_up": -1.0}, {"false_alarms": 1.0}, {"duration": 0.0},
+])  # fmt: skip
+def test_impossible_limits(wrong):
+    with pytest.raises(ValueError, match=r"limits|levels|window"):
+        limits(**wrong)
+
+
+def test_rows_of_a_batch_are_monitors_of_their_own():
+    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    rng = np.random.default_rng(1)
+    y, u = rng.normal(size=(30, 3, 1)), rng.uniform(-1, 1, (30, 3, 1))
+    together = KKLObserver(artifact, 1.0, monitor=True)
+    together.reset(y[0])
+    alone = [KKLObserver(artifact, 1.0, monitor=True) for _ in range(3)]
+    for i, observer in enumerate(alone):
+        observer.reset(y[0, i])
+    for k in range(1, 30):
+        active = np.array([True, k % 2 == 0, True])
+        together.advance(y[k], u[k], active)
+        for i in np.flatnonzero(active):
+            alone[i].step(y[k, i], u[k, i])
+        if k == 12:
+            restarted = np.array([False, False, True])
+            together.restart(y[k, 2:], restarted)
+            alone[2].reset(y[k, 2])
+        assert together.score == pytest.approx([float(observer.score) for observer in alone])
+        assert np.allclose(together.decode(), [observer.decode() for observer in alone], atol=1e-5)
+    assert together.score[0] > 1  # weights that nobody trained
+
+
+def test_a_monitor_changes_no_estimate():
+    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    rng = np.random.default_rng(2)
+    y = rng.normal(size=(20, 4, 1))
+    plain, watched = KKLObserver(artifact, 0.3), KKLObserver(artifact, 0.3, monitor=True)
+    assert (plain.reset(y[0]) == watched.reset(y[0])).all()
+    for k in range(1, 20):
+        assert (plain.step(y[k]) == watched.step(y[k])).all()
+        rows = rng.random(4) < 0.5
+        assert (plain.decode(rows) == watched.decode(rows)).all()
+    before = watched.score
+    assert (plain.step(None) == watched.step(None)).all()
+    assert (watched.score == before).all()  # nothing was measured
+    watched.decode()[:] = np.nan  # a copy
+    assert np.isfinite(watched.decode()).all()
+
+
+def test_no_score_without_a_monitor_or_limits():
+    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]))
+    with pytest.raises(ValueError, match="no limits"):
+        KKLObserver(artifact, monitor=True)
+    observer = KKLObserver(artifact)
+    observer.reset(ZEROS(1))
+    with pytest.raises(RuntimeError, match="monitor=True"):
+        _ = observer.score
+    watched = KKLObserver(dataclasses.replace(artifact, limits=limits()), monitor=True)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = watched.score
+    with pytest.raises(ArtifactError, match="need a C"):
+        dataclasses.replace(artifact, C=None, limits=limits())
+    with pytest.raises(ArtifactError, match="2 residuals"):
+        dataclasses.replace(artifact, limits=limits(ny=2))
+
+
+def test_limits_are_stored(tmp_path):
+    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    artifact.save(tmp_path / "a.safetensors")
+    read = Artifact.read(tmp_path / "a.safetensors").limits
+    for entry in dataclasses.fields(Limits):
+        assert np.array_equal(getattr(read, entry.name), getattr(artifact.limits, entry.name))
+
+
+def oscillator_observer():
+    linear = LinearFilter(np.diag([-1.0, -2.5, -4.0]), ONES((3, 1)), 0.05)
+    M_inv = np.linalg.pinv(sylvester(linear.A, linear.B))
+    inverse = InverseMap(
+        MLP([M_inv.astype(np.float32)], [ZEROS(2, np.float32)], "tanh"), ("z_y",), ZEROS(3), np.eye(3), ZEROS(3),
+        ZEROS(2), ONES(2),
+    )  # fmt: skip
+    return Artifact(linear, inverse, "oscillator", {}, C=np.array([[1.0, 0.0]]))
+
+
+class Noiseless(Oscillator):
+    """A linear observer of three fixed modes follows process noise slowly; that is not what is tested here."""
+
+    name = "oscillator"
+    process_noise = 0.0
+
+
+def test_calibration_keeps_its_promise():
+    system = Noiseless()
+    calibrated = calibrate(oscillator_observer(), system, trajectories=600, duration=20.0)
+    found = calibrated.limits
+    assert (np.diff(found.mean[1:, 0]) > 0).all()  # more noise, wider limits
+    assert found.low[0] == 0.0
+    assert found.low[-1] < 1.0 < found.high[-1]  # about the variance of the noise
+    rng = np.random.default_rng(11)
+    x, _ = sound_runs(calibrated, system, 600, 20.0, rng)
+    for level in (0.2, 1.0):
+        y = output(system, x) + level * rng.standard_normal((*x.shape[:2], 1))
+        observer = KKLObserver(calibrated, level, monitor=True)
+        observer.reset(y[0])
+        alarms = np.zeros(x.shape[1], dtype=bool)
+        for k in range(1, len(y)):
+            observer.advance(y[k])
+            alarms |= observer.score > 1
+        assert alarms.mean() < 0.02  # promised 0.01; of 600 runs, 12 are more than chance allows
+        assert MARGIN > 1.0
+
+
+@pytest.mark.parametrize("fault", ["bias", "drop-out", "freeze"])
+def test_faults_are_seen(fault):
+    system = Noiseless()
+    calibrated = calibrate(oscillator_observer(), system, duration=20.0)
+    rng = np.random.default_rng(12)
+    x, _ = sound_runs(calibrated, system, 50, 30.0, rng)
+    x = x[:, np.abs(x[0]).max(-1) > 0.5]
+    level, at = 0.1, 300
+    y = output(system, x) + level * rng.standard_normal((*x.shape[:2], 1))
+    y[at:] = {"bias": y[at:] + 0.4, "drop-out": 0.0 * y[at:], "freeze": np.broadcast_to(y[at], y[at:].shape)}[fault]
+    observer = KKLObserver(calibrated, level, monitor=True)
+    observer.reset(y[0])
+    seen = np.zeros(x.shape[1], dtype=bool)
+    for k in range(1, at + 126):  # one period after the fault
+        observer.advance(y[k])
+        if k >= at:
+            seen |= observer.score > 1
+        else:
+            assert k * 0.05 > WARM_UP or (observer.score == 0).all()
+    assert seen.mean() >= 0.9
+
+
+def test_impossible_calibrations():
+    for wrong in ({"false_alarms": 0.0}, {"duration": 1.0}, {"trajectories": 599}, {"seed": -1}):
+        with pytest.raises(ValueError, match=r"need|too few"):
+            calibrate(oscillator_observer(), Oscillator(), **wrong)
+    with pytest.raises(ValueError, match="not linear"):
+        calibrate(dataclasses.replace(oscillator_observer(), C=None), Oscillator())
+    with pytest.raises(ArtifactError, match="system"):
+        calibrate(oscillator_observer(), Steep())
+
+
+class Steep(Oscillator):
+    name = "steep"
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_wrappers_report_the_score(tmp_path, estimate):
+    path = tmp_path / "a.safetensors"
+    dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits()).save(path)
+    rows = gym.make_vec(ENV_IDS["van_der_pol"], num_envs=2, vectorization_mode="vector_entry_point")
+    many = KKLVectorObservation(rows, str(path), estimate, monitor=True)
+    ones = [KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, estimate, monitor=True) for _ in range(2)]
+    _, info = many.reset(seed=5)
+    assert (info["score"] == 0).all()
+    for i, env in enumerate(ones):
+        assert env.reset(seed=5 + i)[1]["score"] == 0.0
+    for _ in range(20):
+        action = many.action_space.sample()
+        info = many.step(action)[-1]
+        single = [env.step(one)[-1] for env, one in zip(ones, action, strict=True)]
+        assert info["score"] == pytest.approx([each["score"] for each in single], rel=1e-5)
+        assert all(isinstance(each["score"], float) for each in single)
+    assert (info["score"] > 0).all()
+    assert info["_score"].all()
+    random_artifact().save(path)
+    with pytest.raises(ValueError, match="no limits"):
+        KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, monitor=True)
