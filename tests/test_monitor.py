@@ -82,7 +82,7 @@ def test_rows_of_a_batch_are_monitors_of_their_own():
             alone[2].reset(y[k, 2])
         assert together.score == pytest.approx([float(observer.score) for observer in alone])
         assert np.allclose(together.decode(), [observer.decode() for observer in alone], atol=1e-5)
-    assert together.score[0] > 1  # weights that nobody trained
+    assert (together.score > 0).all()
 
 
 def test_a_monitor_changes_no_estimate():

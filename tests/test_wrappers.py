@@ -176,8 +176,9 @@ def test_wrong_arguments(saved, tmp_path):
 def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
     asked = []
 
-    def load(name, noise):
+    def load(name, noise, monitor):
         asked.append((name, noise))
+        assert not monitor
         return KKLObserver(make_artifact(name), noise)
 
     monkeypatch.setattr(kkl_gym.installed, "load", load)
