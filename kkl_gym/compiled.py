@@ -35,7 +35,10 @@ def batch_step(system: System) -> Step:
 
 
 def compiled_step(system: System) -> Step:
-    """The compiled step of :func:`batch_step`; raises what sympy or Numba raise if they cannot take the equations."""
+    """The compiled step of :func:`batch_step`; raises what sympy or Numba raise if they cannot take the equations.
+
+    ValueError if the result is not what NumPy makes of them at random points.
+    """
     import numba
     import sympy
 
@@ -82,5 +85,10 @@ def compiled_step(system: System) -> Step:
         kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
         return out
 
-    step(np.array(system.X)[:, :1], np.zeros((nu, 1)), np.zeros((nx, 1)), 0.01)  # compiles, or says why not
+    # Compiles, or says why not; and equations such as `0 if x[0] == 0 else ...` mean something else to symbols.
+    rng = np.random.default_rng(0)
+    at = rng.uniform(*system.box(), (32, nx)).T, rng.uniform(-1, 1, (nu, 32)), rng.uniform(-1, 1, (nx, 32))
+    expected = advance_batch(system, *at, 0.01)
+    if not np.allclose(step(*at, 0.01), expected, rtol=1e-9, atol=1e-9, equal_nan=True):
+        raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step

@@ -125,6 +125,19 @@ def test_numpy_where_equations_cannot_be_compiled():
     assert (step(x, u, w, DT) == advance_batch(Branching(), x, u, w, DT)).all()
 
 
+def test_equations_that_mean_something_else_to_symbols():
+    class Comparing(Unicycle):
+        name = "comparing"
+
+        def f(self, x):
+            still = x[0] == 1.0 * x[0]  # true for numbers; sympy compares how it is written
+            return (0.0 if np.all(still) else 1.0) + x[1], x[0], x[2]
+
+    with pytest.raises(ValueError, match="symbols"):
+        compiled_step(Comparing())
+    assert isinstance(batch_step(Comparing()), functools.partial)
+
+
 @pytest.mark.parametrize("missing", ["numba", "sympy"])
 def test_numpy_where_a_library_is_missing(monkeypatch, missing):
     find = importlib.util.find_spec
