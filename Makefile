@@ -3,7 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 
-.PHONY: demo test test-slow lint format maps results benchmark speed clean
+.PHONY: demo test test-slow lint format maps results benchmark certificates speed clean
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -40,11 +40,14 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-speed: $(VENV)/ready  ## single environments against Pendulum-v1
+certificates: $(VENV)/ready  ## the figures in docs/certificates.md
+	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
+
+speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1
 	$(BIN)/kkl-gym speed
 
 clean:
-	rm -rf $(VENV) runs agents demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) runs agents certificates demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "kkl-gym needs Python 3.11 to 3.13: make PYTHON=...")'

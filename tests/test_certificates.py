@@ -265,9 +265,13 @@ def test_command(tmp_path, capsys):
     script = __file__.replace("test_certificates", "linear_system")
     main(["certify", str(tmp_path / "mine.safetensors"), "--system", f"{script}:Oscillator", "--trajectories", "10",
           "--measurement-noise", "0.1", "--out", str(tmp_path / "out")])  # fmt: skip
-    assert json.loads((tmp_path / "out" / "certificate.json").read_text())["observer"] == "mine"
-    assert (tmp_path / "out" / "certificate.png").stat().st_size > 10_000
+    assert json.loads((tmp_path / "out" / "mine.json").read_text())["observer"] == "mine"
+    assert (tmp_path / "out" / "mine.png").stat().st_size > 10_000
+    steepest = f"| Lipschitz constant of T_inv, at least | {1.02 * np.linalg.norm(M_inv, 2):.3g} |"
+    assert steepest in (tmp_path / "out" / "table.md").read_text()
     printed = capsys.readouterr().out
     assert "bound of the rms error" in printed
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
+    with pytest.raises(SystemExit, match="name an observer"):
+        main(["certify"])

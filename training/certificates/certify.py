@@ -12,7 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.certificates.gains import h2, h_infinity, theorem_gain
 from training.certificates.generalisation import generalisation_term, pseudo_dimension_bound
-from training.certificates.smooth import decoder, encoder, lipschitz_lower, lipschitz_upper
+from training.certificates.smooth import decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
 from training.data import output, run_filter
 from training.derivatives import jacobian
 from training.noise import stationary_covariance
@@ -66,6 +66,7 @@ class Certificate:
     error, noisy_error : mean |x - x_hat|^2 over motion and time, without noise and with v and w.
     lipschitz_lower, lipschitz_at : largest spectral norm of T_inv's Jacobian along the motion, and z there.
     lipschitz_upper : no two z anywhere give more.
+    norm_product : of the layers of T_inv, the bound that costs no work.
     output_lipschitz : largest norm of dh/dx over X.
     gain_theorem, gain_h_infinity, gain_h2 : of the filter from noise to z, see :mod:`training.certificates.gains`.
     noise_term : what the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2.
@@ -87,6 +88,7 @@ class Certificate:
     lipschitz_lower: float
     lipschitz_at: tuple[float, ...]
     lipschitz_upper: float
+    norm_product: float
     output_lipschitz: float
     gain_theorem: float
     gain_h_infinity: float
@@ -189,6 +191,7 @@ def certify(
         lipschitz_lower=lower,
         lipschitz_at=tuple(at.tolist()),
         lipschitz_upper=upper,
+        norm_product=norm_product(T_inv),
         output_lipschitz=l_h,
         gain_theorem=gain,
         gain_h_infinity=h_infinity(linear),

@@ -1,6 +1,7 @@
 """``kkl-gym certify``: a certificate as table, JSON and figure."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,9 +13,10 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.artifact import resolve
+from observers.artifact import resolve, shipped
 from training.certificates.certify import (
     CERTIFICATE_SEED,
+    QUANTILES,
     Certificate,
     certify,
     noise_variance,
@@ -28,11 +30,12 @@ from training.files import write
 class Certify:
     """Say how far an observer is to be trusted: learned maps, sensitivities, noise, and the paper's bounds.
 
-    Prints a table and writes certificate.json and certificate.png. docs/certificates.md explains each line.
+    Prints a table and writes table.md, and for each observer NAME.json and NAME.png. docs/certificates.md explains
+    each line.
     """
 
-    observer: tyro.conf.Positional[str]
-    """A shipped map, or a .safetensors file."""
+    observers: tyro.conf.Positional[tuple[str, ...]]
+    """Shipped maps, or .safetensors files."""
     system: str | None = None
     """For files of your own system: its class, as script.py:Class or module:Class."""
     measurement_noise: float = 0.5
@@ -47,83 +50,116 @@ class Certify:
     """Probability with which each generalisation term may fail."""
     seed: int = 0
     """Of everything random."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: certificates/NAME)")] = None
+    out: Path = Path("certificates")
     """Folder for what is written."""
 
-    def run(self, console: Console) -> Certificate:
+    def run(self, console: Console) -> list[Certificate]:
         """Certify."""
         from training.cli import system_of
 
-        artifact = Artifact.read(resolve(self.observer))
-        system = system_of(artifact, self.system)
-        name = Path(self.observer).stem if self.observer.endswith(".safetensors") else self.observer
-        with console.status(f"certifying {name}"):
-            found = certify(
-                artifact,
-                system,
-                self.measurement_noise,
-                self.process_noise,
-                self.psi,
-                self.trajectories,
-                self.delta,
-                self.seed,
-                name,
-            )
-            folder = self.out or Path("certificates") / name
-            folder.mkdir(parents=True, exist_ok=True)
-            write(folder / "certificate.json", json.dumps(found.as_json(), indent=1, allow_nan=False) + "\n")
-            draw(folder / "certificate.png", artifact, system, self.measurement_noise, name)
+        if not self.observers:
+            raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
+        found = []
+        for given in self.observers:
+            artifact = Artifact.read(resolve(given))
+            system = system_of(artifact, self.system)
+            name = Path(given).stem if given.endswith(".safetensors") else given
+            with console.status(f"certifying {name}"):
+                certificate = certify(
+                    artifact,
+                    system,
+                    self.measurement_noise,
+                    self.process_noise,
+                    self.psi,
+                    self.trajectories,
+                    self.delta,
+                    self.seed,
+                    name,
+                )
+                write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
+                draw(self.out / f"{name}.png", artifact, system, self.measurement_noise, name)
+            found.append(certificate)
         console.print(table(found))
-        console.print(f"wrote certificate.json and certificate.png in {folder}")
+        write(self.out / "table.md", markdown(found))
+        console.print(f"wrote table.md, JSON and figures in {self.out}")
         return found
 
 
-def table(found: Certificate) -> Table:
-    """A certificate for people."""
-    out = Table(title=f"{found.observer}: measurement noise {found.measurement_noise:g}", show_header=False)
-    out.add_column("what")
-    out.add_column("value", justify="right")
-
-    def line(what: str, value: float, text: str = "") -> None:
-        shown = "–" if not np.isfinite(value) else f"{value:.3g}"
-        out.add_row(what, shown + text)
-
-    line("rms error in the long run, no noise", found.error**0.5)
-    line(f"the same, |v| <= {found.noise_bound:g}, |w| <= {found.process_noise:.3g}", found.noisy_error**0.5)
-    line("error due to measurement noise alone, predicted", found.predicted_noise_error)
-    line("the same, measured", found.measured_noise_error)
-    out.add_section()
-    line("Lipschitz constant of T_inv, at least", found.lipschitz_lower)
-    line("the same, at most", found.lipschitz_upper)
-    line("largest |dh/dx| over X", found.output_lipschitz)
-    line("gain from v to z: the theorem's", found.gain_theorem)
-    line("H-infinity (energy to energy)", found.gain_h_infinity)
-    line("H2 (rms of z, white noise)", found.gain_h2)
-    out.add_section()
+def lines(found: Certificate) -> list[dict[str, str]]:
+    """What a certificate says, in sections: label to value, the labels being the same for all."""
     forward = found.forward
-    if forward is None:
-        out.add_row("no forward map T was learned:", "no residual,")
-        out.add_row("", "no bound without noise")
-        line("what the noisy theorem adds, as rms", found.noise_term**0.5)
-    else:
-        line("risk of T on its data, mean |z - T(x)|²", forward.data_risk)
-        line("PDE residual, mean |P|² over X", forward.pde_risk)
-        for level, value in forward.residual.items():
-            line(f"|P|, {100 * level:g} % of X below", value)
-        out.add_row("|P| largest at x =", ", ".join(f"{value:.2f}" for value in forward.residual_worst))
-        line("reconstruction, mean |x - T_inv(T(x))|²", forward.reconstruction_risk)
-        line("the same over X", forward.reconstruction_risk_over_box)
+
+    def number(value: float | None) -> str:
+        return "–" if value is None or np.isnan(value) else "∞" if np.isinf(value) else f"{value:.3g}"
+
+    def of(name: str) -> str:
+        return number(getattr(forward, name, None))
+
+    def ratio(bound: float, error: float) -> str:
+        return number((bound / error) ** 0.5 if error > 0 else None)
+
+    residual = {f"\\|P\\|, {100 * level:g} % of X below": level for level in QUANTILES}
+    return [
+        {
+            "rms error in the long run, no noise": number(found.error**0.5),
+            "the same, v and w bounded": number(found.noisy_error**0.5),
+            "error due to v alone, predicted": number(found.predicted_noise_error),
+            "the same, measured": number(found.measured_noise_error),
+        },
+        {
+            "Lipschitz constant of T_inv, at least": number(found.lipschitz_lower),
+            "the same, at most": number(found.lipschitz_upper),
+            "product of the layers' norms": number(found.norm_product),
+            "largest norm of dh/dx over X": number(found.output_lipschitz),
+            "gain from v to z, the theorem's": number(found.gain_theorem),
+            "H-infinity norm": number(found.gain_h_infinity),
+            "H2 norm": number(found.gain_h2),
+        },
+        {
+            "risk of T on its data": of("data_risk"),
+            "PDE residual P, mean square over X": of("pde_risk"),
+            **{label: number(forward.residual[level] if forward else None) for label, level in residual.items()},
+            "reconstruction x - T_inv(T(x)), mean square": of("reconstruction_risk"),
+            "the same over X": of("reconstruction_risk_over_box"),
+        },
+        {
+            "psi": number(found.psi),
+            "bound of the rms error, no noise": number(forward.bound**0.5 if forward else None),
+            "bound / measured": number(None) if forward is None else ratio(forward.bound, found.error),
+            "what the theorem adds for noise, as rms": number(found.noise_term**0.5),
+            "bound with noise / measured": number(None)
+            if forward is None
+            else ratio(forward.noisy_bound, found.noisy_error),
+        },
+        {
+            "pseudo-dimension of T_inv's losses, at most": number(found.inverse_dimension),
+            "generalisation term C of T_inv": number(found.inverse_term),
+            "generalisation term C of T": of("forward_term"),
+        },
+    ]
+
+
+def table(found: Sequence[Certificate]) -> Table:
+    """Certificates side by side."""
+    out = Table("", *(certificate.observer for certificate in found))
+    for sections in zip(*map(lines, found), strict=True):
+        for label in sections[0]:
+            out.add_row(label.replace("\\", ""), *(section[label] for section in sections))
         out.add_section()
-        line("bound of the rms error, no noise", forward.bound**0.5)
-        line("bound / measured", (forward.bound / found.error) ** 0.5)
-        line("bound of the rms error, noise", forward.noisy_bound**0.5)
-        line("bound / measured", (forward.noisy_bound / found.noisy_error) ** 0.5)
-    out.add_section()
-    terms = [found.inverse_term] + ([forward.forward_term] if forward else [])
-    vacuous = "infinite: vacuous" if not np.isfinite(terms).any() else ", ".join(f"{term:.2g}" for term in terms)
-    out.add_row("generalisation terms C", vacuous)
-    line("pseudo-dimension of T_inv's losses, at most", found.inverse_dimension)
     return out
+
+
+def markdown(found: Sequence[Certificate]) -> str:
+    """The same table for a page."""
+    rows = [f"| | {' | '.join(certificate.observer for certificate in found)} |", "|---" * (1 + len(found)) + "|"]
+    for sections in zip(*map(lines, found), strict=True):
+        rows += [f"| {label} | {' | '.join(section[label] for section in sections)} |" for label in sections[0]]
+    first = found[0]
+    head = (
+        f"Measurement noise {first.measurement_noise:g}, cut at {first.noise_bound:g} for the bounds; "
+        f"{first.samples} samples along the motion of the first.\n\n"
+    )
+    return head + "\n".join(rows) + "\n"
 
 
 def draw(path: Path, artifact: Artifact, system: System, measurement_noise: float, name: str) -> None:
