@@ -1,7 +1,7 @@
 """A batch's Runge–Kutta step as machine code, where Numba is installed: several times as fast as NumPy's.
 
 The system's own equations are run once on sympy symbols; what comes out is written down as Python, put into the same
-step as single states take, and compiled, which takes a second for each system and process.
+step as single states take, and compiled, which takes a second for each system, set of parameters and process.
 """
 
 import functools
@@ -12,20 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.simulate import MAX_SUBSTEPS, RATE_STEP, advance_batch, runge_kutta
+from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance_batch, runge_kutta
 from kkl_gym.system import System
+
+MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
 
 Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
 """(x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance_batch`."""
 
 
-@functools.cache
 def batch_step(system: System) -> Step:
     """One sampling interval of a batch: compiled if Numba and sympy are there and take the equations, else NumPy.
 
-    The two agree to rounding, 1e-13 of the state in each step. Equations that sympy cannot read, such as those with
-    NumPy functions or ``if``, go on with NumPy; :mod:`kkl_gym.elementary` has functions that serve both.
+    The two agree to rounding. Equations that sympy cannot read, such as those with NumPy functions or ``if``, go on
+    with NumPy, and so do those with which the two disagree anywhere they are compared; :mod:`kkl_gym.elementary` has
+    functions that serve both. The equations must depend on nothing but state, input and parameters.
     """
+    return _shared_step(type(system), tuple(system.parameters.items()))  # type: ignore[arg-type]
+
+
+@functools.lru_cache(maxsize=64)
+def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...]) -> Step:
+    system = kind(**dict(parameters))
     if importlib.util.find_spec("numba") and importlib.util.find_spec("sympy"):
         try:
             return compiled_step(system)
@@ -37,7 +45,7 @@ def batch_step(system: System) -> Step:
 def compiled_step(system: System) -> Step:
     """The compiled step of :func:`batch_step`; raises what sympy or Numba raise if they cannot take the equations.
 
-    ValueError if the result is not what NumPy makes of them at random points.
+    ValueError if they are too long to compile in seconds, or the result is not what NumPy makes of them.
     """
     import numba
     import sympy
@@ -45,10 +53,18 @@ def compiled_step(system: System) -> Step:
     compiled = numba.njit(error_model="numpy")  # a division by zero is infinite, not an exception
     nx, nu = system.nx, system.nu
     x, u = (list(sympy.symbols(f"{letter}:{n}", real=True)) for letter, n in (("x", nx), ("u", nu)))
-    forced = [
-        sympy.sympify(fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)))
-        for fi, row in zip(system.f(x), system.g(x), strict=True)
-    ]
+
+    def traced() -> list[Any]:
+        return [
+            sympy.sympify(fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)))
+            for fi, row in zip(system.f(x), system.g(x), strict=True)
+        ]
+
+    forced = traced()
+    if forced != traced():
+        raise ValueError(f"{system.name}: the equations are not the same each time they are asked for")
+    if sympy.count_ops(forced) > MAX_OPERATIONS:
+        raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
     rate = sympy.lambdify([(*x,)], sympy.sympify(system.rate(x)), "math", cse=True)
@@ -61,7 +77,7 @@ def compiled_step(system: System) -> Step:
     lines = [
         "def kernel(x, u, w, dt, out):",
         "    for row in range(x.shape[1]):",
-        f"        need = rate({tupled(states)}) * dt / {RATE_STEP}",
+        f"        need = rate({tupled(states)}) * dt * {PER_RATE!r}",
         f"        if not need <= {MAX_SUBSTEPS}:",
         "            out[:, row] = nan",
         "            continue",
@@ -82,13 +98,26 @@ def compiled_step(system: System) -> Step:
 
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
-        kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
+        try:
+            kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
+        except ArithmeticError:  # negative powers of zero, which Numba raises even so
+            return advance_batch(system, x, u, w, dt)
         return out
 
-    # Compiles, or says why not; and equations such as `0 if x[0] == 0 else ...` mean something else to symbols.
-    rng = np.random.default_rng(0)
-    at = rng.uniform(*system.box(), (32, nx)).T, rng.uniform(-1, 1, (nu, 32)), rng.uniform(-1, 1, (nx, 32))
-    expected = advance_batch(system, *at, 0.01)
-    if not np.allclose(step(*at, 0.01), expected, rtol=1e-9, atol=1e-9, equal_nan=True):
-        raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
+    # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.
+    for points in _trials(system):
+        rng, n = np.random.default_rng(0), points.shape[1]
+        at = points, rng.uniform(-1, 1, (nu, n)), rng.uniform(-1, 1, (nx, n))
+        expected = advance_batch(system, *at, 0.01)
+        if not np.allclose(step(*at, 0.01), expected, rtol=1e-9, atol=1e-9, equal_nan=True):
+            raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
+
+
+def _trials(system: System) -> tuple[np.ndarray, np.ndarray]:
+    """States (nx, n) to compare at: random ones within X and within the bounds, and where equations tend to branch."""
+    rng = np.random.default_rng(0)
+    low, high = np.array(system.bounds).T
+    random = np.concatenate([rng.uniform(*system.box(), (200, system.nx)), rng.uniform(low, high, (200, system.nx))])
+    special = rng.choice(3, (200, system.nx))
+    return random.T, np.choose(special, [low, 0.0, high]).T

@@ -31,13 +31,14 @@ class Limits:
 
     def __post_init__(self) -> None:
         k = len(self.levels)
-        if k < 1 or self.levels[0] != 0 or (np.diff(self.levels) <= 0).any():
+        if self.levels.ndim != 1 or k < 1 or self.levels[0] != 0 or (np.diff(self.levels) <= 0).any():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not self.mean.shape == self.low.shape == self.high.shape == (k, *self.mean.shape[1:]) or self.mean.ndim != 2:
             raise ValueError(f"limits must be (levels, ny), got {self.mean.shape}, {self.low.shape}, {self.high.shape}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
-        if not (self.window > 0 and self.warm_up >= 0 and 0 < self.false_alarms < 1 and self.duration > 0):
+        sane = 0 < self.window < np.inf and 0 <= self.warm_up < np.inf and 0 < self.duration < np.inf
+        if not sane or not 0 < self.false_alarms < 1:
             raise ValueError("window and duration must be positive, warm_up not negative, false_alarms within (0, 1)")
 
     def at(self, level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -37,9 +37,9 @@ class KKLObserver:
             raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
         self.artifact = artifact
         self._monitored = monitor
-        self.measurement_noise = measurement_noise
         self._z: np.ndarray | None = None
-        self._x_hat: np.ndarray | None = None  # where the monitor has already made the network say it
+        self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
+        self.measurement_noise = measurement_noise
         self._age: Any = 0  # samples since reset, an array where rows have restarted
 
     @property
@@ -57,15 +57,17 @@ class KKLObserver:
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.noise_max}; "
                 f"pass measurement_noise={inverse.noise_max} to use it all the same"
             )
-        self._measurement_noise = float(level)
+        limits = self.artifact.limits
+        monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
+        if monitor is not None and self._z is not None:
+            monitor.reset(self._z.shape[:-1])
+        self._measurement_noise, self._monitor, self._x_hat = float(level), monitor, None
         gain = inverse.gain(level)[:, None] * inverse.whiten
         self._whiten = np.ascontiguousarray(gain.T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = []
         if "measurement_noise" in inverse.features:
             self._conditions.append(float(inverse.noise_feature(level)))
-        limits = self.artifact.limits
-        self._monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
 
     @property
     def z(self) -> np.ndarray:
@@ -162,12 +164,12 @@ class KKLObserver:
         """The estimate T_inv(z) as things stand, (..., nx), or of some rows of the batch only, (number of rows, nx)."""
         if self._z is None:
             raise RuntimeError("call reset(y0) before the observer is used")
-        if self._x_hat is not None:
-            return self._x_hat.copy() if rows is None else self._x_hat[rows]
         z, age = self._z, self._age
         if rows is not None:
             rows = np.asarray(rows)
             z, age = self._rows(rows)[rows], np.broadcast_to(age, rows.shape)[rows]
+        if self._x_hat is not None:
+            return self._x_hat.copy() if rows is None else self._x_hat[rows]
         return self._invert(z, age * self.artifact.filter.dt)
 
     def _rows(self, rows: np.ndarray) -> np.ndarray:

@@ -6,15 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from conftest import random_artifact
 from linear_system import C, F, Oscillator, sylvester
-from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov
+from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov, solve_sylvester
 
 import observers
-from kkl_gym import System, get_system
+from kkl_gym import get_system
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.artifact import resolve
 from training import certify
-from training.certificates.certify import residual
+from training.certificates.certificate import output_lipschitz, record_motion, residual
 from training.certificates.gains import h2, h_infinity, theorem_gain
 from training.certificates.generalisation import generalisation_term, pseudo_dimension_bound
 from training.certificates.smooth import Smooth, decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
@@ -73,7 +74,7 @@ def test_the_residual_is_that_of_the_equation():
 def test_sensitivities_of_a_linear_observer(exact):
     assert exact.lipschitz_lower == pytest.approx(np.linalg.norm(M_inv, 2), rel=1e-6)
     assert exact.lipschitz_upper == pytest.approx(np.linalg.norm(M_inv, 2), rel=1e-6)
-    assert exact.output_lipschitz == 1.0
+    assert exact.output_lipschitz == pytest.approx(1.0)
     assert exact.gain_theorem == pytest.approx(np.sqrt(3.0))  # cond(V) = 1, |B| = sqrt(3), 1
     # the noise in x_hat: the Lyapunov equation of the filter, written for [z, last y]
     linear = LinearFilter(A, B, 0.01)
@@ -93,7 +94,9 @@ def test_h2_tends_to_the_continuous_one():
         assert h2(LinearFilter(A, B, dt)) == pytest.approx(np.sqrt(dt * np.trace(P)), rel=tolerance)
 
 
-@pytest.mark.parametrize("poles", [A, np.array([[-0.2, 5.0, 0.0], [-5.0, -0.2, 0.0], [0.0, 0.0, -3.0]])])
+@pytest.mark.parametrize("poles", [A, *(
+    np.array([[-damping, 5.0, 0.0], [-5.0, -damping, 0.0], [0.0, 0.0, -3.0]]) for damping in (0.2, 1e-3))
+])  # fmt: skip
 def test_h_infinity_by_bisection(poles):
     """A gain bounds the norm if no frequency reaches it: the symplectic pencil has no eigenvalue on the circle."""
     linear = LinearFilter(poles, B, 0.01)
@@ -112,11 +115,12 @@ def test_h_infinity_by_bisection(poles):
         right = np.block([[closed, np.zeros((n, n))], [-Q, np.eye(n)]])
         return bool((np.abs(np.abs(np.linalg.eigvals(np.linalg.solve(left, right))) - 1.0) < 1e-7).any())
 
-    low, high = 0.0, 1e3
-    for _ in range(60):
+    low, high = 0.0, 1e5
+    for _ in range(70):
         middle = (low + high) / 2
         low, high = (middle, high) if reached(middle) else (low, middle)
-    assert h_infinity(linear) == pytest.approx(high, rel=1e-5)
+    # an eigenvalue within 1e-7 of the circle counts as on it, which matters where the damping is small
+    assert h_infinity(linear) == pytest.approx(high, rel=1e-5 if poles[0, 0] < -0.1 else 1e-3)
     assert h_infinity(linear) <= theorem_gain(linear)
 
 
@@ -146,6 +150,13 @@ def test_lipschitz_constants_that_are_known():
     rotation = Smooth((turns[0], np.eye(6), turns[2]), (np.zeros(6),) * 3, "tanh")
     assert lipschitz_upper(rotation) == pytest.approx(1.0, rel=1e-3)
     assert lipschitz_upper(Smooth((np.zeros((2, 3)), np.zeros((1, 2))), (np.zeros(2), np.ones(1)), "silu")) == 0.0
+
+
+def test_the_steepest_place_of_silu():
+    neuron = Smooth((np.array([[3.0]]), np.array([[2.0]])), (np.zeros(1), np.zeros(1)), "silu")
+    lower, _ = lipschitz_lower(neuron, np.array([[2.39935728052 / 3.0]]))
+    assert lower == pytest.approx(6.0 * 1.0998393201, rel=1e-9)
+    assert lower <= lipschitz_upper(neuron) <= norm_product(neuron) < 1.000001 * lower
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])
@@ -203,7 +214,7 @@ def test_bounds_of_the_paper_are_put_together_as_printed():
 def test_shipped_maps(name):
     system = get_system(name.removesuffix("-spinn"))
     found = certify(Artifact.read(resolve(name)), system, 0.5, trajectories=60)
-    assert 0.5 < found.predicted_noise_error / found.measured_noise_error < 2.0
+    assert 0.8 < found.predicted_noise_error / found.measured_noise_error < 1.25
     assert found.lipschitz_lower <= found.lipschitz_upper
     assert found.gain_h2 < found.gain_h_infinity <= found.gain_theorem
     assert (found.forward is not None) == name.endswith("-spinn")
@@ -212,6 +223,56 @@ def test_shipped_maps(name):
         assert found.noisy_error <= found.forward.noisy_bound
     text = json.dumps(found.as_json(), allow_nan=False)
     assert json.loads(text)["inverse_term"] is None  # infinite
+
+
+class Damped(Oscillator):
+    """Settles at the origin, from where only process noise moves it."""
+
+    name = "oscillator"
+
+    def f(self, x):
+        return x[1], -4.0 * x[0] - 4.0 * x[1]
+
+
+def test_psi_covers_what_noise_does_where_motions_settle():
+    M = solve_sylvester(-A, np.array([[0.0, 1.0], [-4.0, -4.0]]), B @ C)
+    base = linear_observer()
+    inverse = MLP([np.linalg.pinv(M).astype(np.float32)], [np.zeros(2, np.float32)], "tanh")
+    forward = MLP([M.astype(np.float32)], [np.zeros(3, np.float32)], "tanh")
+    artifact = dataclasses.replace(
+        base,
+        inverse=dataclasses.replace(base.inverse, mlp=inverse),
+        forward=dataclasses.replace(base.forward, mlp=forward),
+    )
+    found = certify(artifact, Damped(), 0.0, process_noise=0.05, trajectories=10)
+    assert found.error < 1e-8
+    assert 1e-6 < found.noisy_error < found.forward.noisy_bound
+    motion = record_motion(artifact, Damped(), 0.0, 0.05, 10, 0)
+    assert np.linalg.norm(motion.noisy_x - motion.x, axis=1).max() <= found.psi
+
+
+def test_motions_come_in_two_halves_of_whole_motions():
+    motion = record_motion(linear_observer(), Oscillator(), 0.3, 0.1, 5, 0)
+    first, second = motion.halves()
+    assert (first.motions, second.motions) == (2, 3)
+    assert len(first.x) + len(second.x) == len(motion.x)
+    each = motion.x.reshape(5, -1, 2)
+    radius = np.linalg.norm(each, axis=-1)
+    assert np.ptp(radius, axis=1).max() < 1e-6  # without noise each stays on its circle
+    assert (first.x == each[:2].reshape(-1, 2)).all()
+    assert (second.noisy_z == motion.noisy_z[len(first.x) :]).all()
+
+
+def test_each_bound_has_the_map_that_its_observer_uses():
+    """A map that is told the noise is another one at each level."""
+    artifact = random_artifact("van_der_pol", inputs=False, age=False, forward=True)
+    artifact = dataclasses.replace(artifact, training={"physics_weight": 0.1})
+    found = certify(artifact, get_system("van_der_pol"), 0.7, process_noise=0.0, trajectories=4)
+    quiet = lipschitz_upper(decoder(artifact, 0.0))
+    risk = found.forward.reconstruction_risk
+    assert found.forward.bound == pytest.approx(4 * risk + 4 * quiet**2 * found.forward.physics_risk)
+    assert found.lipschitz_upper == pytest.approx(lipschitz_upper(decoder(artifact, 0.7)))
+    assert abs(quiet / found.lipschitz_upper - 1) > 0.01
 
 
 def test_generalisation_terms():
@@ -228,7 +289,8 @@ def test_bad_requests():
     with pytest.raises(observers.ArtifactError, match="system"):
         certify(linear_observer(), get_system("van_der_pol"))
     for wrong in ({"measurement_noise": -1.0}, {"measurement_noise": np.nan}, {"process_noise": -0.1}, {"psi": np.inf},
-                  {"trajectories": 1}, {"delta": 0.0}, {"delta": 1.0}, {"seed": -1}):  # fmt: skip
+                  {"trajectories": 1}, {"trajectories": 2.5}, {"delta": 0.0}, {"delta": 1.0},
+                  {"seed": -1}):  # fmt: skip
         with pytest.raises(ValueError, match=r"must|need"):
             certify(linear_observer(), Oscillator(), **wrong)
     with pytest.raises(ValueError, match="beyond"):
@@ -253,10 +315,7 @@ def test_output_of_a_nonlinear_h():
         def h(self, x):
             return (x[0] ** 2,)
 
-    from training.certificates.certify import output_lipschitz
-
-    assert isinstance(Squared(), System)
-    assert output_lipschitz(Squared(), np.random.default_rng(0)) == pytest.approx(2.0, rel=0.01)
+    assert output_lipschitz(Squared(), 0) == pytest.approx(2.0, rel=0.01)
     assert output(Squared(), np.array([[0.5, 0.0]])) == pytest.approx(0.25)
 
 
@@ -273,5 +332,8 @@ def test_command(tmp_path, capsys):
     assert "bound of the rms error" in printed
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
+    main(["certify", "reverse_duffing-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
+          "--out", str(tmp_path / "quiet")])  # fmt: skip
+    assert (tmp_path / "quiet" / "reverse_duffing-spinn.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])

@@ -138,6 +138,87 @@ def test_equations_that_mean_something_else_to_symbols():
     assert isinstance(batch_step(Comparing()), functools.partial)
 
 
+class Filled(Unicycle):
+    """sin(x)/x with its limit at zero, where symbols see no special case."""
+
+    name = "filled"
+
+    def f(self, x):
+        return np.where(np.equal(x[0], 0), 1.0, sin(x[0]) / (x[0] + np.equal(x[0], 0))), x[0], x[2]
+
+
+class Rooted(Unicycle):
+    """Not a number for negative states, unless somebody simplifies."""
+
+    name = "rooted"
+
+    def f(self, x):
+        return x[0] ** 0.5 * x[0] ** 0.5, x[1], x[2]
+
+
+class Random(Unicycle):
+    name = "random"
+
+    def f(self, x):
+        return np.random.default_rng().random() + x[0], x[1], x[2]
+
+
+class Long(Unicycle):
+    name = "long"
+
+    def f(self, x):
+        return sum(sin(i + x[0]) * x[1] for i in range(200)), x[1], x[2]
+
+
+@pytest.mark.parametrize("kind", [Filled, Rooted, Random, Long])
+def test_equations_better_left_to_numpy(kind):
+    assert isinstance(batch_step(kind()), functools.partial)
+
+
+@dataclass(frozen=True)
+class Pole(System):
+    """Negative powers, which Numba raises at zero whatever it is told."""
+
+    name = "pole"
+    X = ((0.5, 1),)
+    bounds = ((-5, 5),)
+
+    def f(self, x):
+        return (1e-3 * x[0] ** -2,)
+
+    def rate(self, x):
+        return 1.0 + 0.0 * x[0]
+
+    def h(self, x):
+        return (x[0],)
+
+
+def test_negative_powers_at_zero_lose_their_row_only():
+    got = batch_step(Pole())(np.array([[0.0, 0.5]]), np.zeros((0, 2)), np.zeros((1, 2)), DT)
+    assert not np.isfinite(got[0, 0])
+    assert got[0, 1] == pytest.approx(0.5 + 1e-5 / 0.25, rel=1e-3)
+
+
+def test_systems_that_count_as_equal_are_told_apart():
+    @dataclass(frozen=True, eq=False)
+    class Decaying(System):
+        a: float
+
+        name = "decaying"
+        X = ((0.5, 1),)
+        bounds = ((-5, 5),)
+
+        def f(self, x):
+            return (-self.a * x[0],)
+
+        def h(self, x):
+            return (x[0],)
+
+    x = np.ones((1, 1))
+    steps = [batch_step(Decaying(a))(x, np.zeros((0, 1)), np.zeros((1, 1)), 0.1)[0, 0] for a in (1.0, 5.0)]
+    assert steps == pytest.approx([np.exp(-0.1), np.exp(-0.5)], rel=1e-5)
+
+
 @pytest.mark.parametrize("missing", ["numba", "sympy"])
 def test_numpy_where_a_library_is_missing(monkeypatch, missing):
     find = importlib.util.find_spec

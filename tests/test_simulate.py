@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.elementary import exp, sin
-from kkl_gym.simulate import MAX_SUBSTEPS, RATE_STEP, advance, advance_batch, check_dt, runge_kutta, simulate
+from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance, advance_batch, check_dt, runge_kutta, simulate
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 DT = 0.01
@@ -187,7 +187,7 @@ def test_scalar_and_batch_agree_to_rounding_in_each_step(system, dt):
 @given(k=st.integers(0, 9), above=st.integers(-2, 2), dt=st.floats(1e-4, 0.5))
 def test_scalar_and_batch_choose_the_same_substeps(k, above, dt):
     """Also where rate * dt falls within rounding of the next power of two."""
-    rate = 2**k * RATE_STEP / dt
+    rate = 2**k / (PER_RATE * dt)
     for _ in range(abs(above)):
         rate = math.nextafter(rate, math.inf if above > 0 else 0.0)
     alone, together = fixed_rate(rate), fixed_rate(rate)
@@ -259,7 +259,7 @@ def test_number_of_substeps_is_limited():
 
     system = Counting()
     rate = system.rate((1.0, 1.0))
-    dt = MAX_SUBSTEPS * RATE_STEP / rate
+    dt = MAX_SUBSTEPS / (PER_RATE * rate)
     assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 0.999)).all()
     assert len(calls) == 7 * MAX_SUBSTEPS
     calls.clear()

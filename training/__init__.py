@@ -1,7 +1,7 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
 try:
-    from training.calibrate import calibrate
+    from training.calibration import calibrate
     from training.certificates import Certificate, certify
     from training.config import Config, preset
     from training.evaluate import errors, unseen_runs

@@ -85,7 +85,7 @@ class Train:
 
     def run(self, console: Console) -> Path:
         """Train; returns the artifact's path."""
-        from training.calibrate import calibrate
+        from training.calibration import calibrate
         from training.pipeline import train
         from training.report import write_report
 
@@ -110,8 +110,11 @@ class Train:
         path = folder / f"{name}.safetensors"
         result.artifact.save(path)  # before anything else may fail
         if self.monitor and result.artifact.C is not None:
-            with console.status("finding the monitor's limits"):
-                calibrate(result.artifact, system, seed=config.seed).save(path)
+            try:
+                with console.status("finding the monitor's limits"):
+                    calibrate(result.artifact, system, seed=config.seed).save(path)
+            except ValueError as error:
+                console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
         console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
         write_report(folder / "report.png", result, system)
         console.print(f"wrote {folder / 'report.png'}")

@@ -14,16 +14,18 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.artifact import resolve, shipped
-from training.certificates.certify import (
-    CERTIFICATE_SEED,
+from training.certificates.certificate import (
     QUANTILES,
     Certificate,
+    Motion,
     certify,
     noise_variance,
     record_motion,
     residual,
 )
 from training.files import write
+
+SHOWN = 30_000  # states in the figure
 
 
 @dataclass(frozen=True)
@@ -65,19 +67,23 @@ class Certify:
             system = system_of(artifact, self.system)
             name = Path(given).stem if given.endswith(".safetensors") else given
             with console.status(f"certifying {name}"):
+                process_noise = system.process_noise if self.process_noise is None else self.process_noise
+                recording = (self.measurement_noise, process_noise, self.trajectories, self.seed)
+                motion = record_motion(artifact, system, *recording)
                 certificate = certify(
                     artifact,
                     system,
                     self.measurement_noise,
-                    self.process_noise,
+                    process_noise,
                     self.psi,
                     self.trajectories,
                     self.delta,
                     self.seed,
                     name,
+                    motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, self.measurement_noise, name)
+                draw(self.out / f"{name}.png", artifact, system, self.measurement_noise, name, motion)
             found.append(certificate)
         console.print(table(found))
         write(self.out / "table.md", markdown(found))
@@ -162,20 +168,20 @@ def markdown(found: Sequence[Certificate]) -> str:
     return head + "\n".join(rows) + "\n"
 
 
-def draw(path: Path, artifact: Artifact, system: System, measurement_noise: float, name: str) -> None:
+def draw(path: Path, artifact: Artifact, system: System, measurement_noise: float, name: str, motion: Motion) -> None:
     """The PDE's residual over X, and along the motion the error that noise will make."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
-    motion = record_motion(artifact, system, measurement_noise, 0.0, 100, np.random.default_rng([CERTIFICATE_SEED, 0]))
     panels = 1 + (artifact.forward is not None)
     figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]
     first, second = (i % system.nx for i in system.portrait)
-    size = np.sqrt(noise_variance(artifact, motion.z, measurement_noise))
+    shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
+    x, size = motion.x[shown], np.sqrt(noise_variance(artifact, motion.z[shown], measurement_noise))
     order = size.argsort()
     points: Any = axes[-1].scatter(
-        motion.x[order, first], motion.x[order, second], c=size[order], s=3, norm=LogNorm(), cmap="viridis"
+        x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
     )
     figure.colorbar(points, ax=axes[-1], label="predicted rms error")
     axes[-1].set_title(f"error due to noise {measurement_noise:g}, along the motion")
@@ -184,9 +190,8 @@ def draw(path: Path, artifact: Artifact, system: System, measurement_noise: floa
         x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
         grids = [np.linspace(*system.X[i], n) for i in (first, second)]
         x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
-        image: Any = axes[0].pcolormesh(
-            *grids, np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n), norm=LogNorm(), shading="auto"
-        )
+        wrong = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
+        image: Any = axes[0].pcolormesh(*grids, wrong, norm=LogNorm() if wrong.all() else None, shading="auto")
         figure.colorbar(image, ax=axes[0], label="|∂T/∂x f − A T − B h|")
         axes[0].set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")
     for ax in axes:

@@ -16,13 +16,16 @@ def theorem_gain(linear: LinearFilter) -> float:
 def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
     """H-infinity norm of the sampled filter from v to z: the largest amplification of a noise's energy.
 
-    The greatest gain on a grid of frequencies up to Nyquist's, refined between the neighbours of the best one.
+    The greatest gain on a grid of frequencies up to Nyquist's, finer about the poles', and refined about the best one.
     """
-    poles = np.abs(np.linalg.eigvals(linear.A)) * linear.dt
-    grid = np.concatenate([[0.0], np.geomspace(min(1e-3, 0.01 * poles.min()), np.pi, points)])
+    poles = np.linalg.eigvals(linear.A) * linear.dt
+    near = np.geomspace(1e-2, 1e2, 40)
+    resonances = np.abs(poles.imag) + np.outer([*-near, 0.0, *near], np.abs(poles.real))
+    grid = np.concatenate([[0.0], np.geomspace(min(1e-3, 0.01 * np.abs(poles).min()), np.pi, points)])
+    grid = np.unique(np.concatenate([grid, np.clip(resonances.ravel(), 0.0, np.pi)]))
     gains = np.array([_gain(linear, w) for w in grid])
     best = int(gains.argmax())
-    low, high = grid[max(0, best - 1)], grid[min(points, best + 1)]
+    low, high = grid[max(0, best - 1)], grid[min(len(grid) - 1, best + 1)]
     refined = minimize_scalar(
         lambda w: -_gain(linear, w), bounds=(low, high), method="bounded", options={"xatol": 1e-10}
     )

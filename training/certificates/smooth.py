@@ -9,7 +9,7 @@ from observers import MLP, Artifact, ForwardMap
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
 # vanishes, at |x| = 2.39936.
-SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.09983930, 1.09983930)}
+SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,11 @@ from training.data import output
 from training.signals import random_inputs
 
 CALIBRATION_SEED = 5  # first entry of its seeds; those of training and evaluation are others
-LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest
+LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
 LARGEST = 1.0  # for maps that are not told the noise
 WINDOW = 0.5  # s
 WARM_UP = 5.0  # s
+TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many runs
 
 
@@ -31,8 +32,8 @@ def calibrate(
     """The same artifact with limits for a monitor.
 
     Sound runs are simulated from starts in X with the system's process noise, half of them under random inputs if the
-    map knows inputs, at several noise levels. Each limit is the one that a sixth of ``false_alarms`` (and of an
-    output's share in it) of them exceed, so that all together are exceeded half as often as promised.
+    map knows inputs, at several noise levels. Each limit is the one that a new run exceeds with a sixth of the
+    probability ``false_alarms`` (and of an output's share in it), with a margin for its being found among few runs.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def calibrate(
         raise ValueError(f"{trajectories} runs are too few for {false_alarms:g}: take {least}")
     rng = np.random.default_rng([CALIBRATION_SEED, seed])
     x, u = sound_runs(artifact, system, trajectories or least, duration, rng)
-    levels = np.array(LEVELS) * min(artifact.inverse.noise_max, LARGEST)
+    largest = artifact.inverse.noise_max
+    levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
     rows = [_limits(artifact, system, x, u, level, share, rng) for level in levels]
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
@@ -72,18 +74,25 @@ def calibrate(
 def sound_runs(
     artifact: Artifact, system: System, n: int, duration: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (steps + 1, n, nx) and inputs (steps, n, nu) of runs that stay within the system's bounds."""
+    """States (steps + 1, n, nx) and inputs (steps, n, nu) of runs; those that leave the bounds are drawn anew.
+
+    Raises ValueError if most of them do.
+    """
     dt = artifact.filter.dt
     steps = round(duration / dt)
-    u = np.zeros((steps, n, system.nu))
-    if artifact.nu:
-        u[:, ::2] = random_inputs(system, len(range(0, n, 2)), steps, dt, rng)
-    w = system.process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, (steps, n, system.nx))
-    x = simulate(system, rng.uniform(*system.box(), (n, system.nx)), steps, dt, u=u, w=w)
-    inside = np.isfinite(x[-1]).all(-1)
-    if 2 * inside.sum() < n:
-        raise ValueError(f"only {inside.sum()} of {n} runs stayed within bounds = {system.bounds}")
-    return x[:, inside], u[:, inside]
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
+        u = np.zeros((steps, missing, system.nu))
+        if artifact.nu:
+            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt, rng)
+        w = system.process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, (steps, missing, system.nx))
+        x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
+        inside = np.isfinite(x[-1]).all(-1)
+        kept.append((x[:, inside], u[:, inside]))
+        if len(kept) == TRIES:
+            raise ValueError(f"most runs of {duration:g} s leave bounds = {system.bounds}")
+    xs, us = zip(*kept, strict=True)
+    return np.concatenate(xs, 1), np.concatenate(us, 1)
 
 
 def _limits(
@@ -103,7 +112,7 @@ def _limits(
     late = slice(round(WARM_UP / dt) + 1, None)
     means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]
     squares = lfilter([a], [1.0, a - 1.0], residual**2, axis=0)[late]
-    mean = np.quantile(means.max(0), 1 - share, axis=0) * MARGIN
-    high = np.quantile(squares.max(0), 1 - share, axis=0) * MARGIN
-    low = np.quantile(squares.min(0), share, axis=0) / MARGIN if level else np.zeros_like(high)
+    mean = np.quantile(means.max(0), 1 - share, axis=0, method="weibull") * MARGIN
+    high = np.quantile(squares.max(0), 1 - share, axis=0, method="weibull") * MARGIN
+    low = np.quantile(squares.min(0), share, axis=0, method="weibull") / MARGIN if level else np.zeros_like(high)
     return mean, low, high

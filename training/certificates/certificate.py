@@ -12,9 +12,8 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.certificates.gains import h2, h_infinity, theorem_gain
 from training.certificates.generalisation import generalisation_term, pseudo_dimension_bound
-from training.certificates.smooth import decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
+from training.certificates.smooth import Smooth, decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
 from training.data import output, run_filter
-from training.derivatives import jacobian
 from training.noise import stationary_covariance
 
 CERTIFICATE_SEED = 4  # first entry of its seeds; those of training and evaluation are others
@@ -36,9 +35,10 @@ class Forward:
     reconstruction_risk_over_box : the same uniformly over X.
     residual : quantiles of |P| over X, by their level.
     residual_worst : where in X it is largest, (nx,).
-    forward_dimension, forward_term : bound of the pseudo-dimension of T's losses, and C_theta.
+    forward_dimension, forward_term : bound of the pseudo-dimension of |z - T(x)|^2 (with the residual beside it, as in
+        R_S1, it would be larger still), and C_theta with that.
     bound : the right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_S2 + 2 l^2 R_S1).
-    noisy_bound : that of the noisy one.
+    noisy_bound : that of the noisy one, with the T_inv that is told the noise.
     """
 
     data_risk: float
@@ -61,18 +61,20 @@ class Certificate:
     observer, system : names.
     measurement_noise, noise_bound : standard deviation of the Gaussian noise, and where it is cut for the theorems.
     process_noise : bound of |w|, w uniform in a box and held over each sample.
-    psi : bound of how far w may move the state; default: the diagonal of the motion's bounding box.
+    psi : bound of how far w may move the state; default: the diagonal of the box that the motions keep to.
     samples : number of states along the motion.
-    error, noisy_error : mean |x - x_hat|^2 over motion and time, without noise and with v and w.
+    error, noisy_error : mean |x - x_hat|^2 over motion and time, without noise and with v and w; on other motions than
+        those that the risks are from.
     lipschitz_lower, lipschitz_at : largest spectral norm of T_inv's Jacobian along the motion, and z there.
     lipschitz_upper : no two z anywhere give more.
     norm_product : of the layers of T_inv, the bound that costs no work.
-    output_lipschitz : largest norm of dh/dx over X.
+    output_lipschitz : largest norm of dh/dx at random points of X; where h is not linear there may be larger ones.
     gain_theorem, gain_h_infinity, gain_h2 : of the filter from noise to z, see :mod:`training.certificates.gains`.
     noise_term : what the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2.
     predicted_noise_error, measured_noise_error : rms of what noise alone does to the estimate, from the stationary
         covariance through the Jacobian, and by simulation.
-    inverse_dimension, inverse_term : bound of the pseudo-dimension of T_inv's losses, and C_eta.
+    inverse_dimension, inverse_term : bound of the pseudo-dimension of T_inv's losses, and C_eta, the largest loss that
+        was seen standing for the bound of all.
     forward : what needs a learned T; None where there is none.
     """
 
@@ -113,6 +115,7 @@ class Motion:
     z : of the filter under noise-free outputs, (n, size).
     noisy_x, noisy_z : the same under process noise and noisy outputs.
     noise : in z, due to the measurement noise alone, (n, size).
+    motions : number of motions, each of whose samples follow one another.
     """
 
     x: np.ndarray
@@ -120,6 +123,17 @@ class Motion:
     noisy_x: np.ndarray
     noisy_z: np.ndarray
     noise: np.ndarray
+    motions: int
+
+    def halves(self) -> tuple["Motion", "Motion"]:
+        """Two sets of motions."""
+        first = self.motions // 2
+        cut = first * (len(self.x) // self.motions)
+
+        def part(rows: slice, motions: int) -> "Motion":
+            return Motion(self.x[rows], self.z[rows], self.noisy_x[rows], self.noisy_z[rows], self.noise[rows], motions)
+
+        return part(slice(cut), first), part(slice(cut, None), self.motions - first)
 
 
 def certify(
@@ -132,6 +146,7 @@ def certify(
     delta: float = 0.05,
     seed: int = 0,
     name: str = "",
+    motion: Motion | None = None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
@@ -141,12 +156,14 @@ def certify(
     system : what it was made for, without input.
     measurement_noise : standard deviation of v; the theorems are about the same noise, cut at three of these.
     process_noise : bound of w as a multiple of the system's scale; None is the system's own default.
-    psi : bound of how far w may move the state from where it would have been; None is the diagonal of the motion's
-        bounding box, which is what is left to say where motions drift in phase or are chaotic.
+    psi : bound of how far w may move the state from where it would have been; None is the diagonal of the box that the
+        simulated motions keep to, with w and without, which is what is left to say where they drift in phase or are
+        chaotic.
     trajectories : from starts uniform in X.
     delta : probability with which each of the generalisation terms may fail.
     seed : of everything random.
     name : of the observer, for the report.
+    motion : what :func:`record_motion` returned for the same observer, system, noise and seed, if it is there already.
 
     Raises
     ------
@@ -159,23 +176,26 @@ def certify(
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:
             raise ValueError(f"{what} must be finite and not negative, got {value!r}")
-    if trajectories < 2 or seed < 0 or not 0 < delta < 1:
-        raise ValueError(f"need trajectories >= 2, seed >= 0 and 0 < delta < 1, got {trajectories}, {seed}, {delta}")
+    if not isinstance(trajectories, int) or not isinstance(seed, int) or trajectories < 2 or seed < 0:
+        raise ValueError(f"trajectories and seed must be integers, at least 2 and 0; got {trajectories!r}, {seed!r}")
+    if not 0 < delta < 1:
+        raise ValueError(f"delta must lie between 0 and 1, got {delta!r}")
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
-    rng = np.random.default_rng([CERTIFICATE_SEED, seed])
-    motion = record_motion(artifact, system, measurement_noise, process_noise, trajectories, rng)
-    T_inv = decoder(artifact, measurement_noise)
-    noise_free = decoder(artifact, 0.0)  # told what it sees
-    lower, at = lipschitz_lower(T_inv, motion.z)
-    upper = lipschitz_upper(T_inv)
+    if motion is None:
+        motion = record_motion(artifact, system, measurement_noise, process_noise, trajectories, seed)
+    measured, sample = motion.halves()
+    told, quiet = decoder(artifact, measurement_noise), decoder(artifact, 0.0)
+    lower, at = lipschitz_lower(told, motion.z)
+    upper = lipschitz_upper(told)
     linear = artifact.filter
     gain = theorem_gain(linear)
-    l_h = output_lipschitz(system, rng)
+    l_h = output_lipschitz(system, seed)
     noise_bound = TRUNCATED * measurement_noise
     if psi is None:
-        psi = float(np.linalg.norm(np.ptp(motion.x, axis=0))) if process_noise else 0.0
+        everywhere = np.concatenate([motion.x, motion.noisy_x])
+        psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
     noise_term = 2 * (upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)) ** 2
-    losses = _squared(motion.x - noise_free(motion.z))
+    losses = _squared(measured.x - quiet(measured.z))
     inverse_dimension = pseudo_dimension_bound(artifact.inverse.mlp)
     seen = _training_samples(artifact)
     return Certificate(
@@ -187,21 +207,21 @@ def certify(
         psi=psi,
         samples=len(motion.x),
         error=float(losses.mean()),
-        noisy_error=float(_squared(motion.noisy_x - T_inv(motion.noisy_z)).mean()),
+        noisy_error=float(_squared(measured.noisy_x - told(measured.noisy_z)).mean()),
         lipschitz_lower=lower,
         lipschitz_at=tuple(at.tolist()),
         lipschitz_upper=upper,
-        norm_product=norm_product(T_inv),
+        norm_product=norm_product(told),
         output_lipschitz=l_h,
         gain_theorem=gain,
         gain_h_infinity=h_infinity(linear),
         gain_h2=h2(linear),
         noise_term=noise_term,
         predicted_noise_error=float(np.sqrt(noise_variance(artifact, motion.z, measurement_noise).mean())),
-        measured_noise_error=float(np.sqrt(_squared(T_inv(motion.z + motion.noise) - T_inv(motion.z)).mean())),
+        measured_noise_error=float(np.sqrt(_squared(told(motion.z + motion.noise) - told(motion.z)).mean())),
         inverse_dimension=inverse_dimension,
         inverse_term=generalisation_term(float(losses.max()), inverse_dimension, seen, delta),
-        forward=_forward(artifact, system, motion, upper, noise_term, delta, rng),
+        forward=_forward(artifact, system, sample, (quiet, told), upper, noise_term, delta, seed),
     )
 
 
@@ -211,9 +231,13 @@ def record_motion(
     measurement_noise: float,
     process_noise: float,
     trajectories: int,
-    rng: np.random.Generator,
+    seed: int,
 ) -> Motion:
-    """Motions from starts uniform in X, from where the filter has forgotten its start."""
+    """Motions from starts uniform in X, from where the filter has forgotten its start.
+
+    The parameters are those of :func:`certify`. Raises ValueError if more than half of them leave the system's bounds.
+    """
+    rng = np.random.default_rng([CERTIFICATE_SEED, seed])
     linear = artifact.filter
     dt = linear.dt
     settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
@@ -221,27 +245,33 @@ def record_motion(
     steps = first + round(RECORDED / dt)
     ages = np.arange(first, steps + 1, EVERY)
     x0 = rng.uniform(*system.box(), (trajectories, system.nx))
-    shape = (steps, trajectories, system.nx)
-    w = process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, shape) if process_noise else None
-    runs = simulate(system, np.concatenate([x0, x0]), steps, dt, w=None if w is None else np.concatenate([0 * w, w], 1))
-    inside = np.isfinite(runs[-1]).all(-1).reshape(2, trajectories).all(0)
+    x = noisy_x = simulate(system, x0, steps, dt)
+    if process_noise:
+        w = process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, (steps, trajectories, system.nx))
+        noisy_x = simulate(system, x0, steps, dt, w=w)
+    inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
     if 2 * inside.sum() < trajectories:
         raise ValueError(
             f"only {inside.sum()} of {trajectories} motions of {steps * dt:g} s stayed within bounds = {system.bounds}"
         )
-    x, noisy_x = runs[:, :trajectories][:, inside], runs[:, trajectories:][:, inside]
-    v = measurement_noise * np.clip(rng.standard_normal((*x.shape[:2], system.ny)), -TRUNCATED, TRUNCATED)
+    x, noisy_x = x[:, inside], noisy_x[:, inside]
+    white = rng.standard_normal((*x.shape[:2], system.ny))
+    v = measurement_noise * np.clip(white, -TRUNCATED, TRUNCATED)
     no_input = np.zeros((steps, x.shape[1], linear.nu))
 
+    def recorded(values: np.ndarray) -> np.ndarray:  # motion by motion
+        return np.asarray(np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1]))
+
     def filtered(y: np.ndarray) -> np.ndarray:
-        return run_filter(linear, y, no_input, ages).reshape(-1, linear.size)
+        return recorded(run_filter(linear, y, no_input, ages))
 
     return Motion(
-        x[ages].reshape(-1, system.nx),
-        filtered(output(system, x)),
-        noisy_x[ages].reshape(-1, system.nx),
-        filtered(output(system, noisy_x) + v),
-        filtered(v),
+        x=recorded(x[ages]),
+        z=filtered(output(system, x)),
+        noisy_x=recorded(noisy_x[ages]),
+        noisy_z=filtered(output(system, noisy_x) + v),
+        noise=filtered(v),
+        motions=x.shape[1],
     )
 
 
@@ -265,13 +295,13 @@ def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
     return np.asarray(along - T(x) @ artifact.filter.A.T - output(system, x) @ artifact.filter.B.T)
 
 
-def output_lipschitz(system: System, rng: np.random.Generator, n: int = 2000) -> float:
-    """The largest spectral norm of dh/dx over X, at random points; exact where h is linear."""
-    x = rng.uniform(*system.box(), (n, system.nx))
-    J = np.zeros((n, system.ny, system.nx))
-    for i, row in enumerate(jacobian(system.h, system.nx)):
-        for j, derivative in row.items():
-            J[:, i, j] = derivative(*x.T)
+def output_lipschitz(system: System, seed: int, n: int = 2000) -> float:
+    """The largest spectral norm of dh/dx at random points of X, by central differences; exact where h is linear."""
+    x = np.random.default_rng([CERTIFICATE_SEED, seed, 1]).uniform(*system.box(), (n, system.nx))
+    J = np.empty((n, system.ny, system.nx))
+    for j, scale in enumerate(system.scale):
+        step = 1e-5 * scale * np.eye(system.nx)[j]
+        J[..., j] = (output(system, x + step) - output(system, x - step)) / (2e-5 * scale)
     return float(np.linalg.norm(J, ord=2, axis=(1, 2)).max())
 
 
@@ -279,36 +309,42 @@ def _forward(
     artifact: Artifact,
     system: System,
     motion: Motion,
+    inverses: tuple[Smooth, Smooth],
     lipschitz: float,
     noise_term: float,
     delta: float,
-    rng: np.random.Generator,
+    seed: int,
 ) -> Forward | None:
+    """``inverses`` : T_inv told that there is no noise, and told the noise, whose Lipschitz constant is given."""
     if artifact.forward is None:
         return None
-    T, T_inv = encoder(artifact.forward), decoder(artifact, 0.0)
-    x = rng.uniform(*system.box(), (20_000, system.nx))
+    T, (quiet, told) = encoder(artifact.forward), inverses
+    x = np.random.default_rng([CERTIFICATE_SEED, seed, 2]).uniform(*system.box(), (20_000, system.nx))
     size = np.linalg.norm(residual(artifact, system, x), axis=1)
     weight = float(artifact.training.get("physics_weight", 0.0))
     data_losses = _squared(motion.z - T(motion.x))
     data_risk, pde_risk = float(data_losses.mean()), float(np.square(size).mean())
     physics_risk = data_risk + weight * pde_risk
-    reconstruction = float(_squared(motion.x - T_inv(T(motion.x))).mean())
-    bound = 2 * (2 * reconstruction + 2 * lipschitz**2 * physics_risk)
+
+    def bound(T_inv: Smooth, constant: float) -> float:
+        reconstruction = float(_squared(motion.x - T_inv(T(motion.x))).mean())
+        return 2 * (2 * reconstruction + 2 * constant**2 * physics_risk)
+
+    same = all((a == b).all() for a, b in zip((*quiet.weights, *quiet.biases), (*told.weights, *told.biases)))
     dimension = pseudo_dimension_bound(artifact.forward.mlp)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
     return Forward(
         data_risk=data_risk,
         pde_risk=pde_risk,
         physics_risk=physics_risk,
-        reconstruction_risk=reconstruction,
-        reconstruction_risk_over_box=float(_squared(x - T_inv(T(x))).mean()),
+        reconstruction_risk=float(_squared(motion.x - quiet(T(motion.x))).mean()),
+        reconstruction_risk_over_box=float(_squared(x - quiet(T(x))).mean()),
         residual={level: float(np.quantile(size, level)) for level in QUANTILES},
         residual_worst=tuple(x[size.argmax()].tolist()),
         forward_dimension=dimension,
         forward_term=generalisation_term(largest, dimension, _training_samples(artifact), delta),
-        bound=bound,
-        noisy_bound=bound + noise_term,
+        bound=bound(quiet, lipschitz if same else lipschitz_upper(quiet)),
+        noisy_bound=bound(told, lipschitz) + noise_term,
     )
 
 
