@@ -42,6 +42,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 
 certificates: $(VENV)/ready  ## the figures in docs/certificates.md
 	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
+	$(BIN)/kkl-gym faults --out docs/results/faults
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1
 	$(BIN)/kkl-gym speed

@@ -234,6 +234,7 @@ def main(arguments: list[str] | None = None) -> None:
     from training.benchmark.command import Benchmark
     from training.certificates.command import Certify
     from training.demo import Demo
+    from training.faults import Faults
     from training.speed import Speed
 
     commands: dict[str, Callable[..., Any]] = {
@@ -242,6 +243,7 @@ def main(arguments: list[str] | None = None) -> None:
         "benchmark": Benchmark,
         "agent": AgentCommand,
         "certify": Certify,
+        "faults": Faults,
         "maps": Maps,
         "demo": Demo,
         "speed": Speed,

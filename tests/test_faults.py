@@ -1,0 +1,73 @@
+"""Sensor faults, on a small scale."""
+
+import dataclasses
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import training.faults
+from observers import Artifact, Limits
+from observers.artifact import resolve
+from training.cli import main
+from training.faults import FAULTS, play, report
+
+
+def with_limits(name):
+    """A shipped map with limits that nobody calibrated."""
+    return dataclasses.replace(
+        Artifact.read(resolve(name)),
+        limits=Limits(
+            np.array([0.0, 1.0]), np.array([[0.3], [0.8]]), np.array([[0.0], [0.2]]), np.array([[0.3], [4.0]]),
+            0.5, 5.0, 0.01, 50.0,
+        ),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found():
+    from kkl_gym import get_system
+
+    return play(with_limits("lorenz"), get_system("lorenz"), 12, 16.0, 0.5, 0)
+
+
+def test_one_row_for_each_run_and_fault(found):
+    assert found.groupby("fault", sort=False).size().to_dict() == dict.fromkeys(FAULTS, 12)
+    sound = found[found.fault == "none"]
+    assert (sound.score > 0).all()
+    assert (sound.score < 1).mean() > 0.8
+    for fault in FAULTS[1:]:
+        here = found[found.fault == fault]
+        assert (here.amplitude.to_numpy() == sound.amplitude.to_numpy()).all()
+        assert (here.delay[here.score > 1] <= 2.0).all()
+    bias = found[found.fault == "bias"]
+    assert (bias.score > 1).all()  # a fifth of Lorenz's range is nine
+    assert (bias.delay < 0.5).all()
+
+
+def test_report_from_the_file_alone(found, tmp_path):
+    found.to_csv(tmp_path / "faults.csv", index=False)
+    report(tmp_path)
+    table = (tmp_path / "table.md").read_text()
+    assert "| lorenz |" in table
+    assert "| bias | 2 s | 100.0 % |" in table
+    assert (tmp_path / "roc.png").stat().st_size > 5_000
+
+
+def test_duffing_is_reported_by_amplitude(tmp_path):
+    rows = [("reverse_duffing", fault, i, float(i), 2.0 if i > 4 else 0.5, 1.0) for fault in FAULTS for i in range(9)]
+    columns = ["system", "fault", "run", "amplitude", "score", "delay"]
+    pd.DataFrame(rows, columns=columns).to_csv(tmp_path / "faults.csv", index=False)
+    report(tmp_path)
+    assert "| bias | 0 % | 0 % | 100 % | 100 % |" in (tmp_path / "table.md").read_text()
+
+
+def test_command(tmp_path, monkeypatch, capsys):
+    artifact = with_limits("lorenz")
+    monkeypatch.setattr(training.faults.Artifact, "read", lambda path: artifact)
+    main(["faults", "--systems", "lorenz", "--runs", "4", "--duration", "12", "--out", str(tmp_path)])
+    assert "noticed" in capsys.readouterr().out
+    assert len(pd.read_csv(tmp_path / "faults.csv")) == 16
+    for wrong in (["--systems", "pendulum"], ["--runs", "1"]):
+        with pytest.raises(SystemExit, match="kkl-gym: "):
+            main(["faults", *wrong, "--out", str(tmp_path)])
