@@ -21,7 +21,7 @@ FAULTS_SEED = 6  # first entry of its seeds; those of training, evaluation and c
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
-# Seconds within which a fault should be noticed: one period of Van der Pol, about one of reverse Duffing at amplitude 1.
+# Seconds within which a fault should be noticed; for the first two about a period (Duffing's, at amplitude 1).
 DEADLINES = {"reverse_duffing": 10.0, "van_der_pol": 8.9, "rossler": 2.0, "lorenz": 2.0}
 
 

@@ -38,7 +38,8 @@ class Train:
     timesteps: int | None = None
     """Actions to learn from, in all environments together; default: the hyperparameters'."""
     observer: str | None = None
-    """A shipped map's name or a .safetensors file; default: the map shipped for the system."""
+    """A shipped map's name or a .safetensors file; default: the map that ships for the system, the one fitted in closed
+    loop if there is one."""
     algorithm: Literal["ppo", "sac"] | None = None
     """Default: the one that there are hyperparameters for."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: agents/SYSTEM-INFORMATION-SEED)")] = None

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import kkl_gym
 from kkl_gym import get_system
-from training.agents.information import make
+from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
 from training.agents.policy import fingerprint, rules, versioned
 from training.agents.tasks import TASKS, get_task, scores, successes
@@ -70,7 +70,7 @@ class Case:
 
         task = get_task(self.system, self.measurement_noise)
         recurrent = self.knows.startswith("recurrent")
-        observer = versioned(task.system) if self.knows in ("x_hat", "z") else None
+        observer = versioned(observer_of(get_system(task.system))) if self.knows in ("x_hat", "z") else None
         described = {
             "protocol": PROTOCOL,
             "episodes": self.episodes,

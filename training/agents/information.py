@@ -13,7 +13,7 @@ from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.vector import with_mask
 from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
-from observers import KKLObserver, load
+from observers import KKLObserver, load, shipped
 from training.agents.tasks import ControlTask, deviation
 from training.derivatives import linearised
 from training.methods.kalman import NOISE_FLOOR, ExtendedKalmanFilter, unknown_start
@@ -139,6 +139,7 @@ def make(
     see every sample. "y": the noisy output when the agent acts. "stacked": the last ``STACKED`` of those, each with
     the action before it.
 
+    observer : a shipped name or a ``.safetensors`` file; None takes :func:`observer_of`.
     with_action : whether "state" and "y" come with the action before them.
 
     Raises ValueError on an unknown name.
@@ -160,12 +161,19 @@ def make(
     if information == "ekf":
         env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
         return Features(env, ["x_hat"], of("x_hat"), system.nx)
+    observer = observer or observer_of(system)
     if information == "x_hat":
         env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
         return Features(env, ["x_hat"], of("x_hat"), system.nx)
     env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, estimate="z"), autoreset_mode)
-    feature, width = modes(load(observer or system.name, task.measurement_noise), system)
+    feature, width = modes(load(observer, task.measurement_noise), system)
     return Features(env, ["z", "sample"], feature, width)
+
+
+def observer_of(system: System) -> str:
+    """Name of the map that agents get for a system: the one fitted in closed loop where it ships, else the default."""
+    fitted = f"{system.name}-closed-loop"
+    return fitted if fitted in shipped() else system.name
 
 
 def output_deviation(system: System) -> Feature:

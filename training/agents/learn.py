@@ -22,7 +22,7 @@ from kkl_gym import ENV_IDS, get_system
 from kkl_gym.vector_wrappers import VectorEnv, VectorWrapper
 from observers import MLP
 from training.agents.bridge import SB3VecEnv
-from training.agents.information import Features, Information, make
+from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
 from training.agents.policy import Agent, fingerprint, rules, versioned
 from training.agents.tasks import ControlTask
@@ -57,7 +57,7 @@ def learn(
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
     name, settings = hyperparameters(task, algorithm)
-    named = versioned(observer or get_system(task.system).name) if information in ("x_hat", "z") else None
+    named = versioned(observer or observer_of(get_system(task.system))) if information in ("x_hat", "z") else None
     env = make(task, information, settings["n_envs"], observer=named)
     timesteps = settings["n_timesteps"] if timesteps is None else timesteps
     model = _fit(name, settings, env, task, timesteps, seed, folder, progress, f"{task.system} {information}")
