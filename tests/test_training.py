@@ -20,10 +20,11 @@ from training.data import output, record, record_closed_loop, recording_ages, ru
 from training.evaluate import starts
 from training.forward import ForwardProblem, on_tensors, truncation_time
 from training.inverse import AGE_UNIT, NOISE_UNIT, ClosedLoopSampler, TrajectorySampler, coordinates
-from training.networks import Network
+from training.networks import Network, on_torch
 from training.noise import noise_covariance, root, stationary_covariance
-from training.pipeline import output_matrix
+from training.pipeline import make_filter, output_matrix
 from training.signals import random_inputs
+from training.solved import solve_forward
 
 CPU = torch.device("cpu")
 
@@ -347,6 +348,59 @@ def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
     truth = np.array([backward_quadrature(point, eigenvalues) for point in x])
     error = artifact.forward(x) - truth
     assert np.sqrt((error**2).mean()) < 2e-2 * np.sqrt((truth**2).mean())
+
+
+def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
+    """One map, in X and beyond."""
+    system, linear = ReverseDuffing(), make_filter((-1.5, -1.875, -2.25, -2.625, -3.0), 1, 0.01, 0)
+    T = solve_forward(system, linear, 800, 2.0, np.random.default_rng(0))
+    rng = np.random.default_rng(1)
+    inside = rng.uniform(*system.box(), (40, 2))
+    beyond = rng.uniform(*system.box(2), (80, 2))
+    beyond = beyond[(np.abs(beyond) > 2).any(1)]
+    for x in (inside, beyond):
+        truth = np.array([backward_quadrature(point, linear.A.diagonal()) for point in x])
+        assert np.sqrt(np.square(T(x) - truth).sum() / np.square(truth).sum()) < 1e-3
+    on_tensors_too = on_torch(T, CPU)(torch.as_tensor(inside, dtype=torch.float32)).numpy()
+    np.testing.assert_allclose(on_tensors_too, T(inside), atol=1e-4)
+
+
+def test_solved_forward_map_of_a_linear_system():
+    linear = make_filter((-1.0, -2.0, -3.0), 1, 0.01, 0)
+    T = solve_forward(Oscillator(), linear, 100, 1.0, np.random.default_rng(0))
+    x = np.random.default_rng(1).uniform(-1, 1, (50, 2))
+    expected = x @ sylvester(linear.A, linear.B).T
+    assert np.abs(T(x) - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def test_what_cannot_be_solved():
+    pair = LinearFilter(np.array([[-1.0, 2.0], [-2.0, -1.0]]), np.ones((2, 1)), 0.01)
+    with pytest.raises(ValueError, match="diagonal"):
+        solve_forward(Oscillator(), pair, 10, 1.0, np.random.default_rng(0))
+
+    class Tight(Oscillator):
+        name = "oscillator"
+        bounds = ((-1.0, 1.0), (-1.0, 1.0))
+
+        def f(self, x):
+            return 100.0 + x[0], 100.0 + x[1]
+
+    with pytest.raises(ValueError, match="too soon"):
+        solve_forward(Tight(), make_filter((-1.0,), 1, 0.01, 0), 1000, 1.0, np.random.default_rng(0))
+    for wrong in ({"reach": 0.5}, {"reach": 2.0}, {"features": -1}, {"features": 10}):
+        with pytest.raises(ValueError, match=r"features|reach"):
+            replace(preset(ReverseDuffing(), "spinn", "fast"), **wrong)
+    with pytest.raises(ValueError, match="does not go with"):
+        replace(preset(ReverseDuffing(), "input-aware", "fast"), features=10)
+
+
+def test_training_on_a_solved_map(tmp_path):
+    config = toy(Oscillator(), "spinn", forward_steps=0, features=60, reach=1.5, inverse_steps=600, duration=15.0)
+    result = train(Oscillator(), config, tmp_path)
+    assert list(result.losses) == ["inverse"]
+    assert result.artifact.forward.mlp.weights[0].shape == (60, 2)
+    runs = unseen_runs(Oscillator(), config.dt, 20, 20.0, seed=0, domain="1.5X")
+    assert np.median(errors(result.artifact, Oscillator(), runs, 0.0, 0).late) < 10.0
 
 
 # Whole runs

@@ -74,6 +74,10 @@ class Train:
     """Batches for the forward map (spinn)."""
     inverse_steps: Override[int] = None
     """Batches for the inverse map."""
+    features: Override[int] = None
+    """Solve for the forward map with so many random features instead of training it, 1500 say (spinn)."""
+    reach: Override[float] = None
+    """The multiple of X over which a solved forward map is inverted."""
     physics_weight: Override[float] = None
     """Weight nu of the PDE residual (spinn)."""
     noise_max: Override[float] = None
@@ -99,10 +103,10 @@ class Train:
         name += "-closed-loop" if self.closed_loop else ""
         folder = self.out or Path("runs") / name
         names = {entry.name for entry in fields(Config)}
-        config = override(
-            preset(system, self.method, self.preset),
-            {key: value for key, value in vars(self).items() if key in names and key not in ("method", "closed_loop")},
-        )
+        changes = {key: value for key, value in vars(self).items() if key in names - {"method", "closed_loop"}}
+        if self.features and self.forward_steps is None:
+            changes["forward_steps"] = 0  # what is solved for is not trained
+        config = override(preset(system, self.method, self.preset), changes)
         if self.closed_loop:
             config = replace(config, closed_loop=CLOSED_LOOP)
         device = None if self.device == "auto" else torch.device(self.device)

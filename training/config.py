@@ -44,6 +44,10 @@ class Config:
     """Batches for the forward map; the input-aware method has none."""
     inverse_steps: int = 30000
     """Batches for the inverse map."""
+    features: int = 0
+    """Random features of a forward map that is solved for by least squares instead of trained (spinn); 0 trains it."""
+    reach: float = 1.0
+    """The multiple of the training box over which a solved forward map is inverted; its points lie there as well."""
     physics_weight: float = 0.1
     """nu, the weight of the PDE residual in the forward map's risk."""
     noise_max: float = 1.0
@@ -85,8 +89,18 @@ class Config:
                 f"closed_loop must be 0 or at least 10, and needs method 'input-aware'; got {self.closed_loop}, "
                 f"{self.method!r}"
             )
-        if (self.method == "spinn") != (self.forward_steps > 0):
-            raise ValueError(f"method {self.method!r} does not go with forward_steps = {self.forward_steps}")
+        if (self.method == "spinn") != (self.forward_steps > 0 or self.features > 0):
+            raise ValueError(
+                f"method {self.method!r} does not go with forward_steps = {self.forward_steps} and features = "
+                f"{self.features}"
+            )
+        if self.features and self.forward_steps:
+            raise ValueError(f"features = {self.features} solve for T: forward_steps must be 0 beside them")
+        if self.features < 0 or not 1 <= self.reach < np.inf or (self.reach > 1 and not self.features):
+            raise ValueError(
+                f"features = {self.features} must not be negative, and reach = {self.reach} must be 1, or more with "
+                "features"
+            )
 
 
 # Number, fastest and slowest of the real modes of the input-aware maps, evenly spaced in the logarithm.

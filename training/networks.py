@@ -1,12 +1,13 @@
 """Torch networks and their way into artifacts."""
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import nn
 
-from observers import MLP
+from observers import MLP, ForwardMap
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 
@@ -42,3 +43,24 @@ class Network(nn.Sequential):
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
     """A float32 tensor on ``device``."""
     return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)
+
+
+def on_torch(forward: ForwardMap, device: torch.device) -> Callable[[torch.Tensor], torch.Tensor]:
+    """A forward map on tensors, (n, nx) to (n, nz), in float32."""
+    mlp = forward.mlp
+    layers: list[nn.Module] = []
+    for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
+        layer = nn.Linear(weight.shape[1], weight.shape[0], device=device)
+        layer.weight.data, layer.bias.data = tensor(weight, device), tensor(bias, device)
+        layers += [layer, ACTIVATIONS[mlp.activation]()]
+    network = nn.Sequential(*layers[:-1])
+    xo, xs, zo, zs = (
+        tensor(values, device) for values in (forward.x_offset, forward.x_scale, forward.z_offset, forward.z_scale)
+    )
+
+    @torch.no_grad()
+    def T(x: torch.Tensor) -> torch.Tensor:
+        z: torch.Tensor = zo + zs * network((x - xo) / xs)
+        return z
+
+    return T

@@ -18,15 +18,16 @@ from torch.utils.tensorboard import SummaryWriter
 
 import kkl_gym
 from kkl_gym.system import System
-from observers import Artifact, LinearFilter
+from observers import Artifact, ForwardMap, LinearFilter
 from training.config import Config
 from training.controllers import controller
 from training.data import output, record, record_closed_loop, recording_ages
 from training.files import write
 from training.forward import ForwardProblem, truncation_time
 from training.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
-from training.networks import Network
+from training.networks import Network, on_torch
 from training.optimise import Stage, optimise
+from training.solved import solve_forward
 
 # First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
 TRAINING_SEED = 1
@@ -45,7 +46,6 @@ class Result:
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
-    forward: ForwardProblem | None
 
 
 def train(
@@ -104,17 +104,24 @@ def train(
         data = record(
             system, linear, config.trajectories, steps, ages, rng, lambda done: progress.update(task, completed=done)
         )
-        forward = None
+        forward: ForwardMap | None = None
         sampler: Sampler
         feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
         if config.method == "input-aware":
             sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
         else:
             x, z = data.x.reshape(-1, system.nx), data.z.reshape(-1, linear.size)
-            network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
-            forward = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
-            run("forward", forward, config.forward_steps)
-            sampler = ForwardMapSampler(forward.T, forward.error(), system.box(), config.batch, device)
+            if config.features:
+                with progress.console.status(f"solving for T with {config.features} features"):
+                    forward = solve_forward(system, linear, config.features, config.reach, rng)
+                some = np.random.default_rng(0).permutation(len(x))[:100_000]
+                T, error = on_torch(forward, device), z[some] - forward(x[some])
+            else:
+                network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
+                problem = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
+                run("forward", problem, config.forward_steps)
+                forward, T, error = problem.forward_map(), problem.T, problem.error()
+            sampler = ForwardMapSampler(T, error, system.box(config.reach), config.batch, device)
         inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
         inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
         run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)
@@ -125,7 +132,7 @@ def train(
                 inverse=sampler.inverse_map(inverse, linear),
                 system=system.name,
                 parameters=system.parameters,
-                forward=forward.forward_map() if forward else None,
+                forward=forward,
                 C=output_matrix(system),
                 training={
                     **dataclasses.asdict(config),
@@ -157,7 +164,7 @@ def train(
             )
             sampler = ClosedLoopSampler(sampler, driven, config.dt, device)
             run("closed-loop", InverseProblem(inverse, sampler, device), config.inverse_steps)
-    return Result(artifact(), losses, forward)
+    return Result(artifact(), losses)
 
 
 def describe(system: System) -> dict[str, Any]:

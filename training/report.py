@@ -4,13 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from kkl_gym.system import System
-from observers import KKLObserver
+from observers import Artifact, KKLObserver
+from training.certificates.certificate import residual
 from training.data import output
 from training.evaluate import Runs, errors, unseen_runs
-from training.forward import ForwardProblem
 from training.pipeline import Result
 
 
@@ -37,10 +36,10 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {artifact.training['method']}")
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
-    if result.forward is None:
+    if artifact.forward is None:
         _draw_noise_levels(right, result, system, runs, seed)
     else:
-        _draw_residual(figure, right, result.forward, system)
+        _draw_residual(figure, right, artifact, system)
 
     x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
@@ -74,15 +73,12 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, runs: Runs, seed
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
-def _draw_residual(figure: Any, ax: Any, forward: ForwardProblem, system: System, n: int = 120) -> None:
+def _draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 120) -> None:
     (low1, high1), (low2, high2) = system.X[0], system.X[-1]
     first, last = np.linspace(low1, high1, n), np.linspace(low2, high2, n)
     points = np.tile([(low + high) / 2 for low, high in system.X], (n * n, 1))
     points[:, 0], points[:, -1] = (grid.ravel() for grid in np.meshgrid(first, last))
-    device = forward._x.device
-    with torch.no_grad():
-        residual, _ = forward.residual(torch.as_tensor(points, dtype=torch.float32, device=device))
-    size = residual.norm(dim=-1).cpu().numpy().reshape(n, n)
+    size = np.linalg.norm(residual(artifact, system, points), axis=1).reshape(n, n)
     image = ax.pcolormesh(first, last, np.log10(size + 1e-12), shading="auto")
     figure.colorbar(image, ax=ax, label="log10 |PDE residual|")
     ax.set(xlabel=system.state_names[0], ylabel=system.state_names[-1], title="PDE residual over X")
