@@ -370,7 +370,7 @@ def test_solved_forward_map_of_a_linear_system():
     T = solve_forward(Oscillator(), linear, 100, 1.0, np.random.default_rng(0))
     x = np.random.default_rng(1).uniform(-1, 1, (50, 2))
     expected = x @ sylvester(linear.A, linear.B).T
-    assert np.abs(T(x) - expected).max() < 1e-3 * np.abs(expected).max()
+    assert np.abs(T(x) - expected).max() < 1e-2 * np.abs(expected).max()
 
 
 def test_what_cannot_be_solved():
