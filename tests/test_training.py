@@ -395,12 +395,14 @@ def test_what_cannot_be_solved():
 
 
 def test_training_on_a_solved_map(tmp_path):
-    config = toy(Oscillator(), "spinn", forward_steps=0, features=200, reach=1.5, inverse_steps=600, duration=15.0)
+    sizes = {"features": 200, "forward_steps": 0, "reach": 1.5, "inverse_steps": 2000, "duration": 15.0, "width": 32}
+    config = toy(Oscillator(), "spinn", **sizes)
     result = train(Oscillator(), config, tmp_path)
     assert list(result.losses) == ["inverse"]
     assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
     runs = unseen_runs(Oscillator(), config.dt, 20, 20.0, seed=0, domain="1.5X")
-    assert np.median(errors(result.artifact, Oscillator(), runs, 0.0, 0).late) < 10.0
+    # long after the start, whose last traces in z an inverse of exact T(x) magnifies
+    assert np.median(errors(result.artifact, Oscillator(), runs, 0.0, 0, skip=12.0).late) < 5.0
 
 
 # Whole runs

@@ -77,7 +77,7 @@ class Train:
     features: Override[int] = None
     """Solve for the forward map with so many random features instead of training it, 1500 say (spinn)."""
     reach: Override[float] = None
-    """The multiple of X over which a solved forward map is inverted."""
+    """A solved forward map holds along motions that start in this multiple of X."""
     physics_weight: Override[float] = None
     """Weight nu of the PDE residual (spinn)."""
     noise_max: Override[float] = None

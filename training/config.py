@@ -47,7 +47,7 @@ class Config:
     features: int = 0
     """Random features of a forward map that is solved for by least squares instead of trained (spinn); 0 trains it."""
     reach: float = 1.0
-    """The multiple of the training box over which a solved forward map is inverted; its points lie there as well."""
+    """Where a solved forward map holds and is inverted: along motions from this multiple of the training box."""
     physics_weight: float = 0.1
     """nu, the weight of the PDE residual in the forward map's risk."""
     noise_max: float = 1.0

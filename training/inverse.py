@@ -198,7 +198,7 @@ class ClosedLoopSampler:
 
 
 class ForwardMapSampler:
-    """The paper's second data set S_2: x' uniform in the training box, z' = T(x') by the learned map (sec. 5.2).
+    """The paper's second data set S_2: x' uniform in the training box (or given), z' = T(x') by the map (sec. 5.2).
 
     The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
     Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
@@ -208,7 +208,8 @@ class ForwardMapSampler:
     ----------
     forward : T on tensors, (n, nx) to (n, nz).
     error : samples of z - T(x), (n, nz).
-    box : low and high corner of the training box.
+    box : low and high corner of where x' is drawn.
+    points : states (n, nx) of which x' is drawn instead.
     """
 
     cells = 1
@@ -220,9 +221,11 @@ class ForwardMapSampler:
         box: tuple[np.ndarray, np.ndarray],
         batch: int,
         device: torch.device,
+        points: np.ndarray | None = None,
     ) -> None:
-        low, high = box
+        low, high = box if points is None else (points.min(0), points.max(0))
         self._low, self._span = tensor(low, device), tensor(high - low, device)
+        self._points = None if points is None else tensor(points, device)
         self._forward, self._batch = forward, batch
         x = self._draw(torch.Generator(device).manual_seed(0), 100_000)
         z = forward(x).cpu().numpy().astype(float)
@@ -234,6 +237,9 @@ class ForwardMapSampler:
         self._blur = tensor(self.coordinates.noise_gain, device)
 
     def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
+        if self._points is not None:
+            rows = torch.randint(len(self._points), (n,), generator=generator, device=generator.device)
+            return self._points[rows]
         return self._low + self._span * torch.rand((n, len(self._low)), generator=generator, device=generator.device)
 
     def __call__(self, generator: torch.Generator) -> Batch:

@@ -27,7 +27,7 @@ from training.forward import ForwardProblem, truncation_time
 from training.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.networks import Network, on_torch
 from training.optimise import Stage, optimise
-from training.solved import solve_forward
+from training.solved import collocation, solve_forward
 
 # First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
 TRAINING_SEED = 1
@@ -37,6 +37,7 @@ SHARES = {
     "closed-loop": {"inverse": 0.5, "closed-loop": 0.5},
     "spinn": {"forward": 0.75, "inverse": 0.25},
 }
+INVERTED = 200_000  # states on which a solved forward map is inverted
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
 
@@ -116,12 +117,13 @@ def train(
                     forward = solve_forward(system, linear, config.features, config.reach, rng)
                 some = np.random.default_rng(0).permutation(len(x))[:100_000]
                 T, error = on_torch(forward, device), z[some] - forward(x[some])
+                points = collocation(system, INVERTED, config.reach, rng)
             else:
                 network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
                 problem = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
                 run("forward", problem, config.forward_steps)
-                forward, T, error = problem.forward_map(), problem.T, problem.error()
-            sampler = ForwardMapSampler(T, error, system.box(config.reach), config.batch, device)
+                forward, T, error, points = problem.forward_map(), problem.T, problem.error(), None
+            sampler = ForwardMapSampler(T, error, system.box(), config.batch, device, points)
         inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
         inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
         run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)

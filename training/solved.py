@@ -72,7 +72,7 @@ def solve_forward(
 
 def collocation(system: System, n: int, reach: float, rng: np.random.Generator) -> np.ndarray:
     """n states along motions from ``reach`` times X, more of them from X itself; raises ValueError if motions leave."""
-    motions = max(50, 5 * n // SAMPLES)
+    motions = max(50, 2 * n // SAMPLES)
     near = round(NEAR * motions)
     x0 = np.concatenate(
         [rng.uniform(*system.box(), (near, system.nx)), rng.uniform(*system.box(reach), (motions - near, system.nx))]
