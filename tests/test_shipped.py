@@ -69,6 +69,25 @@ def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
     assert np.median(relative) < error
 
 
+@pytest.mark.parametrize("name", sorted(set(observers.shipped().values())))
+def test_every_map_can_be_monitored(name):
+    observer = observers.load(name, measurement_noise=0.5, monitor=True)
+    assert observer.artifact.limits.false_alarms == 0.01
+    y = 0.5 * np.random.default_rng(0).standard_normal((600, 1, 1)) + 300.0  # far off scale
+    observer.reset(y[0])
+    for k in range(1, 600):
+        observer.step(y[k])
+    assert (observer.score > 1).all()
+
+
+def test_the_map_fitted_in_closed_loop():
+    system, runs = get_system("van_der_pol"), unseen_runs(get_system("van_der_pol"), 0.01, 100, 50.0, seed=0)
+    fitted = observers.Artifact.read(resolve("van_der_pol-closed-loop"))
+    assert fitted.training["closed_loop"] == 2000
+    assert np.median(errors(fitted, system, runs, 0.0, seed=0).full) <= 1.5
+    assert np.median(errors(fitted, system, runs, 0.5, seed=0).full) <= 5.0
+
+
 def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
     for name in NAMES:
         limit = 3.0 if name == "lorenz" else 1.0
