@@ -7,7 +7,16 @@ import pytest
 
 from kkl_gym import SYSTEMS, VanDerPol, get_system
 from observers import load
-from training.agents.information import INFORMATION, STACKED, Features, KalmanFilters, make, modes, output_deviation
+from training.agents.information import (
+    INFORMATION,
+    STACKED,
+    Features,
+    KalmanFilters,
+    make,
+    modes,
+    observer_of,
+    output_deviation,
+)
 from training.agents.tasks import ControlTask
 from training.methods.kalman import EKF
 
@@ -70,7 +79,7 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
     env.reset(seed=0)
     for action in actions(5):
         obs, *_, info = env.step(action)
-    observer = load("van_der_pol", 0.2)
+    observer = load(observer_of(system), 0.2)
     inverse = observer.artifact.inverse
     feature, width = modes(observer, system)
     assert obs.shape == (N, width)
@@ -80,6 +89,11 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
     whitened = (info["z"] - at_target) @ (inverse.gain(0.2)[:, None] * inverse.whiten).T
     assert np.allclose(obs[:, :-1], whitened, atol=1e-4)
     assert np.allclose(obs[:, -1], inverse.age_feature(np.full(N, 0.1)))
+
+
+def test_agents_get_the_map_fitted_in_closed_loop_where_it_ships():
+    assert observer_of(get_system("van_der_pol")) == "van_der_pol-closed-loop"
+    assert observer_of(get_system("lorenz")) == "lorenz"
 
 
 def test_an_output_that_is_flat_at_the_target():
