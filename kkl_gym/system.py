@@ -7,7 +7,7 @@ floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) 
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -107,7 +107,7 @@ class System:
     @property
     def parameters(self) -> dict[str, float]:
         """The physical parameters by name."""
-        return asdict(self)
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)}
 
     @property
     def target(self) -> tuple[float, ...]:

@@ -113,8 +113,9 @@ def train(
         else:
             x, z = data.x.reshape(-1, system.nx), data.z.reshape(-1, linear.size)
             if config.features:
-                with progress.console.status(f"solving for T with {config.features} features"):
-                    forward = solve_forward(system, linear, config.features, config.reach, rng)
+                task = progress.add_task(f"solving for T with {config.features} features", total=1)
+                forward = solve_forward(system, linear, config.features, config.reach, rng)
+                progress.update(task, completed=1)
                 some = np.random.default_rng(0).permutation(len(x))[:100_000]
                 T, error = on_torch(forward, device), z[some] - forward(x[some])
                 points = collocation(system, INVERTED, config.reach, rng)
