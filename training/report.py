@@ -39,7 +39,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     if artifact.forward is None:
         _draw_noise_levels(right, result, system, runs, seed)
     else:
-        _draw_residual(figure, right, artifact, system)
+        draw_residual(figure, right, artifact, system)
 
     x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
@@ -73,12 +73,16 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, runs: Runs, seed
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
-def _draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 120) -> None:
-    (low1, high1), (low2, high2) = system.X[0], system.X[-1]
-    first, last = np.linspace(low1, high1, n), np.linspace(low2, high2, n)
-    points = np.tile([(low + high) / 2 for low, high in system.X], (n * n, 1))
-    points[:, 0], points[:, -1] = (grid.ravel() for grid in np.meshgrid(first, last))
-    size = np.linalg.norm(residual(artifact, system, points), axis=1).reshape(n, n)
-    image = ax.pcolormesh(first, last, np.log10(size + 1e-12), shading="auto")
-    figure.colorbar(image, ax=ax, label="log10 |PDE residual|")
-    ax.set(xlabel=system.state_names[0], ylabel=system.state_names[-1], title="PDE residual over X")
+def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 150) -> None:
+    """Size of the PDE's residual over the plane of the phase portrait, the other states at the centre of X."""
+    from matplotlib.colors import LogNorm
+
+    first, second = (i % system.nx for i in system.portrait)
+    x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
+    grids = [np.linspace(*system.X[i], n) for i in (first, second)]
+    x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
+    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
+    image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
+    figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
+    ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+    ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

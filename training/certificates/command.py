@@ -21,9 +21,9 @@ from training.certificates.certificate import (
     certify,
     noise_variance,
     record_motion,
-    residual,
 )
 from training.files import write
+from training.report import draw_residual
 
 SHOWN = 30_000  # states in the figure
 
@@ -185,16 +185,8 @@ def draw(path: Path, artifact: Artifact, system: System, measurement_noise: floa
     )
     figure.colorbar(points, ax=axes[-1], label="predicted rms error")
     axes[-1].set_title(f"error due to noise {measurement_noise:g}, along the motion")
+    axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     if artifact.forward is not None:
-        n = 150
-        x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
-        grids = [np.linspace(*system.X[i], n) for i in (first, second)]
-        x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
-        wrong = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
-        image: Any = axes[0].pcolormesh(*grids, wrong, norm=LogNorm() if wrong.all() else None, shading="auto")
-        figure.colorbar(image, ax=axes[0], label="|∂T/∂x f − A T − B h|")
-        axes[0].set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")
-    for ax in axes:
-        ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+        draw_residual(figure, axes[0], artifact, system)
     figure.suptitle(name)
     figure.savefig(path, dpi=110)
