@@ -93,6 +93,7 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
 
 def test_agents_get_the_map_fitted_in_closed_loop_where_it_ships():
     assert observer_of(get_system("van_der_pol")) == "van_der_pol-closed-loop"
+    assert observer_of(get_system("reverse_duffing")) == "reverse_duffing-closed-loop"
     assert observer_of(get_system("lorenz")) == "lorenz"
 
 

@@ -80,9 +80,10 @@ def test_every_map_can_be_monitored(name):
     assert (observer.score > 1).all()
 
 
-def test_the_map_fitted_in_closed_loop():
-    system, runs = get_system("van_der_pol"), unseen_runs(get_system("van_der_pol"), 0.01, 100, 50.0, seed=0)
-    fitted = observers.Artifact.read(resolve("van_der_pol-closed-loop"))
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
+def test_maps_fitted_in_closed_loop(name):
+    system, runs = get_system(name), unseen_runs(get_system(name), 0.01, 100, 50.0, seed=0)
+    fitted = observers.Artifact.read(resolve(f"{name}-closed-loop"))
     assert fitted.training["closed_loop"] == 2000
     assert np.median(errors(fitted, system, runs, 0.0, seed=0).full) <= 1.5
     assert np.median(errors(fitted, system, runs, 0.5, seed=0).full) <= 5.0
