@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo test test-slow lint format maps results benchmark certificates speed clean
+.PHONY: demo test test-slow lint format maps results benchmark certificates agents speed clean
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -35,6 +35,7 @@ maps: $(VENV)/ready
 # The figures in the README and in docs/.
 results: $(VENV)/ready
 	$(BIN)/kkl-gym demo --out docs/figures
+	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
 		--csv docs/results/accuracy.csv
 
@@ -46,6 +47,13 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 certificates: $(VENV)/ready  ## the figures in docs/certificates.md
 	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
 	$(BIN)/kkl-gym faults --out docs/results/faults
+
+agents: $(VENV)/ready  ## every agent in docs/agents.md, and those that ship: hours on two cores; resumable
+	$(BIN)/kkl-gym agent compare
+	mkdir -p docs/results/agents training/agents/shipped
+	cp $(addprefix agents/comparison/,results.csv table.md scores.png) docs/results/agents
+	for system in $(SYSTEMS); do cp agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
+		training/agents/shipped/$$system.safetensors || exit 1; done
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1
 	$(BIN)/kkl-gym speed

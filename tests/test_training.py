@@ -330,6 +330,26 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     assert relative < 1e-3
 
 
+def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
+    system = Oscillator()
+    linear = make_filter((-2.0,), 1, 0.01, 0, ((-0.9, 1.7), (-1.5, 0.4)))
+    np.testing.assert_allclose(
+        np.sort_complex(np.linalg.eigvals(linear.A)),
+        np.sort_complex([-2.0, -0.9 + 1.7j, -0.9 - 1.7j, -1.5 + 0.4j, -1.5 - 0.4j]),
+    )
+    data = record(system, linear, 20, 2500, np.array([2400, 2500]), np.random.default_rng(0))
+    np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
+
+
+def test_a_pair_of_modes_can_be_trained(tmp_path):
+    system = Oscillator()
+    config = toy(system, eigenvalues=(-3.0,), pairs=((-0.5, 1.0),), inverse_steps=20)
+    train(system, config, tmp_path).artifact.save(tmp_path / "a.safetensors")
+    artifact = Artifact.read(tmp_path / "a.safetensors")
+    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(artifact.filter.A)), [-3, -0.5 - 1j, -0.5 + 1j])
+    assert artifact.filter.size == 3 * (1 + system.nu)
+
+
 def test_backward_quadrature_solves_the_pde():
     eigenvalues, eps = [-1.5, -3.0], 1e-4
     x, system = np.array([1.2, -0.7]), ReverseDuffing()
@@ -560,6 +580,10 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"dt": 0.0}, "dt"),
         ({"eigenvalues": (1.0,)}, "eigenvalues"),
         ({"eigenvalues": (-1.0, -1.0)}, "distinct"),
+        ({"pairs": ((0.1, 1.0),)}, "pairs"),
+        ({"pairs": ((-0.1, -1.0),)}, "pairs"),
+        ({"pairs": ((-0.1, 1.0), (-0.1, 1.0))}, "distinct"),
+        ({"eigenvalues": ()}, "needs eigenvalues"),
         ({"forward_steps": 5}, "forward_steps"),
         ({"width": 0}, "width"),
         ({"batch": 2}, "batch"),

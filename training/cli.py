@@ -53,7 +53,9 @@ class Train:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     eigenvalues: Override[tuple[float, ...]] = None
-    """Of the diagonal A, in 1/s."""
+    """Real eigenvalues of A, in 1/s."""
+    pairs: Override[tuple[tuple[float, float], ...]] = None
+    """Complex pairs of them, real and imaginary part of each: --pairs -0.1 0.94 -0.3 2.8."""
     dt: Override[float] = None
     """Sampling interval in seconds."""
     trajectories: Override[int] = None

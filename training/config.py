@@ -21,7 +21,10 @@ class Config:
     """"input-aware": T_inv(z_y, z_u) fitted along driven, noisy trajectories, transients included.
     "spinn": the paper's pipeline, a physics-informed T and then T_inv on z' = T(x')."""
     eigenvalues: tuple[float, ...]
-    """Of the diagonal A, in 1/s; B is all ones for each output."""
+    """The real ones of A, in 1/s; B is all ones for each output."""
+    pairs: tuple[tuple[float, float], ...] = ()
+    """Complex ones beside them, (a, w) for each pair a +- iw: a in 1/s and negative, w in rad/s and positive. A slow
+    pair averages the noise on a component of y that oscillates at its frequency, which real modes do not."""
     dt: float = 0.01
     """Sampling interval in seconds."""
     trajectories: int = 4000
@@ -66,10 +69,17 @@ class Config:
         for name, allowed in (("method", get_args(Method)), ("activation", ("tanh", "silu"))):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if not self.eigenvalues or any(not value < 0 for value in self.eigenvalues):
+        if not self.eigenvalues and not self.pairs:
+            raise ValueError("A needs eigenvalues, or pairs of them")
+        if any(not -np.inf < value < 0 for value in self.eigenvalues):
             raise ValueError(f"eigenvalues must be negative, got {self.eigenvalues}")
-        if len(set(self.eigenvalues)) < len(self.eigenvalues):
-            raise ValueError(f"eigenvalues must be distinct, got {self.eigenvalues}")
+        if any(not (-np.inf < a < 0 < w < np.inf) for a, w in self.pairs):
+            raise ValueError(f"pairs must be (negative real part, positive imaginary part), got {self.pairs}")
+        for modes in (self.eigenvalues, self.pairs):
+            if len(set(modes)) < len(modes):
+                raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
+        if self.pairs and self.features:
+            raise ValueError(f"solving for the forward map (features) needs a diagonal A, without pairs = {self.pairs}")
         for name in ("dt", "duration", "learning_rate", "noise_max", "truncation"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from scipy.linalg import block_diag
 from torch.utils.tensorboard import SummaryWriter
 
 import kkl_gym
@@ -84,7 +85,7 @@ def train(
     rng = np.random.default_rng([TRAINING_SEED, config.seed])
 
     nu = system.nu if config.method == "input-aware" else 0
-    linear = make_filter(config.eigenvalues, system.ny, config.dt, nu)
+    linear = make_filter(config.eigenvalues, system.ny, config.dt, nu, config.pairs)
     steps = max(1, round(config.duration / config.dt))
     losses: dict[str, list[tuple[int, float]]] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -225,8 +226,12 @@ def output_matrix(system: System) -> np.ndarray | None:
     return C if np.allclose(output(system, x), x @ C.T, rtol=1e-9, atol=1e-12) else None
 
 
-def make_filter(eigenvalues: tuple[float, ...], ny: int, dt: float, nu: int) -> LinearFilter:
-    """The filter with these modes for each of ny outputs: A = diag(eigenvalues) repeated, B = ones in its block."""
-    modes = len(eigenvalues)
-    A = np.kron(np.eye(ny), np.diag(eigenvalues))
-    return LinearFilter(A, np.kron(np.eye(ny), np.ones((modes, 1))), dt, nu)
+def make_filter(
+    eigenvalues: tuple[float, ...], ny: int, dt: float, nu: int, pairs: tuple[tuple[float, float], ...] = ()
+) -> LinearFilter:
+    """The filter with these modes for each of ny outputs, A block diagonal and B all ones for each output.
+
+    eigenvalues : real ones; pairs : (a, w) for each pair a +- iw, which becomes the block [[a, w], [-w, a]].
+    """
+    one = block_diag(*eigenvalues, *([[a, w], [-w, a]] for a, w in pairs))
+    return LinearFilter(np.kron(np.eye(ny), one), np.kron(np.eye(ny), np.ones((len(one), 1))), dt, nu)
