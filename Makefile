@@ -59,7 +59,7 @@ speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1
 	$(BIN)/kkl-gym speed
 
 clean:
-	rm -rf $(VENV) runs agents certificates demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) runs agents certificates tuning demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 
 $(VENV)/ready: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "kkl-gym needs Python 3.11 to 3.13: make PYTHON=...")'

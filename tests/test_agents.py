@@ -61,7 +61,7 @@ def test_a_saved_agent_plays_the_same(learned):
     read = Agent.read(folder / "agent.safetensors")
     assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-closed-loop-v1")
     assert read.fingerprint == fingerprint("van_der_pol-closed-loop")
-    assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 64 * 64)
+    assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
     episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
     assert np.array_equal(episodes[0].x, episodes[1].x)

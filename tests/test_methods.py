@@ -17,6 +17,7 @@ from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
 from training.data import output, run_filter
+from training.derivatives import jacobian, with_sensitivity
 from training.methods import METHODS, Budget, Task, get_method
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.autoencoder import bessel_filter
@@ -27,9 +28,7 @@ from training.methods.kalman import (
     ExtendedKalmanFilter,
     UnscentedFilters,
     faster,
-    jacobian,
     unknown_start,
-    with_sensitivity,
 )
 from training.methods.recurrent import rollout
 

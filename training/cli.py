@@ -16,7 +16,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, get_system
 from observers import Artifact, shipped
 from observers.artifact import resolve
-from training.config import CLOSED_LOOP, Config, Method, Preset, override, preset
+from training.config import CLOSED_LOOP, Config, Method, Preset, override, preset, read_changes
 from training.evaluate import Domain, errors, unseen_runs
 
 Value = TypeVar("Value")
@@ -38,6 +38,8 @@ class Train:
     """fast: at most ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
+    config: Path | None = None
+    """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
     closed_loop: bool = False
     """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware);
     takes twice as long. Writes NAME-closed-loop."""
@@ -108,7 +110,8 @@ class Train:
         changes = {key: value for key, value in vars(self).items() if key in names - {"method", "closed_loop"}}
         if self.features and self.forward_steps is None:
             changes["forward_steps"] = 0  # what is solved for is not trained
-        config = override(preset(system, self.method, self.preset), changes)
+        settings = preset(system, self.method, self.preset)
+        config = override(override(settings, read_changes(self.config) if self.config else {}), changes)
         if self.closed_loop:
             config = replace(config, closed_loop=CLOSED_LOOP)
         device = None if self.device == "auto" else torch.device(self.device)
@@ -242,6 +245,7 @@ def main(arguments: list[str] | None = None) -> None:
     from training.demo import Demo
     from training.faults import Faults
     from training.speed import Speed
+    from training.tuning.command import Tune
 
     commands: dict[str, Callable[..., Any]] = {
         "train": Train,
@@ -249,6 +253,7 @@ def main(arguments: list[str] | None = None) -> None:
         "benchmark": Benchmark,
         "agent": AgentCommand,
         "certify": Certify,
+        "tune": Tune,
         "faults": Faults,
         "maps": Maps,
         "demo": Demo,

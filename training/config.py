@@ -1,7 +1,9 @@
 """What a training run is made of, and the presets."""
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -181,6 +183,25 @@ def spectrum(system: System) -> tuple[float, ...]:
             raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
         n, fastest, slowest = 4 * system.nx + 3, -1.5 * rate, -rate / 15
     return tuple((-np.geomspace(-slowest, -fastest, n)).round(6).tolist())
+
+
+def read_changes(path: Path) -> dict[str, Any]:
+    """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`.
+
+    Raises ValueError if it is no object of a configuration's settings.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from None
+    names = {entry.name for entry in fields(Config)}
+    if not isinstance(found, dict) or not set(found) <= names:
+        unknown = sorted(set(found) - names) if isinstance(found, dict) else type(found).__name__
+        raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(names))}; it has {unknown}")
+    for name in ("eigenvalues", "pairs"):
+        if name in found:
+            found[name] = tuple(tuple(value) if isinstance(value, list) else value for value in found[name])
+    return found
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.simulate import advance, advance_batch
-from kkl_gym.system import Box, Components, System
+from kkl_gym.system import Components, System
 from training.data import output
-from training.derivatives import jacobian
+from training.derivatives import jacobian, with_sensitivity
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
 # Process noise, in multiples of each state's scale per square root of a second: what stands for the filters'
@@ -111,33 +111,6 @@ def faster(system: System, factor: float) -> System:
             return factor * system.rate(x)
 
     return Faster()
-
-
-def with_sensitivity(system: System) -> System:
-    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi."""
-    nx, rows = system.nx, jacobian(system.f, system.nx)
-    if type(system).g is not System.g:
-        raise ValueError(f"{system.name} has an input matrix that depends on the state, which the filter does not know")
-
-    class Sensitivity(System):
-        name = f"{system.name}-sensitivity"
-        X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
-        bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
-        u_max: ClassVar[tuple[float, ...]] = system.u_max
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * system.nu,) * nx**2) if system.nu else ()
-
-        def f(self, x: Components) -> Components:
-            state, Phi = x[:nx], x[nx:]
-            out = list(system.f(state))
-            for row in rows:
-                at = {k: derivative(*state) for k, derivative in row.items()}
-                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
-            return out
-
-        def rate(self, x: Components) -> Any:
-            return system.rate(x[:nx])
-
-    return Sensitivity()
 
 
 class ExtendedKalmanFilter:

@@ -1,0 +1,132 @@
+"""Choosing a spectrum, against closed forms on a linear system."""
+
+import json
+
+import numpy as np
+import pytest
+from linear_system import Oscillator
+from scipy.linalg import expm
+
+import training.tuning.probe
+from training.cli import main
+from training.config import read_changes
+from training.data import output, run_filter
+from training.methods.kalman import ExtendedKalmanFilter
+from training.pipeline import make_filter
+from training.tuning import Probe, Spectrum
+
+SPECTRUM = Spectrum((-2.0, -0.7), ((-0.3, 1.0),))
+
+
+@pytest.fixture(scope="module")
+def probe():
+    return Probe(Oscillator(), duration=6.0, motions=8)
+
+
+def relative(probe, covariance):
+    """What a covariance at each of the probe's ages amounts to."""
+    root = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    return 100 * probe.share @ (root[:, None] / np.linalg.norm(probe.x[probe.ages], axis=-1)).mean(1)
+
+
+def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, monkeypatch):
+    monkeypatch.setattr(training.tuning.probe, "RESOLUTION", 0.0)
+    rng, n, sigma = np.random.default_rng(0), 8000, 0.4
+    flow = expm(np.array([[0.0, 0.01], [-0.01, 0.0]]))
+    x = [rng.normal(size=(n, 2)) / np.sqrt(probe.start)]
+    for _ in range(600):
+        x.append(x[-1] @ flow.T)
+    y = output(probe.system, np.array(x)) + sigma * rng.normal(size=(601, n, 1))
+    linear = make_filter(SPECTRUM.eigenvalues, 1, 0.01, 0, SPECTRUM.pairs)
+    z = run_filter(linear, y, np.zeros((600, n, 0)), probe.ages)
+    left = []
+    for i, age in enumerate(probe.ages):
+        best, *_ = np.linalg.lstsq(z[i], x[age], rcond=None)
+        error = x[age] - z[i] @ best
+        left.append(error.T @ error / (n - z.shape[-1]))
+    assert relative(probe, np.array(left)) == pytest.approx(probe.error(SPECTRUM, sigma), rel=0.02)
+
+
+def test_the_least_error_is_that_of_a_kalman_filter(probe):
+    kalman = ExtendedKalmanFilter(
+        probe.system, 0.01, np.zeros((2, 2)), 0.09 * np.eye(1), np.zeros(2), np.diag(1 / probe.start)
+    )
+    kalman.reset(probe.y[0])
+    P = [kalman.P[0]]
+    for y in probe.y[1:]:
+        kalman.step(y)
+        P.append(kalman.P[0])
+    assert relative(probe, np.array(P)[probe.ages]) == pytest.approx(probe.least(0.3), rel=1e-6)
+    assert probe.least(0.3) < probe.error(SPECTRUM, 0.3)
+
+
+def test_errors_fall_with_modes_and_those_of_the_library_are_those_of_the_spectrum(probe):
+    found = probe.choose(0.3, 7)
+    assert 3 <= found[-1].spectrum.modes <= 7
+    errors = [choice.error for choice in found]
+    assert (np.diff(errors) < 0).all()
+    assert probe.error(found[-1].spectrum, 0.3) == pytest.approx(found[-1].error, rel=1e-5)
+    assert probe.least(0.3) < found[-1].error < probe.error(Spectrum((-2.0, -0.7)), 0.3)
+
+
+def test_more_noise_is_worse_and_slower_modes_average_it(probe):
+    assert probe.error(SPECTRUM, 0.1) < probe.error(SPECTRUM, 0.4)
+    slow, fast = Spectrum((), ((-0.5, 1.0),)), Spectrum((), ((-5.0, 1.0),))
+    assert probe.error(slow, 0.5) < probe.error(fast, 0.5)
+
+
+def test_bessel_filters_have_their_poles(probe):
+    (third,) = probe.bessel(0.1, [3], [2.0])
+    assert third.spectrum.modes == 3
+    poles = [*third.spectrum.eigenvalues, *(complex(*pair) for pair in third.spectrum.pairs)]
+    s = 2.0j  # at the cutoff the gain is down by 3 dB
+    gain = np.prod(
+        [abs(p) / abs(s - p) * (abs(p) / abs(s - np.conj(p)) if isinstance(p, complex) else 1) for p in poles]
+    )
+    assert gain == pytest.approx(1 / np.sqrt(2), rel=1e-6)
+
+
+class Escaping(Oscillator):
+    name = "escaping"
+
+    def f(self, x):
+        return 5.0 * x[0], 5.0 * x[1]
+
+
+def test_a_system_whose_motions_leave_its_bounds():
+    with pytest.raises(ValueError, match="stayed within the bounds"):
+        Probe(Escaping(), duration=5.0)
+
+
+def test_the_command_writes_what_training_takes(tmp_path, capsys):
+    chosen = {}
+    for noise in ("0", "0.5"):
+        folder = tmp_path / noise
+        main(["tune", "lorenz", "--measurement-noise", noise, "--duration", "4", "--modes", "7", "--out", str(folder)])
+        chosen[noise] = read_changes(folder / "config.json")
+        assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
+    assert chosen["0"]["pairs"] != chosen["0.5"]["pairs"]
+    assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 0.5)
+    small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]
+    config = ["--config", str(tmp_path / "0.5" / "config.json"), "--no-monitor", "--out", str(tmp_path / "run")]
+    main(["train", "lorenz", *config, *small, "--batch", "64"])
+    described = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert described["pairs"] == [list(pair) for pair in chosen["0.5"]["pairs"]]
+    assert described["width"] == 8
+
+
+@pytest.mark.parametrize(
+    "options", [["--measurement-noise", "-1"], ["--modes", "0"], ["--duration", "0"], ["--dt", "0"]]
+)
+def test_bad_options(options, tmp_path):
+    with pytest.raises(SystemExit, match="must"):
+        main(["tune", "lorenz", *options, "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"), [("{", "no JSON"), ("[1]", "object of settings"), ('{"modes": 3}', "modes")]
+)
+def test_files_that_hold_no_settings(text, message, tmp_path):
+    (tmp_path / "c.json").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_changes(tmp_path / "c.json")

@@ -1,0 +1,130 @@
+"""``kkl-gym tune``: a spectrum for a system and a noise level, and what others would have given."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from kkl_gym.system import System
+from kkl_gym.systems import get_system
+from training.config import spectrum
+from training.files import write
+from training.tuning.probe import Choice, Probe, Spectrum
+
+LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
+CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiples of the frequency of most of y's power
+
+
+@dataclass(frozen=True)
+class Tune:
+    """Choose the modes of A for a system and a noise level, by the error that is predicted without training.
+
+    Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`, front.csv and front.png: predicted error
+    against the number of modes, for this noise and others. docs/tuning.md says what the prediction rests on.
+    """
+
+    system: tyro.conf.Positional[str]
+    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    measurement_noise: float = 0.5
+    """Standard deviation of the noise on each sample of y."""
+    modes: int = 21
+    """Most modes for each output. They cost time in every step, and training."""
+    dt: float = 0.01
+    """Sampling interval in seconds."""
+    duration: float = 50.0
+    """Of a run, in seconds: how much transients count."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
+    seed: int = 0
+    """Of the motions' starts."""
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: tuning/SYSTEM-NOISE)")] = None
+    """Folder for what is written."""
+
+    def run(self, console: Console) -> Choice:
+        """Tune."""
+        if not 0 <= self.measurement_noise < np.inf or self.modes < 1:
+            raise ValueError(
+                f"measurement_noise = {self.measurement_noise} must not be negative, modes = {self.modes} be positive"
+            )
+        system = get_system(self.system, self.parameters)
+        folder = self.out or Path("tuning") / f"{system.name}-{self.measurement_noise:g}"
+        with console.status(f"following motions of {system.name}"):
+            probe = Probe(system, self.dt, self.duration, seed=self.seed)
+        noise = self.measurement_noise
+        levels = sorted({0.0, noise, noise / 5 if noise else 0.1, 2 * noise if noise else 0.5})
+        fronts = {}
+        for level in levels:
+            with console.status(f"choosing modes for noise {level:g}"):
+                fronts[level] = probe.choose(level, self.modes)
+        with console.status("comparing others"):
+            others = _others(probe, system, noise, self.modes)
+        best = min([fronts[noise][-1], *others], key=lambda choice: choice.error)
+
+        table = Table("modes", "predicted error in %", "", title=f"{system.name}, measurement noise {noise:g}")
+        for choice in [*fronts[noise], *others]:
+            mark = "[green]written[/green]" if choice is best else ""
+            table.add_row(str(choice.spectrum.modes), f"{choice.error:.3g}", f"{choice.kind} {mark}")
+        if noise:
+            table.add_row("–", f"{probe.least(noise):.3g}", "who knows the equations and all of y")
+        console.print(table)
+        config = {**asdict(best.spectrum), "noise_max": max(noise, LEAST_NOISE), "dt": self.dt}
+        write(folder / "config.json", json.dumps(config, indent=2) + "\n")
+        lines = [
+            f"{level:g},{choice.kind},{choice.spectrum.modes},{choice.error:.6g}"
+            for level, choices in [*fronts.items(), (noise, others)]
+            for choice in choices
+        ]
+        write(folder / "front.csv", "\n".join(["noise,kind,modes,error", *lines]) + "\n")
+        _draw(folder / "front.png", system, noise, fronts, others, best)
+        console.print(
+            f"wrote config.json, front.csv and front.png in {folder}; kkl-gym train {self.system} --config "
+            f"{folder / 'config.json'} trains an observer with it"
+        )
+        return best
+
+
+def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choice]:
+    """The package's default, the paper's, and Bessel filters."""
+    frequency = probe.frequencies[len(probe.frequencies) // 2]
+    named = {"default": spectrum(system), "paper's": tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist())}
+    found = [
+        Choice(Spectrum(values), probe.error(Spectrum(values), noise), kind)
+        for kind, values in named.items()
+        if len(values) <= most
+    ]
+    orders = [order for order in (system.nx + 1, 2 * system.nx + 1, 4 * system.nx + 1) if order <= most]
+    return found + probe.bessel(noise, orders, CUTOFFS * frequency)
+
+
+def _draw(
+    path: Path, system: System, noise: float, fronts: dict[float, list[Choice]], others: list[Choice], best: Choice
+) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for i, (level, choices) in enumerate(fronts.items()):
+        points = np.array([[choice.spectrum.modes, choice.error] for choice in choices])
+        left.semilogy(*points.T, "o-", color=f"C{i}", ms=3, lw=2 if level == noise else 1, label=f"noise {level:g}")
+    color = f"C{list(fronts).index(noise)}"
+    for kind, marker in (("default", "s"), ("paper's", "^"), ("Bessel", "x")):
+        points = np.array([[choice.spectrum.modes, choice.error] for choice in others if choice.kind == kind])
+        if len(points):
+            left.semilogy(*points.T, marker, color=color, ms=7, mfc="none", label=f"{kind}, noise {noise:g}")
+    left.set(xlabel="modes for each output", ylabel="predicted error in %", title=system.name.replace("_", " "))
+    left.set_ylim(top=10 * left.get_ylim()[1])  # room for the legend
+    left.legend(fontsize="small", ncols=2)
+    poles = [complex(value) for value in best.spectrum.eigenvalues]
+    poles += [complex(a, sign * w) for a, w in best.spectrum.pairs for sign in (1, -1)]
+    for choice in others:
+        if choice.kind == "default":
+            right.plot(choice.spectrum.eigenvalues, np.zeros(choice.spectrum.modes), "s", mfc="none", label="default")
+    right.plot(np.real(poles), np.imag(poles), "x", color=color, label=f"written: {best.kind}")
+    right.set(xscale="symlog", xlabel="Re λ in 1/s", ylabel="Im λ in rad/s", title=f"eigenvalues of A, noise {noise:g}")
+    right.legend(fontsize="small")
+    figure.savefig(path, dpi=110)

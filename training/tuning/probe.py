@@ -1,0 +1,215 @@
+"""Choosing the spectrum of A by the error that the best decoder would leave, without training any."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.signal import besselap, periodogram
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.data import output, run_filter
+from training.derivatives import output_jacobian, with_sensitivity
+from training.noise import noise_covariance
+from training.pipeline import make_filter
+
+RESOLUTION = 1e-3  # to which a network reads z, as a part of the signal: what is left where there is no noise
+REAL_MODES = 24  # in the library
+FREQUENCIES = np.array([0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98, 0.999])  # quantiles of the power of y
+DECAYS = 5  # of pairs at each frequency
+LEAST_GAIN = 0.01  # by which one more mode must lower the error
+SIGNIFICANT = 1e-13  # what rounding leaves of a matrix of unit diagonal
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues of A for each output: real ones, and pairs (a, w) of a +- iw."""
+
+    eigenvalues: tuple[float, ...] = ()
+    pairs: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def modes(self) -> int:
+        """Their number."""
+        return len(self.eigenvalues) + 2 * len(self.pairs)
+
+    def __add__(self, other: "Spectrum") -> "Spectrum":
+        return Spectrum(self.eigenvalues + other.eigenvalues, self.pairs + other.pairs)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A spectrum with the error that is predicted for it, in percent."""
+
+    spectrum: Spectrum
+    error: float
+    kind: str = "chosen"
+
+
+@dataclass
+class Probe:
+    """What the outputs of a system tell of its state through filters with any spectrum, to first order.
+
+    Along motions from X, a small error d in the start moves the state by Phi d and, as filters are linear, their z by
+    what they make of the signal dh/dx Phi d. From z with Gaussian errors of covariance R and a start of covariance S,
+    the start is therefore known to (Z^T R^-1 Z + S^-1)^-1, and the state to that carried along by Phi. No decoder of
+    this z does better, as far as motions are linear in their starts; an extended Kalman filter, which needs no filter
+    but the equations, has R of the outputs themselves.
+
+    R is the noise's exact covariance at each time since reset, and RESOLUTION^2 of the signal's for the network.
+
+    Parameters
+    ----------
+    system : any system whose input matrix does not depend on the state; its input is zero here.
+    dt, duration : in seconds; duration is that of the runs over which the error is averaged.
+    motions, seed : number and seed of their starts.
+
+    Raises
+    ------
+    ValueError : if hardly any motion stays within the system's bounds.
+    """
+
+    system: System
+    dt: float = 0.01
+    duration: float = 50.0
+    motions: int = 40
+    seed: int = 0
+    _of_library: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 < self.dt < self.duration < np.inf or self.motions < 2:
+            raise ValueError(
+                f"dt = {self.dt} must be positive, duration = {self.duration} longer, and motions = {self.motions} at "
+                "least 2"
+            )
+        system, nx = self.system, self.system.nx
+        low, high = system.box()
+        x0 = np.random.default_rng([self.seed, 7]).uniform(low, high, (2 * self.motions, nx))
+        identity = np.tile(np.eye(nx).ravel(), (len(x0), 1))
+        joint = simulate(with_sensitivity(system), np.hstack([x0, identity]), round(self.duration / self.dt), self.dt)
+        with np.errstate(invalid="ignore"):
+            inside = np.isfinite(simulate(system, x0, len(joint) - 1, self.dt)[-1]).all(-1)
+        if 2 * inside.sum() < self.motions:
+            raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
+        joint = joint[:, inside][:, : self.motions]
+        # Where the flow contracts by more than double precision can hold, later times tell nothing new.
+        useful = np.isfinite(joint).all((1, 2)) & (np.abs(joint).max((1, 2)) < 1e30)
+        end = len(joint) if useful.all() else int(useful.argmin())
+        self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
+        self.y = output(system, self.x)
+        self.signal = output_jacobian(system, self.x) @ self.Phi
+        self.start = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
+        early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
+        self.ages = np.unique(np.concatenate([early, late])).astype(int)
+        self.share = np.gradient(self.ages.astype(float))
+        self.share[-1] += round(self.duration / self.dt) - (end - 1)  # what comes later is like the last
+        self.share /= self.share.sum()
+        self._of_library = self.response(self.library)
+
+    @cached_property
+    def library(self) -> Spectrum:
+        """The modes to choose from: real ones up to twice the system's rate, and pairs where y has its power."""
+        low, high = self.system.box()
+        points = np.random.default_rng(0).uniform(low, high, (1000, self.system.nx)).T
+        rate = float(np.median(np.broadcast_to(self.system.rate(points), 1000)))
+        slowest, fastest = 5.0 / self.duration, min(3.0 * rate, 0.5 / self.dt)
+        real = -np.geomspace(slowest, fastest, REAL_MODES)
+        pairs = np.array([(-a, w) for w in self.frequencies for a in np.geomspace(slowest, 2 * w, DECAYS)])
+        pairs = pairs.reshape(-1, 2)  # also where y does not oscillate at all
+        return Spectrum(tuple(real.round(4).tolist()), tuple((a, w) for a, w in pairs.round(4).tolist()))
+
+    @cached_property
+    def frequencies(self) -> np.ndarray:
+        """Where y has its power, in rad/s: quantiles of it, rising."""
+        frequency, power = periodogram(self.y - self.y.mean(0), 1.0 / self.dt, "hann", axis=0)
+        share = np.cumsum(power.mean((1, 2)))
+        at = np.unique((2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)).round(3))
+        return np.asarray(at[at > 0])
+
+    def response(self, spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the filter with this spectrum makes of motions, of errors in their starts, and of noise, at all ages.
+
+        z : (ages, motions, size); of errors : (ages, motions, nx, size); covariance : (ages, size, size).
+        """
+        linear = make_filter(spectrum.eigenvalues, self.system.ny, self.dt, 0, spectrum.pairs)
+        steps, n, ny, nx = self.signal.shape
+        signals = np.moveaxis(self.signal, -1, 2).reshape(steps, n * nx, ny)
+        z = run_filter(linear, self.y, np.zeros((steps - 1, n, 0)), self.ages)
+        Z = run_filter(linear, signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
+        return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
+
+    def error(self, spectrum: Spectrum, measurement_noise: float) -> float:
+        """Predicted error of the best decoder, |x_hat - x|/|x| in percent: root mean square, mean over runs."""
+        return self._error(*self.response(spectrum), measurement_noise)
+
+    def least(self, measurement_noise: float) -> float:
+        """The same of whoever knows the equations and remembers every sample of y; raises ValueError without noise."""
+        if not measurement_noise > 0:
+            raise ValueError("without noise, all of y tells the state exactly")
+        square = np.einsum("tnij,tnik->tnjk", self.signal, self.signal).cumsum(0)
+        return self._relative(square[self.ages] / measurement_noise**2)
+
+    def _error(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: float) -> float:
+        spread = np.cov(z.reshape(-1, z.shape[-1]).T).reshape(z.shape[-1], -1)
+        R = measurement_noise**2 * P + RESOLUTION**2 * spread
+        seen = Z @ _inverse_root(R)[:, None]
+        return self._relative(seen @ seen.mT)
+
+    def _relative(self, information: np.ndarray) -> float:
+        left = _inverse_root(information + np.diag(self.start))
+        error = np.linalg.norm(self.Phi[self.ages] @ left, axis=(-2, -1))
+        relative = np.minimum(error / np.linalg.norm(self.x[self.ages], axis=-1), 2.0)
+        return float(100.0 * self.share @ relative.mean(1))
+
+    def choose(
+        self, measurement_noise: float, most: int = 21, report: Callable[[Choice], None] = lambda choice: None
+    ) -> list[Choice]:
+        """Spectra of more and more modes, each the one before and the mode, or pair, of the library that helps most.
+
+        It ends at ``most`` modes, or where none lowers the error by LEAST_GAIN. With several outputs, each has all.
+        """
+        z, Z, P = self._of_library
+        real, pairs, ny = self.library.eigenvalues, self.library.pairs, self.system.ny
+        size = self.library.modes
+        parts = [(Spectrum((value,)), [i]) for i, value in enumerate(real)]
+        parts += [(Spectrum((), (pair,)), [len(real) + 2 * i, len(real) + 2 * i + 1]) for i, pair in enumerate(pairs)]
+        chosen, columns, found = Spectrum(), list[int](), list[Choice]()
+        while True:
+            tried = []
+            for spectrum, own in parts:
+                if chosen.modes + spectrum.modes > most or own[0] in columns:
+                    continue
+                taken = np.add.outer(size * np.arange(ny), [*columns, *own]).ravel()
+                error = self._error(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
+                before = found[-1].error if found else 200.0
+                tried.append((np.log(before / error) / spectrum.modes, error, spectrum, own))
+            if not tried:
+                return found
+            gain, error, spectrum, own = max(tried, key=lambda one: one[0])
+            if gain < LEAST_GAIN:
+                return found
+            chosen, columns = chosen + spectrum, columns + own
+            found.append(Choice(chosen, error))
+            report(found[-1])
+
+    def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
+        """For each order, the poles of a Bessel filter at the best of some cutoffs in rad/s."""
+        found, cutoffs = [], list(cutoffs)
+        for order in orders:
+            _, poles, _ = besselap(order, norm="mag")
+            options = []
+            for cutoff in cutoffs:
+                real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
+                above = tuple((float(cutoff * pole.real), float(cutoff * pole.imag)) for pole in poles if pole.imag > 0)
+                spectrum = Spectrum(real, above)
+                options.append(Choice(spectrum, self.error(spectrum, measurement_noise), "Bessel"))
+            found.append(min(options, key=lambda choice: choice.error))
+        return found
+
+
+def _inverse_root(matrix: np.ndarray) -> np.ndarray:
+    """R with R R^T the inverse of symmetric positive matrices (..., n, n), to what rounding allows."""
+    scale = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(matrix / scale[..., None, :] / scale[..., :, None])
+    return np.asarray(vectors / np.sqrt(np.maximum(values, SIGNIFICANT))[..., None, :] / scale[..., :, None])
