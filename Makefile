@@ -4,7 +4,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo test test-slow lint format maps results benchmark certificates agents speed clean
+.PHONY: demo test test-slow lint format maps results benchmark ablation certificates agents speed clean
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -43,6 +43,13 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	$(BIN)/kkl-gym benchmark
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
+
+ABLATION := spinn ablation-solved ablation-solved-2x ablation-transients ablation-noise default ablation-tuned ablation-one-level
+
+ablation: $(VENV)/ready  ## what each idea earns (docs/method.md), hours on two cores; resumable
+	$(BIN)/kkl-gym benchmark --methods $(ABLATION) --out benchmark/ablation
+	mkdir -p docs/results/ablation
+	cp $(addprefix benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
 
 certificates: $(VENV)/ready  ## the figures in docs/certificates.md
 	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates

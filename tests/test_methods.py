@@ -12,13 +12,14 @@ from filterpy.kalman import KalmanFilter
 from linear_system import C, F, Oscillator, sylvester
 from scipy.linalg import expm
 
+import training.methods.ablation
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
 from training.data import output, run_filter
 from training.derivatives import jacobian, with_sensitivity
-from training.methods import METHODS, Budget, Task, get_method
+from training.methods import ABLATION, METHODS, Budget, Task, get_method
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.autoencoder import bessel_filter
 from training.methods.dmf import FORGET, Switching
@@ -371,8 +372,9 @@ def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path)
     np.testing.assert_allclose(data.y[data.ages], output(system, data.x), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", sorted(METHODS))
-def test_saved_and_loaded_is_the_same_observer(name, tmp_path):
+@pytest.mark.parametrize("name", sorted(METHODS | ABLATION))
+def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(training.methods.ablation, "FEATURES", 30)
     method, system = get_method(name), Oscillator()
     budget = Budget(
         "tiny", trajectories=10, duration=25.0, samples=20, seconds=math.inf, width=8, depth=1, dt=0.02, steps=2

@@ -138,7 +138,7 @@ def preset(system: System, method: Method, name: Preset) -> Config:
     if method == "spinn":
         paper = Config(
             method="spinn",
-            eigenvalues=tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist()),
+            eigenvalues=papers_spectrum(system),
             trajectories=500,
             samples=5001,
             width=512,
@@ -169,6 +169,11 @@ def preset(system: System, method: Method, name: Preset) -> Config:
     if name == "fast":
         return fast
     return replace(fast, width=512, depth=4, activation="silu", learning_rate=1e-3, inverse_steps=244_140)
+
+
+def papers_spectrum(system: System) -> tuple[float, ...]:
+    """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8)."""
+    return tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist())
 
 
 def spectrum(system: System) -> tuple[float, ...]:

@@ -37,6 +37,7 @@ SHARES = {
     "input-aware": {"inverse": 1.0},
     "closed-loop": {"inverse": 0.5, "closed-loop": 0.5},
     "spinn": {"forward": 0.75, "inverse": 0.25},
+    "solved": {"inverse": 0.75},  # solving takes about the rest
 }
 INVERTED = 200_000  # states on which a solved forward map is inverted
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
@@ -95,7 +96,7 @@ def train(
     ):
 
         def run(name: str, problem: Any, count: int) -> None:
-            shares = SHARES["closed-loop" if config.closed_loop else config.method]
+            shares = SHARES["closed-loop" if config.closed_loop else "solved" if config.features else config.method]
             cap = math.inf if config.cap is None else config.cap * shares[name]
             stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed, cap)
             losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)

@@ -17,7 +17,7 @@ from training.benchmark.jobs import Job, run_job
 from training.benchmark.protocol import Protocol, step_time
 from training.benchmark.tables import draw, write_table
 from training.files import write
-from training.methods import METHODS, Budget, get_method
+from training.methods import ABLATION, METHODS, Budget, get_method
 from training.parallel import run_all
 
 BUDGETS = {
@@ -156,7 +156,7 @@ def _collect(out: Path) -> None:
     errors, costs = [], []
     rules: dict[str, Any] = {}
 
-    systems, methods = list(SYSTEMS), list(METHODS)  # shipped ones in their order, then the user's
+    systems, methods = list(SYSTEMS), list(ABLATION | METHODS)  # shipped ones in their order, then the user's
 
     def position(folder: Path) -> tuple[int, str, int, str]:
         system, method = folder.parent.name, folder.name
@@ -198,7 +198,9 @@ def _report(out: Path, console: Console) -> None:
         if not (out / name).exists():
             raise ValueError(f"{out / name} does not exist; run the benchmark first")
     results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
-    systems, names = set(methods.system) | set(SYSTEMS), set(methods.method) | set(METHODS)
+    found = set(methods.method)
+    full = METHODS if found & (set(METHODS) - set(ABLATION)) else ABLATION
+    systems, names = set(methods.system) | set(SYSTEMS), found | set(full)
     whole = len(systems) * len(names)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
     if len(methods) < whole:

@@ -16,7 +16,7 @@ import kkl_gym
 from kkl_gym.systems import get_system
 from training.benchmark.protocol import Protocol, measure, validate
 from training.files import write
-from training.methods import METHODS, Budget, Configuration, Method, Task, get_method
+from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
 from training.optimise import seconds_spent
 from training.pipeline import describe
 
@@ -72,7 +72,7 @@ class Job:
             "version": kkl_gym.__version__,
         }
         del described["folder"], described["device"]
-        if type(method) not in METHODS.values():  # a user's, who may be at work on it
+        if type(method) not in (ABLATION | METHODS).values():  # a user's, who may be at work on it
             described["code"] = hashlib.sha256(inspect.getsource(type(method)).encode()).hexdigest()[:16]
         found: dict[str, Any] = json.loads(json.dumps(described))
         return found

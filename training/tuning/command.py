@@ -12,7 +12,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.config import spectrum
+from training.config import papers_spectrum, spectrum
 from training.files import write
 from training.tuning.probe import Choice, Probe, Spectrum
 
@@ -91,7 +91,7 @@ class Tune:
 def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choice]:
     """The package's default, the paper's, and Bessel filters."""
     frequency = probe.frequencies[len(probe.frequencies) // 2]
-    named = {"default": spectrum(system), "paper's": tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist())}
+    named = {"default": spectrum(system), "paper's": papers_spectrum(system)}
     found = [
         Choice(Spectrum(values), probe.error(Spectrum(values), noise), kind)
         for kind, values in named.items()

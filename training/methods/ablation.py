@@ -1,0 +1,113 @@
+"""What each idea earns: from the paper's pipeline to this package's, one change after the other, at equal cost."""
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar
+
+from kkl_gym.system import System
+from observers import Artifact
+from training.config import Method as Pipeline
+from training.config import papers_spectrum, preset
+from training.methods.base import Configuration, Task
+from training.methods.kkl import KKLMethod, within
+from training.pipeline import train
+from training.tuning import Probe, Spectrum
+
+FEATURES = 1500
+NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
+TUNED_FOR = 0.5
+
+
+class Ablation(KKLMethod):
+    """A pipeline of the package with some settings changed."""
+
+    pipeline: ClassVar[Pipeline] = "input-aware"
+
+    @abstractmethod
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """Settings that differ from the preset's."""
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        config = within(preset(task.system, self.pipeline, "fast"), task.budget, task.seed)
+        config = replace(config, **self.changes(task.system))
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class Solved(Ablation):
+    """SPINN, but the output layer of T found by least squares instead of descent."""
+
+    name: ClassVar[str] = "ablation-solved"
+    label: ClassVar[str] = "SPINN, T solved in X"
+    pipeline: ClassVar[Pipeline] = "spinn"
+    reach: ClassVar[float] = 1.0
+
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """Random features in place of a trained network; the paper's spectrum."""
+        return {
+            "forward_steps": 0,
+            "features": FEATURES,
+            "reach": self.reach,
+            "eigenvalues": papers_spectrum(system),
+        }
+
+
+class SolvedBeyond(Solved):
+    """The same with T, and the states on which it is inverted, along motions from 2X."""
+
+    name: ClassVar[str] = "ablation-solved-2x"
+    label: ClassVar[str] = "... in 2X"
+    reach: ClassVar[float] = 2.0
+
+
+class Transients(Ablation):
+    """The inverse fitted to what the filter shows along motions, from its start on, inputs included; no T."""
+
+    name: ClassVar[str] = "ablation-transients"
+    label: ClassVar[str] = "inverse on transients"
+
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """The paper's spectrum, no noise."""
+        return {"eigenvalues": papers_spectrum(system), "noise_max": NO_NOISE}
+
+
+class NoiseAware(Ablation):
+    """The same, also under noise of every level, which it is told."""
+
+    name: ClassVar[str] = "ablation-noise"
+    label: ClassVar[str] = "... and noise"
+
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """The paper's spectrum. (The next step, more modes over a wider range, is the package's default.)"""
+        return {"eigenvalues": papers_spectrum(system)}
+
+
+class Tuned(Ablation):
+    """Complex modes chosen for the system and a noise level of 0.5 in place of the default's real ones."""
+
+    name: ClassVar[str] = "ablation-tuned"
+    label: ClassVar[str] = "... tuned spectrum"
+
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """What ``kkl-gym tune`` writes."""
+        spectrum = tuned_spectrum(system)
+        return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
+
+
+class OneLevel(Tuned):
+    """The same for noise up to that level only."""
+
+    name: ClassVar[str] = "ablation-one-level"
+    label: ClassVar[str] = "... noise up to 0.5"
+
+    def changes(self, system: System) -> Mapping[str, Any]:
+        """As ``kkl-gym tune`` writes them."""
+        return {**super().changes(system), "noise_max": TUNED_FOR}
+
+
+@cache
+def tuned_spectrum(system: System) -> Spectrum:
+    """The one chosen for noise of 0.5."""
+    return Probe(system).choose(TUNED_FOR)[-1].spectrum
