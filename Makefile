@@ -44,7 +44,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-ABLATION := spinn ablation-solved ablation-solved-2x ablation-transients ablation-noise default ablation-tuned ablation-one-level
+ABLATION := ablation-spinn ablation-solved ablation-solved-2x ablation-transients ablation-noise default ablation-tuned ablation-one-level
 
 ablation: $(VENV)/ready  ## what each idea earns (docs/method.md), hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark --methods $(ABLATION) --out benchmark/ablation

@@ -1,16 +1,21 @@
 """Choosing a spectrum, against closed forms on a linear system."""
 
 import json
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
-from linear_system import Oscillator
+from linear_system import F, Oscillator
 from scipy.linalg import expm
 
 import training.tuning.probe
+from kkl_gym import get_system
+from kkl_gym.simulate import simulate
 from training.cli import main
 from training.config import read_changes
 from training.data import output, run_filter
+from training.derivatives import with_sensitivity
 from training.methods.kalman import ExtendedKalmanFilter
 from training.pipeline import make_filter
 from training.tuning import Probe, Spectrum
@@ -63,8 +68,9 @@ def test_the_least_error_is_that_of_a_kalman_filter(probe):
 def test_errors_fall_with_modes_and_those_of_the_library_are_those_of_the_spectrum(probe):
     found = probe.choose(0.3, 7)
     assert 3 <= found[-1].spectrum.modes <= 7
-    errors = [choice.error for choice in found]
-    assert (np.diff(errors) < 0).all()
+    alone = [probe.error(Spectrum((value,)), 0.3) for value in probe.library.eigenvalues]
+    alone += [probe.error(Spectrum((), (pair,)), 0.3) for pair in probe.library.pairs]
+    assert min(alone) >= found[1].error
     assert probe.error(found[-1].spectrum, 0.3) == pytest.approx(found[-1].error, rel=1e-5)
     assert probe.least(0.3) < found[-1].error < probe.error(Spectrum((-2.0, -0.7)), 0.3)
 
@@ -98,18 +104,100 @@ def test_a_system_whose_motions_leave_its_bounds():
         Probe(Escaping(), duration=5.0)
 
 
+@dataclass(frozen=True)
+class Decaying(Oscillator):
+    """Underflows to zero within a second or two; two outputs of different size, one of them at rest."""
+
+    name = "decaying"
+
+    def f(self, x):
+        return -400.0 * x[0] + x[1], -500.0 * x[1]
+
+    def h(self, x):
+        return x[0] + 1e3 * x[1], 0.0 * x[0]
+
+
+def test_motions_that_end_in_a_point():
+    probe = Probe(Decaying(), dt=0.004, duration=4.0, motions=2)
+    assert np.abs(probe.x[-1]).max() < 1e-300
+    (*_, last) = probe.choose(0.3, 5)
+    assert 0 < last.error < 200
+
+
+@dataclass(frozen=True)
+class Seen(Oscillator):
+    """Both states are outputs."""
+
+    name = "seen"
+
+    def h(self, x):
+        return x[0], x[1]
+
+
+def test_several_outputs_have_all_modes_each():
+    probe = Probe(Seen(), duration=6.0, motions=4)
+    found = probe.choose(0.3, 4)
+    assert probe.error(found[-1].spectrum, 0.3) == pytest.approx(found[-1].error, rel=1e-6)
+    one = Probe(Oscillator(), duration=6.0, motions=4)
+    assert found[-1].error < one.error(found[-1].spectrum, 0.3)
+
+
+@dataclass(frozen=True)
+class Still(Oscillator):
+    """An output that tells nothing."""
+
+    name = "still"
+
+    def h(self, x):
+        return (0.0 * x[0],)
+
+
+def test_an_output_that_does_not_move_leaves_the_start_unknown():
+    probe = Probe(Still(), duration=6.0, motions=4)
+    assert not len(probe.frequencies)
+    (only,) = probe.choose(0.3)
+    assert only.error == pytest.approx(
+        relative(
+            probe,
+            np.array([expm(age * 0.01 * F) @ np.diag(1 / probe.start) @ expm(age * 0.01 * F).T for age in probe.ages]),
+        ),
+        rel=1e-4,
+    )
+
+
+def test_chaotic_motions_are_followed_as_far_as_numbers_go():
+    """The recursion of Riccati, which forgets what is lost, against the sum over all samples."""
+    probe = Probe(get_system("lorenz"), dt=0.02, duration=20.0, motions=2)
+    assert 1e4 < np.abs(probe.Phi).max() < 1e5
+    assert len(probe.x) < 900
+    P, nx = np.broadcast_to(np.diag(1 / probe.start), (2, 3, 3)), 3
+    H, R, left = np.array([[0.0, 1.0, 0.0]]), 0.25, []
+    for k in range(len(probe.x)):
+        if k:
+            joint = np.hstack([probe.x[k - 1], np.tile(np.eye(nx).ravel(), (2, 1))])
+            step = simulate(with_sensitivity(probe.system, driven=False), joint, 1, 0.02)[1][:, nx:].reshape(2, nx, nx)
+            P = step @ P @ step.mT
+        K = P @ H.T / (H @ P @ H.T + R)
+        P = (np.eye(nx) - K @ H) @ P
+        left.append(P)
+    root = np.sqrt(np.trace(np.array(left)[probe.ages], axis1=-2, axis2=-1))
+    size = np.linalg.norm(probe.x[probe.ages], axis=-1)
+    expected = 100 * probe.share @ np.minimum(root / size, 2.0).mean(1)
+    assert probe.least(0.5) == pytest.approx(expected, rel=1e-3)
+
+
 def test_the_command_writes_what_training_takes(tmp_path, capsys):
-    chosen = {}
+    system, chosen = str(Path(__file__).with_name("linear_system.py")) + ":Oscillator", {}
     for noise in ("0", "0.5"):
         folder = tmp_path / noise
-        main(["tune", "lorenz", "--measurement-noise", noise, "--duration", "4", "--modes", "7", "--out", str(folder)])
+        main(["tune", system, "--measurement-noise", noise, "--duration", "4", "--modes", "3", "--out", str(folder)])
         chosen[noise] = read_changes(folder / "config.json")
         assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
-    assert chosen["0"]["pairs"] != chosen["0.5"]["pairs"]
+    assert chosen["0"]["eigenvalues"] != chosen["0.5"]["eigenvalues"]
     assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 0.5)
     small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]
     config = ["--config", str(tmp_path / "0.5" / "config.json"), "--no-monitor", "--out", str(tmp_path / "run")]
-    main(["train", "lorenz", *config, *small, "--batch", "64"])
+    main(["train", system, *config, *small, "--batch", "64"])
     described = json.loads((tmp_path / "run" / "config.json").read_text())
     assert described["pairs"] == [list(pair) for pair in chosen["0.5"]["pairs"]]
     assert described["width"] == 8
@@ -124,9 +212,29 @@ def test_bad_options(options, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "message"), [("{", "no JSON"), ("[1]", "object of settings"), ('{"modes": 3}', "modes")]
+    ("text", "message"),
+    [
+        ("{", "no JSON"),
+        ("[1]", "object of settings"),
+        ('{"modes": 3}', "modes"),
+        ('{"method": "spinn"}', "method"),
+        ('{"eigenvalues": -1}', "eigenvalues"),
+        ('{"eigenvalues": ["-1"]}', "eigenvalues"),
+        ('{"pairs": [[-1, 2, 3]]}', "pairs"),
+        ('{"samples": 20.5}', "samples"),
+        ('{"dt": true}', "dt"),
+        ('{"activation": "relu"}', "activation"),
+        ('{"cap": "a"}', "cap"),
+    ],
 )
 def test_files_that_hold_no_settings(text, message, tmp_path):
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_changes(tmp_path / "c.json")
+
+
+def test_a_file_of_settings(tmp_path):
+    (tmp_path / "c.json").write_text('{"eigenvalues": [-1, -2.5], "pairs": [[-1, 2]], "cap": null, "samples": 20}')
+    assert read_changes(tmp_path / "c.json") == {
+        "eigenvalues": (-1, -2.5), "pairs": ((-1, 2),), "cap": None, "samples": 20,
+    }  # fmt: skip

@@ -108,10 +108,11 @@ class Train:
         folder = self.out or Path("runs") / name
         names = {entry.name for entry in fields(Config)}
         changes = {key: value for key, value in vars(self).items() if key in names - {"method", "closed_loop"}}
-        if self.features and self.forward_steps is None:
-            changes["forward_steps"] = 0  # what is solved for is not trained
-        settings = preset(system, self.method, self.preset)
-        config = override(override(settings, read_changes(self.config) if self.config else {}), changes)
+        read = read_changes(self.config) if self.config else {}
+        changes = read | {key: value for key, value in changes.items() if value is not None}
+        if changes.get("features"):
+            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
+        config = override(preset(system, self.method, self.preset), changes)
         if self.closed_loop:
             config = replace(config, closed_loop=CLOSED_LOOP)
         device = None if self.device == "auto" else torch.device(self.device)

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
@@ -181,13 +181,19 @@ def spectrum(system: System) -> tuple[float, ...]:
     if system.name in SPECTRA:
         n, fastest, slowest = SPECTRA[system.name]
     else:
-        low, high = system.box()
-        points = np.random.default_rng(0).uniform(low, high, (1000, system.nx)).T
-        rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
-        if not 0 < rate < np.inf:
-            raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+        rate = typical_rate(system)
         n, fastest, slowest = 4 * system.nx + 3, -1.5 * rate, -rate / 15
     return tuple((-np.geomspace(-slowest, -fastest, n)).round(6).tolist())
+
+
+def typical_rate(system: System) -> float:
+    """Median over X of how fast f changes, in 1/s; raises ValueError if the system does not say."""
+    low, high = system.box()
+    points = np.random.default_rng(0).uniform(low, high, (1000, system.nx)).T
+    rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
+    if not 0 < rate < np.inf:
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+    return rate
 
 
 def read_changes(path: Path) -> dict[str, Any]:
@@ -199,14 +205,35 @@ def read_changes(path: Path) -> dict[str, Any]:
         found = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is no JSON: {error}") from None
-    names = {entry.name for entry in fields(Config)}
-    if not isinstance(found, dict) or not set(found) <= names:
-        unknown = sorted(set(found) - names) if isinstance(found, dict) else type(found).__name__
-        raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(names))}; it has {unknown}")
-    for name in ("eigenvalues", "pairs"):
-        if name in found:
-            found[name] = tuple(tuple(value) if isinstance(value, list) else value for value in found[name])
-    return found
+    kinds = {entry.name: entry.type for entry in fields(Config) if entry.name not in ("method", "closed_loop")}
+    if not isinstance(found, dict) or not set(found) <= set(kinds):
+        unknown = sorted(set(found) - set(kinds)) if isinstance(found, dict) else type(found).__name__
+        raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(kinds))}; it has {unknown}")
+    for name, value in found.items():
+        if not _fits(value, kinds[name]):
+            raise ValueError(f"{path}: {name} must be of type {kinds[name]}, got {value!r}")
+    return {name: _hashable(value) for name, value in found.items()}
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    """Whether a value from a JSON file is of a setting's type."""
+    options = get_args(kind)
+    if get_origin(kind) is tuple:
+        repeated = options[-1] is Ellipsis
+        return (
+            isinstance(value, list)
+            and (repeated or len(value) == len(options))
+            and all(_fits(one, options[0]) for one in value)
+        )
+    if get_origin(kind) is Literal:
+        return value in options
+    if options:  # a union
+        return any(_fits(value, option) for option in options)
+    return isinstance(value, (int, float) if kind is float else kind) and not isinstance(value, bool)
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:

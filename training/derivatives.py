@@ -1,6 +1,6 @@
 """Derivatives of a system from its own equations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,35 +14,40 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
     x = sympy.symbols(f"x:{nx}", real=True)
     rows = []
-    for value in equations(list(x)):
-        derivatives = {j: sympy.diff(sympy.sympify(value), x[j]) for j in range(nx)}
+    try:
+        values = [sympy.sympify(value) for value in equations(list(x))]
+    except TypeError as error:
+        raise ValueError(f"derivatives need equations that take symbols, from kkl_gym.elementary: {error}") from error
+    for value in values:
+        derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
         rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
     return rows
 
 
-def output_jacobian(system: System, x: np.ndarray) -> np.ndarray:
-    """dh/dx at states x, (..., nx), as (..., ny, nx)."""
-    H = np.zeros((*x.shape[:-1], system.ny, system.nx))
-    for i, row in enumerate(jacobian(system.h, system.nx)):
+def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
+    """What :func:`jacobian` returned, at states (..., nx), as (..., rows, nx)."""
+    out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
+    for i, row in enumerate(rows):
         for j, derivative in row.items():
-            H[..., i, j] = derivative(*np.moveaxis(x, -1, 0))
-    return H
+            out[..., i, j] = derivative(*np.moveaxis(x, -1, 0))
+    return out
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """df/dx, g and dh/dx at a state x: (nx, nx), (nx, nu) and (ny, nx)."""
-    A, C = np.zeros((system.nx, system.nx)), np.zeros((system.ny, system.nx))
-    for matrix, equations in ((A, system.f), (C, system.h)):
-        for i, row in enumerate(jacobian(equations, system.nx)):
-            for j, derivative in row.items():
-                matrix[i, j] = derivative(*x)
-    return A, np.array(system.g(x), dtype=float).reshape(system.nx, system.nu), C
+    g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
+    at = np.array(x, dtype=float)
+    return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
 
 
-def with_sensitivity(system: System) -> System:
-    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi."""
+def with_sensitivity(system: System, driven: bool = True) -> System:
+    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi.
+
+    Raises ValueError if it is ``driven`` through an input matrix that depends on the state.
+    """
     nx, rows = system.nx, jacobian(system.f, system.nx)
-    if type(system).g is not System.g:
+    nu = system.nu if driven else 0
+    if nu and type(system).g is not System.g:
         raise ValueError(
             f"{system.name} has an input matrix that depends on the state, which the variational equation would need"
         )
@@ -51,8 +56,8 @@ def with_sensitivity(system: System) -> System:
         name = f"{system.name}-sensitivity"
         X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
         bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
-        u_max: ClassVar[tuple[float, ...]] = system.u_max
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * system.nu,) * nx**2) if system.nu else ()
+        u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu else ()
 
         def f(self, x: Components) -> Components:
             state, Phi = x[:nx], x[nx:]

@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -148,6 +149,16 @@ def _progress(console: Console) -> Progress:
     return Progress(*columns, TimeRemainingColumn(), console=console)
 
 
+def _full_set(found: Iterable[str]) -> list[str]:
+    """The shipped methods, in order, of the comparison that some are of: the benchmark, the ablation, or both."""
+    names = set(found)
+    ablation = bool(names & (set(ABLATION) - set(METHODS)))
+    benchmark = bool(names & (set(METHODS) - set(ABLATION)))
+    if ablation:
+        return list(METHODS | ABLATION if benchmark else ABLATION)
+    return list(METHODS)
+
+
 def _collect(out: Path) -> None:
     """One CSV of all errors and one of all costs, from every job found in the folder.
 
@@ -156,7 +167,7 @@ def _collect(out: Path) -> None:
     errors, costs = [], []
     rules: dict[str, Any] = {}
 
-    systems, methods = list(SYSTEMS), list(ABLATION | METHODS)  # shipped ones in their order, then the user's
+    systems, methods = list(SYSTEMS), _full_set(path.name for path in (out / "jobs").glob("*/*"))  # then the user's
 
     def position(folder: Path) -> tuple[int, str, int, str]:
         system, method = folder.parent.name, folder.name
@@ -198,9 +209,7 @@ def _report(out: Path, console: Console) -> None:
         if not (out / name).exists():
             raise ValueError(f"{out / name} does not exist; run the benchmark first")
     results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
-    found = set(methods.method)
-    full = METHODS if found & (set(METHODS) - set(ABLATION)) else ABLATION
-    systems, names = set(methods.system) | set(SYSTEMS), found | set(full)
+    systems, names = set(methods.system) | set(SYSTEMS), set(methods.method) | set(_full_set(methods.method))
     whole = len(systems) * len(names)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
     if len(methods) < whole:

@@ -72,7 +72,7 @@ class Job:
             "version": kkl_gym.__version__,
         }
         del described["folder"], described["device"]
-        if type(method) not in (ABLATION | METHODS).values():  # a user's, who may be at work on it
+        if type(method) not in (METHODS | ABLATION).values():  # a user's, who may be at work on it
             described["code"] = hashlib.sha256(inspect.getsource(type(method)).encode()).hexdigest()[:16]
         found: dict[str, Any] = json.loads(json.dumps(described))
         return found

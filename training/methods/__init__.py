@@ -4,7 +4,7 @@ from inspect import isabstract
 from typing import Any
 
 from kkl_gym.loading import load_class
-from training.methods.ablation import NoiseAware, OneLevel, Solved, SolvedBeyond, Transients, Tuned
+from training.methods.ablation import NoiseAware, OneLevel, PapersSPINN, Solved, SolvedBeyond, Transients, Tuned
 from training.methods.autoencoder import AE
 from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task
 from training.methods.dmf import DMF, DMFNoise
@@ -18,7 +18,7 @@ METHODS: dict[str, type[Method[Any]]] = {
 }
 # Steps from the paper's pipeline to the package's and past it, which ``make ablation`` compares in this order.
 ABLATION: dict[str, type[Method[Any]]] = {
-    cls.name: cls for cls in (SPINN, Solved, SolvedBeyond, Transients, NoiseAware, Default, Tuned, OneLevel)
+    cls.name: cls for cls in (PapersSPINN, Solved, SolvedBeyond, Transients, NoiseAware, Default, Tuned, OneLevel)
 }
 
 
@@ -27,12 +27,12 @@ def get_method(name: str) -> Method[Any]:
 
     Raises ValueError if there is none.
     """
-    shipped = ABLATION | METHODS
+    shipped = METHODS | ABLATION
     if name in shipped:
         return shipped[name]()
     if ":" not in name:
         raise ValueError(
-            f"unknown method {name!r}; there are {', '.join(METHODS)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown method {name!r}; there are {', '.join(shipped)}; your own: 'module:Class' or 'script.py:Class'"
         )
     found = load_class(name, Method)  # type: ignore[type-abstract]
     if isabstract(found):

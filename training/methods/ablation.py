@@ -1,4 +1,4 @@
-"""What each idea earns: from the paper's pipeline to this package's, one change after the other, at equal cost."""
+"""What each idea earns: from the paper's pipeline to this package's, step by step, networks trained for equal times."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -26,31 +26,43 @@ class Ablation(KKLMethod):
     pipeline: ClassVar[Pipeline] = "input-aware"
 
     @abstractmethod
-    def changes(self, system: System) -> Mapping[str, Any]:
+    def changes(self, task: Task) -> Mapping[str, Any]:
         """Settings that differ from the preset's."""
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
         config = within(preset(task.system, self.pipeline, "fast"), task.budget, task.seed)
-        config = replace(config, **self.changes(task.system))
+        config = replace(config, **self.changes(task))
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 
+class PapersSPINN(Ablation):
+    """SPINN with the spectrum of the paper (the benchmark's chooses among three)."""
+
+    name: ClassVar[str] = "ablation-spinn"
+    label: ClassVar[str] = "SPINN"
+    pipeline: ClassVar[Pipeline] = "spinn"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """The spectrum."""
+        return {"eigenvalues": papers_spectrum(task.system)}
+
+
 class Solved(Ablation):
-    """SPINN, but the output layer of T found by least squares instead of descent."""
+    """The same, but the output layer of T found by least squares instead of descent."""
 
     name: ClassVar[str] = "ablation-solved"
     label: ClassVar[str] = "SPINN, T solved in X"
     pipeline: ClassVar[Pipeline] = "spinn"
     reach: ClassVar[float] = 1.0
 
-    def changes(self, system: System) -> Mapping[str, Any]:
+    def changes(self, task: Task) -> Mapping[str, Any]:
         """Random features in place of a trained network; the paper's spectrum."""
         return {
             "forward_steps": 0,
             "features": FEATURES,
             "reach": self.reach,
-            "eigenvalues": papers_spectrum(system),
+            "eigenvalues": papers_spectrum(task.system),
         }
 
 
@@ -63,14 +75,14 @@ class SolvedBeyond(Solved):
 
 
 class Transients(Ablation):
-    """The inverse fitted to what the filter shows along motions, from its start on, inputs included; no T."""
+    """No T: the inverse fitted to what the filter shows along motions from X, half of them driven."""
 
     name: ClassVar[str] = "ablation-transients"
     label: ClassVar[str] = "inverse on transients"
 
-    def changes(self, system: System) -> Mapping[str, Any]:
+    def changes(self, task: Task) -> Mapping[str, Any]:
         """The paper's spectrum, no noise."""
-        return {"eigenvalues": papers_spectrum(system), "noise_max": NO_NOISE}
+        return {"eigenvalues": papers_spectrum(task.system), "noise_max": NO_NOISE}
 
 
 class NoiseAware(Ablation):
@@ -79,9 +91,9 @@ class NoiseAware(Ablation):
     name: ClassVar[str] = "ablation-noise"
     label: ClassVar[str] = "... and noise"
 
-    def changes(self, system: System) -> Mapping[str, Any]:
+    def changes(self, task: Task) -> Mapping[str, Any]:
         """The paper's spectrum. (The next step, more modes over a wider range, is the package's default.)"""
-        return {"eigenvalues": papers_spectrum(system)}
+        return {"eigenvalues": papers_spectrum(task.system)}
 
 
 class Tuned(Ablation):
@@ -90,9 +102,9 @@ class Tuned(Ablation):
     name: ClassVar[str] = "ablation-tuned"
     label: ClassVar[str] = "... tuned spectrum"
 
-    def changes(self, system: System) -> Mapping[str, Any]:
-        """What ``kkl-gym tune`` writes."""
-        spectrum = tuned_spectrum(system)
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """The modes that ``kkl-gym tune`` chooses."""
+        spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
         return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
 
 
@@ -102,12 +114,12 @@ class OneLevel(Tuned):
     name: ClassVar[str] = "ablation-one-level"
     label: ClassVar[str] = "... noise up to 0.5"
 
-    def changes(self, system: System) -> Mapping[str, Any]:
-        """As ``kkl-gym tune`` writes them."""
-        return {**super().changes(system), "noise_max": TUNED_FOR}
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """The same, and the largest noise."""
+        return {**super().changes(task), "noise_max": TUNED_FOR}
 
 
 @cache
-def tuned_spectrum(system: System) -> Spectrum:
+def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
     """The one chosen for noise of 0.5."""
-    return Probe(system).choose(TUNED_FOR)[-1].spectrum
+    return Probe(system, dt, duration).choose(TUNED_FOR)[-1].spectrum

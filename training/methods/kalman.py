@@ -7,7 +7,7 @@ import numpy as np
 from kkl_gym.simulate import advance, advance_batch
 from kkl_gym.system import Components, System
 from training.data import output
-from training.derivatives import jacobian, with_sensitivity
+from training.derivatives import evaluate, jacobian, with_sensitivity
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
 # Process noise, in multiples of each state's scale per square root of a second: what stands for the filters'
@@ -175,15 +175,11 @@ class ExtendedKalmanFilter:
         if not inside.all():
             x, P = x.copy(), P.copy()
             x[~inside], P[~inside] = self._start
-        n, nx = x.shape
-        H = np.zeros((n, self._system.ny, nx))
-        for i, row in enumerate(self._outputs):
-            for j, derivative in row.items():
-                H[:, i, j] = derivative(*x.T)
+        H = evaluate(self._outputs, x)
         S = H @ P @ H.mT + self._R
         K = np.linalg.solve(S, H @ P).mT
         x = x + (K @ (y - output(self._system, x))[..., None])[..., 0]
-        I_KH = np.eye(nx) - K @ H
+        I_KH = np.eye(x.shape[1]) - K @ H
         return x, I_KH @ P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
 
 

@@ -52,7 +52,8 @@ class Tune:
                 f"measurement_noise = {self.measurement_noise} must not be negative, modes = {self.modes} be positive"
             )
         system = get_system(self.system, self.parameters)
-        folder = self.out or Path("tuning") / f"{system.name}-{self.measurement_noise:g}"
+        given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
+        folder = self.out or Path("tuning") / f"{system.name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
         with console.status(f"following motions of {system.name}"):
             probe = Probe(system, self.dt, self.duration, seed=self.seed)
         noise = self.measurement_noise
@@ -81,16 +82,14 @@ class Tune:
         ]
         write(folder / "front.csv", "\n".join(["noise,kind,modes,error", *lines]) + "\n")
         _draw(folder / "front.png", system, noise, fronts, others, best)
-        console.print(
-            f"wrote config.json, front.csv and front.png in {folder}; kkl-gym train {self.system} --config "
-            f"{folder / 'config.json'} trains an observer with it"
-        )
+        again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
+        again += f" --parameters{given}" if given else ""
+        console.print(f"wrote config.json, front.csv and front.png in {folder}; to train an observer with it:\n{again}")
         return best
 
 
 def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choice]:
     """The package's default, the paper's, and Bessel filters."""
-    frequency = probe.frequencies[len(probe.frequencies) // 2]
     named = {"default": spectrum(system), "paper's": papers_spectrum(system)}
     found = [
         Choice(Spectrum(values), probe.error(Spectrum(values), noise), kind)
@@ -98,7 +97,9 @@ def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choic
         if len(values) <= most
     ]
     orders = [order for order in (system.nx + 1, 2 * system.nx + 1, 4 * system.nx + 1) if order <= most]
-    return found + probe.bessel(noise, orders, CUTOFFS * frequency)
+    if not len(probe.frequencies):  # y does not move
+        return found
+    return found + probe.bessel(noise, orders, CUTOFFS * np.median(probe.frequencies))
 
 
 def _draw(

@@ -9,8 +9,9 @@ from scipy.signal import besselap, periodogram
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.config import typical_rate
 from training.data import output, run_filter
-from training.derivatives import output_jacobian, with_sensitivity
+from training.derivatives import evaluate, jacobian, with_sensitivity
 from training.noise import noise_covariance
 from training.pipeline import make_filter
 
@@ -20,6 +21,9 @@ FREQUENCIES = np.array([0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98,
 DECAYS = 5  # of pairs at each frequency
 LEAST_GAIN = 0.01  # by which one more mode must lower the error
 SIGNIFICANT = 1e-13  # what rounding leaves of a matrix of unit diagonal
+FARTHEST = 1e5  # that an error in the start may grow; what is known of it is a matrix of squares
+SHORTEST = 10  # samples that must be followed
+SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no longer taken relative to it
 
 
 @dataclass(frozen=True)
@@ -61,13 +65,13 @@ class Probe:
 
     Parameters
     ----------
-    system : any system whose input matrix does not depend on the state; its input is zero here.
+    system : any system; its input is zero here.
     dt, duration : in seconds; duration is that of the runs over which the error is averaged.
     motions, seed : number and seed of their starts.
 
     Raises
     ------
-    ValueError : if hardly any motion stays within the system's bounds.
+    ValueError : if hardly any motion stays within the system's bounds, or none can be followed for long.
     """
 
     system: System
@@ -86,46 +90,51 @@ class Probe:
         system, nx = self.system, self.system.nx
         low, high = system.box()
         x0 = np.random.default_rng([self.seed, 7]).uniform(low, high, (2 * self.motions, nx))
-        identity = np.tile(np.eye(nx).ravel(), (len(x0), 1))
-        joint = simulate(with_sensitivity(system), np.hstack([x0, identity]), round(self.duration / self.dt), self.dt)
-        with np.errstate(invalid="ignore"):
-            inside = np.isfinite(simulate(system, x0, len(joint) - 1, self.dt)[-1]).all(-1)
+        steps = round(self.duration / self.dt)
+        inside = np.isfinite(simulate(system, x0, steps, self.dt)[-1]).all(-1)
         if 2 * inside.sum() < self.motions:
             raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
-        joint = joint[:, inside][:, : self.motions]
-        # Where the flow contracts by more than double precision can hold, later times tell nothing new.
-        useful = np.isfinite(joint).all((1, 2)) & (np.abs(joint).max((1, 2)) < 1e30)
+        x0 = x0[inside][: self.motions]
+        identity = np.tile(np.eye(nx).ravel(), (len(x0), 1))
+        joint = simulate(with_sensitivity(system, driven=False), np.hstack([x0, identity]), steps, self.dt)
+        # Where motions part, later times depend on the start beyond what double precision can tell.
+        useful = np.isfinite(joint).all((1, 2)) & (np.abs(joint[..., nx:]).max((1, 2)) < FARTHEST)
         end = len(joint) if useful.all() else int(useful.argmin())
+        if end < SHORTEST:
+            raise ValueError(
+                f"only {end - 1} samples of {self.dt:g} s can be followed, of a duration of {self.duration:g} s: take "
+                "a longer one, or a smaller dt"
+            )
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
         self.y = output(system, self.x)
-        self.signal = output_jacobian(system, self.x) @ self.Phi
+        self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
         self.start = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
         self.ages = np.unique(np.concatenate([early, late])).astype(int)
         self.share = np.gradient(self.ages.astype(float))
-        self.share[-1] += round(self.duration / self.dt) - (end - 1)  # what comes later is like the last
+        second_half = np.where(self.ages > end / 2, self.share, 0.0)  # what comes later is like it
+        self.share += second_half / second_half.sum() * max(0, steps - (end - 1))
         self.share /= self.share.sum()
         self._of_library = self.response(self.library)
 
     @cached_property
     def library(self) -> Spectrum:
-        """The modes to choose from: real ones up to twice the system's rate, and pairs where y has its power."""
-        low, high = self.system.box()
-        points = np.random.default_rng(0).uniform(low, high, (1000, self.system.nx)).T
-        rate = float(np.median(np.broadcast_to(self.system.rate(points), 1000)))
-        slowest, fastest = 5.0 / self.duration, min(3.0 * rate, 0.5 / self.dt)
-        real = -np.geomspace(slowest, fastest, REAL_MODES)
-        pairs = np.array([(-a, w) for w in self.frequencies for a in np.geomspace(slowest, 2 * w, DECAYS)])
-        pairs = pairs.reshape(-1, 2)  # also where y does not oscillate at all
-        return Spectrum(tuple(real.round(4).tolist()), tuple((a, w) for a, w in pairs.round(4).tolist()))
+        """The modes to choose from: real ones up to three times the system's rate, and pairs where y has its power."""
+        slowest, fastest = 5.0 / self.duration, min(3.0 * typical_rate(self.system), 0.5 / self.dt)
+        real = -np.geomspace(slowest, max(fastest, 2.0 * slowest), REAL_MODES)
+        pairs = [(-a, w) for w in self.frequencies for a in np.geomspace(slowest, max(2 * w, 2 * slowest), DECAYS)]
+        return Spectrum(tuple(map(_rounded, real)), tuple((_rounded(a), _rounded(w)) for a, w in pairs))
 
     @cached_property
     def frequencies(self) -> np.ndarray:
-        """Where y has its power, in rad/s: quantiles of it, rising."""
-        frequency, power = periodogram(self.y - self.y.mean(0), 1.0 / self.dt, "hann", axis=0)
-        share = np.cumsum(power.mean((1, 2)))
-        at = np.unique((2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)).round(3))
-        return np.asarray(at[at > 0])
+        """Where the outputs have their power, in rad/s: quantiles of it, rising; none where they do not move."""
+        moving = self.y[..., self.y.std((0, 1)) > 0]
+        if not moving.size:
+            return np.empty(0)
+        frequency, power = periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
+        share = np.cumsum((power.mean(1) / power.sum(0).mean(0)).mean(-1))
+        at = 2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)
+        return np.unique([_rounded(w) for w in at if w > 0])
 
     def response(self, spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the filter with this spectrum makes of motions, of errors in their starts, and of noise, at all ages.
@@ -157,17 +166,22 @@ class Probe:
         return self._relative(seen @ seen.mT)
 
     def _relative(self, information: np.ndarray) -> float:
-        left = _inverse_root(information + np.diag(self.start))
-        error = np.linalg.norm(self.Phi[self.ages] @ left, axis=(-2, -1))
-        relative = np.minimum(error / np.linalg.norm(self.x[self.ages], axis=-1), 2.0)
-        return float(100.0 * self.share @ relative.mean(1))
+        """The mean error in percent, from what is known of the start beside X: (ages, motions, nx, nx)."""
+        left = self.Phi[self.ages] @ _inverse_root(information + np.diag(self.start))
+        size = np.linalg.norm(self.x[self.ages], axis=-1)
+        relative = np.linalg.norm(left, axis=(-2, -1)) / np.maximum(size, SMALLEST * size.max())
+        found = float(100.0 * self.share @ np.minimum(relative, 2.0).mean(1))
+        if not np.isfinite(found):
+            raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
+        return found
 
     def choose(
         self, measurement_noise: float, most: int = 21, report: Callable[[Choice], None] = lambda choice: None
     ) -> list[Choice]:
         """Spectra of more and more modes, each the one before and the mode, or pair, of the library that helps most.
 
-        It ends at ``most`` modes, or where none lowers the error by LEAST_GAIN. With several outputs, each has all.
+        It ends at ``most`` modes, or where none lowers the error by LEAST_GAIN; there is at least one. With several
+        outputs, each has all.
         """
         z, Z, P = self._of_library
         real, pairs, ny = self.library.eigenvalues, self.library.pairs, self.system.ny
@@ -175,6 +189,7 @@ class Probe:
         parts = [(Spectrum((value,)), [i]) for i, value in enumerate(real)]
         parts += [(Spectrum((), (pair,)), [len(real) + 2 * i, len(real) + 2 * i + 1]) for i, pair in enumerate(pairs)]
         chosen, columns, found = Spectrum(), list[int](), list[Choice]()
+        before = self._relative(np.zeros(self.Phi[self.ages].shape))
         while True:
             tried = []
             for spectrum, own in parts:
@@ -182,14 +197,13 @@ class Probe:
                     continue
                 taken = np.add.outer(size * np.arange(ny), [*columns, *own]).ravel()
                 error = self._error(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
-                before = found[-1].error if found else 200.0
                 tried.append((np.log(before / error) / spectrum.modes, error, spectrum, own))
             if not tried:
                 return found
             gain, error, spectrum, own = max(tried, key=lambda one: one[0])
-            if gain < LEAST_GAIN:
+            if found and gain < LEAST_GAIN:
                 return found
-            chosen, columns = chosen + spectrum, columns + own
+            chosen, columns, before = chosen + spectrum, columns + own, error
             found.append(Choice(chosen, error))
             report(found[-1])
 
@@ -213,3 +227,8 @@ def _inverse_root(matrix: np.ndarray) -> np.ndarray:
     scale = np.sqrt(np.maximum(np.diagonal(matrix, axis1=-2, axis2=-1), np.finfo(float).tiny))
     values, vectors = np.linalg.eigh(matrix / scale[..., None, :] / scale[..., :, None])
     return np.asarray(vectors / np.sqrt(np.maximum(values, SIGNIFICANT))[..., None, :] / scale[..., :, None])
+
+
+def _rounded(value: float) -> float:
+    """To four digits, for people."""
+    return float(f"{value:.4g}")
