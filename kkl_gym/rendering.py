@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.system import System
+from kkl_gym.system import Box, System
 
 STATE, ESTIMATE, TARGET = "0.2", "C3", "C2"
 
@@ -14,10 +14,16 @@ class Canvas:
     """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar.
 
     What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
+    Parameters
+    ----------
+    system : whose states.
+    estimates : whether there are any.
+    box : of the states to show, with a margin; None is the training box.
+
     Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not installed.
     """
 
-    def __init__(self, system: System, estimates: bool = False) -> None:
+    def __init__(self, system: System, estimates: bool = False, box: Box | None = None) -> None:
         try:
             from matplotlib.backends.backend_agg import FigureCanvasAgg
             from matplotlib.figure import Figure
@@ -31,7 +37,7 @@ class Canvas:
         heights = [24, system.nu] if system.nu else [1]
         ax, *below = figure.subplots(len(heights), height_ratios=heights, squeeze=False)[:, 0]
         names = [system.state_names[i] for i in self._states]
-        (left, right), (bottom, top) = (system.X[i] for i in self._states)
+        (left, right), (bottom, top) = ((box or system.X)[i] for i in self._states)
         wide, tall = 0.3 * (right - left), 0.3 * (top - bottom)  # driven or not, motions leave the training box
         ax.set(xlim=(left - wide, right + wide), ylim=(bottom - tall, top + tall), xlabel=names[0], ylabel=names[1])
         ax.set_title(system.name.replace("_", " "))

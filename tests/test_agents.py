@@ -14,9 +14,10 @@ from kkl_gym import get_system
 from training.agents import SB3VecEnv
 from training.agents.command import find
 from training.agents.compare import EVALUATION_SEED
+from training.agents.information import observer_of
 from training.agents.learn import WORST, Cost, hyperparameters, learn, learn_recurrent
 from training.agents.play import play
-from training.agents.policy import Agent, AgentError, fingerprint, rules
+from training.agents.policy import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.tasks import TASKS, ControlTask, scores
 from training.cli import main
 
@@ -235,3 +236,15 @@ def test_metadata_is_json(learned):
     with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
         described = json.loads(opened.metadata()["kkl-gym-agent"])
     assert described["task"]["system"] == "van_der_pol"
+
+
+@pytest.mark.parametrize(
+    ("name", "least"), [("reverse_duffing", -0.25), ("van_der_pol", -0.2), ("rossler", -0.12), ("lorenz", -0.25)]
+)
+def test_shipped_agents_act_on_estimates(name, least):
+    agent = Agent.read(find(name))
+    assert (agent.information, agent.observer) == ("x_hat", versioned(observer_of(get_system(name))))
+    assert agent.task == TASKS[name]
+    system, episodes = get_system(name), play(agent.make(20), agent, agent.task.steps, 0)
+    assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
+    assert not episodes.escaped.any()

@@ -48,7 +48,8 @@ def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
     system = get_system(task.system)
     x = episodes.x[:, 0]
     x_hat = None if episodes.x_hat is None else episodes.x_hat[:, 0]
-    canvas = Canvas(system, x_hat is not None)
+    shown = np.concatenate([x, [system.target], *([] if x_hat is None else [x_hat])])
+    canvas = Canvas(system, x_hat is not None, tuple(zip(shown.min(0).tolist(), shown.max(0).tolist(), strict=True)))
     every = max(1, round(len(x) / FRAMES))
     frames = [
         Image.fromarray(canvas.draw(x[:k], () if x_hat is None else x_hat[:k], episodes.u[k - 1, 0])).quantize(32)
