@@ -46,7 +46,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 
 ABLATION := ablation-spinn ablation-solved ablation-solved-2x ablation-transients ablation-noise default ablation-tuned ablation-one-level
 
-ablation: $(VENV)/ready  ## what each idea earns (docs/method.md), hours on two cores; resumable
+ablation: $(VENV)/ready  ## what each idea earns, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark --methods $(ABLATION) --out benchmark/ablation
 	mkdir -p docs/results/ablation
 	cp $(addprefix benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation

@@ -1,6 +1,5 @@
 """What each idea earns: from the paper's pipeline to this package's, step by step, networks trained for equal times."""
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -25,9 +24,9 @@ class Ablation(KKLMethod):
 
     pipeline: ClassVar[Pipeline] = "input-aware"
 
-    @abstractmethod
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """Settings that differ from the preset's."""
+        """Settings that differ from the preset's; the paper's spectrum, unless another is the point."""
+        return {"eigenvalues": papers_spectrum(task.system)}
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
@@ -43,10 +42,6 @@ class PapersSPINN(Ablation):
     label: ClassVar[str] = "SPINN"
     pipeline: ClassVar[Pipeline] = "spinn"
 
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """The spectrum."""
-        return {"eigenvalues": papers_spectrum(task.system)}
-
 
 class Solved(Ablation):
     """The same, but the output layer of T found by least squares instead of descent."""
@@ -57,12 +52,12 @@ class Solved(Ablation):
     reach: ClassVar[float] = 1.0
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """Random features in place of a trained network; the paper's spectrum."""
+        """Random features in place of a trained network."""
         return {
             "forward_steps": 0,
             "features": FEATURES,
             "reach": self.reach,
-            "eigenvalues": papers_spectrum(task.system),
+            **super().changes(task),
         }
 
 
@@ -81,19 +76,15 @@ class Transients(Ablation):
     label: ClassVar[str] = "inverse on transients"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """The paper's spectrum, no noise."""
-        return {"eigenvalues": papers_spectrum(task.system), "noise_max": NO_NOISE}
+        """No noise."""
+        return {**super().changes(task), "noise_max": NO_NOISE}
 
 
 class NoiseAware(Ablation):
-    """The same, also under noise of every level, which it is told."""
+    """The same, also under noise of every level, which it is told; the package's default has more modes beside."""
 
     name: ClassVar[str] = "ablation-noise"
     label: ClassVar[str] = "... and noise"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """The paper's spectrum. (The next step, more modes over a wider range, is the package's default.)"""
-        return {"eigenvalues": papers_spectrum(task.system)}
 
 
 class Tuned(Ablation):

@@ -1,6 +1,6 @@
 """Choosing the spectrum of A by the error that the best decoder would leave, without training any."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -175,9 +175,7 @@ class Probe:
             raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
         return found
 
-    def choose(
-        self, measurement_noise: float, most: int = 21, report: Callable[[Choice], None] = lambda choice: None
-    ) -> list[Choice]:
+    def choose(self, measurement_noise: float, most: int = 21) -> list[Choice]:
         """Spectra of more and more modes, each the one before and the mode, or pair, of the library that helps most.
 
         It ends at ``most`` modes, or where none lowers the error by LEAST_GAIN; there is at least one. With several
@@ -205,7 +203,6 @@ class Probe:
                 return found
             chosen, columns, before = chosen + spectrum, columns + own, error
             found.append(Choice(chosen, error))
-            report(found[-1])
 
     def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
         """For each order, the poles of a Bessel filter at the best of some cutoffs in rad/s."""
