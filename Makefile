@@ -44,10 +44,10 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-ABLATION := ablation-spinn ablation-solved ablation-solved-2x ablation-transients ablation-noise default ablation-tuned ablation-one-level
+ABLATION := ablation-spinn ablation-solved ablation-transients ablation-noise ablation-modes ablation-soap default ablation-tuned
 
-ablation: $(VENV)/ready  ## what each idea earns, hours on two cores; resumable
-	$(BIN)/kkl-gym benchmark --methods $(ABLATION) --out benchmark/ablation
+ablation: $(VENV)/ready  ## what each idea earns, half an hour on two cores; resumable
+	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out benchmark/ablation
 	mkdir -p docs/results/ablation
 	cp $(addprefix benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
 

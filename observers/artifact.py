@@ -23,6 +23,7 @@ FORMAT = 1
 FEATURES = ("z_y", "z_u", "measurement_noise", "age")
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
+_INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
 
@@ -120,6 +121,8 @@ class Artifact:
     forward : T, where one was learned.
     C : (ny, nx) where the output is linear, h(x) = C x: what coasting and monitoring need.
     limits : of the residual y - C x_hat in sound operation, where they were found.
+    free : T_inv of z_y alone, in use as long as no input has acted since reset: motions without input keep to far fewer
+        states than driven ones, which a map that knows of no input can rely on.
     training : how it was made: method, preset, configuration, seed, measures.
     versions : of the libraries that made it.
     """
@@ -131,6 +134,7 @@ class Artifact:
     forward: ForwardMap | None = None
     C: np.ndarray | None = None
     limits: Limits | None = None
+    free: InverseMap | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -140,6 +144,11 @@ class Artifact:
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
                 f"a filter of {self.filter.size} values and {self.filter.nu} inputs"
             )
+        free, nz = self.free, len(self.filter.A)
+        if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
+            raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
+        if free is not None and (len(free.x_offset) != self.nx or free.noise_max != self.inverse.noise_max):
+            raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
         if self.limits is not None and (self.C is None or self.limits.mean.shape[1] != self.ny):
@@ -187,24 +196,16 @@ class Artifact:
         tensors: dict[str, np.ndarray] = {"A": self.filter.A, "B": self.filter.B}
         if self.C is not None:
             tensors["C"] = np.ascontiguousarray(self.C, dtype=float)
-        _put_mlp(tensors, "inverse", self.inverse.mlp)
-        for name in ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale"):
-            tensors[f"inverse.{name}"] = np.ascontiguousarray(getattr(self.inverse, name), dtype=float)
+        described = {"inverse": _put_inverse(tensors, "inverse", self.inverse)}
+        if self.free is not None:
+            described["free"] = _put_inverse(tensors, "free", self.free)
         meta: dict[str, Any] = {
             "format": FORMAT,
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
             "holds": {"y": "first-order", "u": "zero-order"},
-            "inverse": {
-                "features": list(self.inverse.features),
-                "activation": self.inverse.mlp.activation,
-                **{
-                    name: getattr(self.inverse, name)
-                    for name in ("noise_unit", "noise_max", "age_unit", "age_max")
-                    if math.isfinite(getattr(self.inverse, name))
-                },
-            },
+            **described,
             "training": dict(self.training),
             "versions": dict(self.versions),
         }
@@ -255,13 +256,6 @@ class Artifact:
         for name, tensor in tensors.items():
             if not np.isfinite(tensor).all():
                 raise ArtifactError(f"its tensor {name} is not finite")
-        described: dict[str, Any] = dict(meta["inverse"])
-        arrays = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
-        inverse = InverseMap(
-            mlp=_get_mlp(tensors, "inverse", described.pop("activation")),
-            features=tuple(described.pop("features")),
-            **{**described, **{name: tensors[f"inverse.{name}"] for name in arrays}},
-        )
         forward = None
         if "forward" in meta:
             forward = ForwardMap(
@@ -270,15 +264,37 @@ class Artifact:
             )
         return cls(
             filter=LinearFilter(tensors["A"], tensors["B"], meta["dt"], meta["inputs"]),
-            inverse=inverse,
+            inverse=_get_inverse(tensors, "inverse", meta["inverse"]),
             system=meta["system"]["name"],
             parameters=meta["system"]["parameters"],
             forward=forward,
             C=tensors.get("C"),
             limits=_get_limits(tensors, meta["limits"]) if "limits" in meta else None,
+            free=_get_inverse(tensors, "free", meta["free"]) if "free" in meta else None,
             training=meta["training"],
             versions=meta["versions"],
         )
+
+
+def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
+    _put_mlp(tensors, prefix, inverse.mlp)
+    for name in _INVERSE_ARRAYS:
+        tensors[f"{prefix}.{name}"] = np.ascontiguousarray(getattr(inverse, name), dtype=float)
+    scalars = {name: getattr(inverse, name) for name in ("noise_unit", "noise_max", "age_unit", "age_max")}
+    return {
+        "features": list(inverse.features),
+        "activation": inverse.mlp.activation,
+        **{name: value for name, value in scalars.items() if math.isfinite(value)},
+    }
+
+
+def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:
+    scalars = dict(described)
+    return InverseMap(
+        mlp=_get_mlp(tensors, prefix, scalars.pop("activation")),
+        features=tuple(scalars.pop("features")),
+        **{**scalars, **{name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}},
+    )
 
 
 def _put_mlp(tensors: dict[str, np.ndarray], prefix: str, mlp: MLP) -> None:

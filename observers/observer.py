@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact, ArtifactError, resolve
+from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
 from observers.monitor import Monitor
 
 _LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
@@ -62,12 +62,8 @@ class KKLObserver:
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
         self._measurement_noise, self._monitor, self._x_hat = float(level), monitor, None
-        gain = inverse.gain(level)[:, None] * inverse.whiten
-        self._whiten = np.ascontiguousarray(gain.T)
-        self._offset = -inverse.z_offset @ self._whiten
-        self._conditions: list[Any] = []
-        if "measurement_noise" in inverse.features:
-            self._conditions.append(float(inverse.noise_feature(level)))
+        self._driven = _Decoder(inverse, level)
+        self._free = None if self.artifact.free is None else _Decoder(self.artifact.free, level)
 
     @property
     def z(self) -> np.ndarray:
@@ -223,21 +219,21 @@ class KKLObserver:
         return out
 
     def _invert(self, z: np.ndarray, age: Any) -> np.ndarray:
-        inverse = self.artifact.inverse
-        modes = z @ self._whiten
-        modes += self._offset
-        conditions = self._conditions
-        if inverse.features[-1] == "age":
-            conditions = [*conditions, inverse.age_feature(age)]
-        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
-            inputs = np.array([*modes.tolist(), *conditions], dtype=np.float32)
-        else:
-            width = modes.shape[-1]
-            inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
-            inputs[..., :width] = modes
-            for i, condition in enumerate(conditions):
-                inputs[..., width + i] = condition
-        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
+        if self._free is None:
+            return self._driven(z, age)
+        nz = len(self.artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
+        if z.ndim == 1:  # a single sample: every call of numpy would be felt
+            return self._driven(z, age) if any(z[nz:].tolist()) else self._free(z[:nz], age)
+        driven = z[..., nz:].any(-1)
+        if driven.all():
+            return self._driven(z, age)
+        if not driven.any():
+            return self._free(z[..., :nz], age)
+        age = np.broadcast_to(age, driven.shape)
+        x_hat = np.empty((*driven.shape, self.artifact.nx))
+        x_hat[driven] = self._driven(z[driven], age[driven])
+        x_hat[~driven] = self._free(z[~driven][:, :nz], age[~driven])
+        return x_hat
 
     def _check_output(self, y: np.ndarray, batch: tuple[int, ...]) -> None:
         if y.shape != (*batch, self.artifact.ny):
@@ -262,6 +258,33 @@ class KKLObserver:
         if not _finite(u):
             raise ValueError("u holds NaN or infinity")
         return u
+
+
+class _Decoder:
+    """An inverse map at one noise level: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+
+    def __init__(self, inverse: InverseMap, level: float) -> None:
+        self._inverse = inverse
+        self._whiten = np.ascontiguousarray((inverse.gain(level)[:, None] * inverse.whiten).T)
+        self._offset = -inverse.z_offset @ self._whiten
+        told = "measurement_noise" in inverse.features
+        self._conditions: list[Any] = [float(inverse.noise_feature(level))] if told else []
+
+    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
+        inverse, conditions = self._inverse, self._conditions
+        modes = z @ self._whiten
+        modes += self._offset
+        if inverse.features[-1] == "age":
+            conditions = [*conditions, inverse.age_feature(age)]
+        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
+            inputs = np.array([*modes.tolist(), *conditions], dtype=np.float32)
+        else:
+            width = modes.shape[-1]
+            inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
+            inputs[..., :width] = modes
+            for i, condition in enumerate(conditions):
+                inputs[..., width + i] = condition
+        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
 
 
 def _finite(values: np.ndarray) -> bool:

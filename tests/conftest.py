@@ -14,7 +14,9 @@ def random_mlp(rng, inputs, outputs, activation="silu", width=8):
     return MLP(weights, biases, activation)
 
 
-def random_artifact(system="van_der_pol", inputs=True, noise=True, age=True, dt=0.01, pair=False, forward=False):
+def random_artifact(
+    system="van_der_pol", inputs=True, noise=True, age=True, dt=0.01, pair=False, forward=False, free=False
+):
     """A whole observer for a system with weights that nobody trained."""
     system = get_system(system)
     rng = np.random.default_rng(0)
@@ -53,6 +55,19 @@ def random_artifact(system="van_der_pol", inputs=True, noise=True, age=True, dt=
             random_mlp(rng, system.nx, nz, "tanh"), zeros(system.nx), 2 * ones(system.nx), ones(nz), 3 * ones(nz)
         )
         if forward
+        else None,
+        free=InverseMap(
+            mlp=random_mlp(rng, nz + noise, system.nx),
+            features=("z_y", *(["measurement_noise"] if noise else [])),
+            z_offset=rng.normal(size=nz),
+            whiten=rng.normal(size=(nz, nz)),
+            noise_gain=rng.uniform(0.1, 1.0, nz),
+            x_offset=rng.normal(size=system.nx),
+            x_scale=np.array(system.scale),
+            noise_unit=0.2,
+            noise_max=inverse.noise_max,
+        )
+        if free
         else None,
         training={"preset": "none", "seed": 0},
         versions={"numpy": np.__version__},

@@ -23,6 +23,8 @@ KINDS = [
     {"inputs": False, "noise": False, "age": False},
     {"pair": True},
     {"forward": True},
+    {"free": True},
+    {"free": True, "noise": False},
 ]
 
 
@@ -60,16 +62,19 @@ def test_round_trip(system, options, make_artifact, tmp_path):
     assert (again.training, again.versions) == (artifact.training, artifact.versions)
     assert again.filter.dt == artifact.filter.dt
     assert np.array_equal(again.filter._update, artifact.filter._update)
-    for part in dataclasses.fields(artifact.inverse):
-        if part.name != "mlp":
-            assert np.array_equal(getattr(again.inverse, part.name), getattr(artifact.inverse, part.name))
-    assert again.inverse.features == artifact.inverse.features
+    assert (again.free is None) == (artifact.free is None)
+    for after, before in ((again.inverse, artifact.inverse), (again.free, artifact.free)):
+        for part in dataclasses.fields(before) if before else ():
+            if part.name != "mlp":
+                assert np.array_equal(getattr(after, part.name), getattr(before, part.name))
     assert (again.forward is None) == (artifact.forward is None)
     x = np.random.default_rng(1).normal(size=(5, artifact.nx))
     if artifact.forward:
         assert np.array_equal(again.forward(x), artifact.forward(x))
     y = np.random.default_rng(2).normal(size=(20, 3, artifact.ny))
     assert np.array_equal(KKLObserver(again).estimate(y), KKLObserver(artifact).estimate(y))
+    u = np.ones((20, 3, artifact.nu))
+    assert np.array_equal(KKLObserver(again).estimate(y, u), KKLObserver(artifact).estimate(y, u))
     before = contents(path)[1]
     again.save(path)
     assert contents(path)[1] == before
@@ -343,3 +348,16 @@ def test_mlp_shape_errors():
             MLP(*wrong, "tanh")
     with pytest.raises(ValueError, match="unknown activation 'relu', expected one of tanh, silu"):
         MLP(weights, biases, "relu")
+
+
+def test_a_map_of_free_motion_must_fit_the_one_of_driven_motion(make_artifact):
+    artifact, autonomous = make_artifact(free=True), make_artifact(inputs=False)
+    other = make_artifact("lorenz", free=True).free
+    with pytest.raises(ArtifactError, match="must be of z_y, 5 values"):
+        dataclasses.replace(artifact, free=artifact.inverse)
+    with pytest.raises(ArtifactError, match="must be of z_y, 5 values, beside one that knows of inputs"):
+        dataclasses.replace(autonomous, free=artifact.free)
+    with pytest.raises(ArtifactError, match="must be of z_y"):
+        dataclasses.replace(artifact, free=other)
+    with pytest.raises(ArtifactError, match="differ in states, or in noise"):
+        dataclasses.replace(artifact, free=dataclasses.replace(artifact.free, noise_max=2.0))

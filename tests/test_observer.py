@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -7,11 +8,12 @@ from hypothesis import strategies as st
 
 import observers.observer
 from kkl_gym import SYSTEMS
-from observers import KKLObserver, load
+from observers import KKLObserver, LinearFilter, load
 
 everyone = pytest.mark.parametrize("system", SYSTEMS)
 KINDS = [{"inputs": inputs, "noise": noise, "age": age} for inputs in (0, 1) for noise in (0, 1) for age in (0, 1)] + [
-    {"pair": True}
+    {"pair": True},
+    {"free": True},
 ]
 CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # the network works in float32
 
@@ -87,6 +89,36 @@ def test_estimate_takes_a_last_row_of_u_more_and_none(make_artifact):
     assert np.array_equal(observer.estimate(y), observer.estimate(y, 0 * u))
     assert not np.allclose(observer.estimate(y), expected)
     assert observer.estimate(y[:1]).shape == (1, 2)
+
+
+def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
+    both = make_artifact(free=True)
+    driven, free = (
+        KKLObserver(dataclasses.replace(both, free=None)),
+        KKLObserver(
+            dataclasses.replace(make_artifact(inputs=False), filter=autonomous(both.filter), inverse=both.free)
+        ),
+    )
+    observer, steps = KKLObserver(both), 12
+    y, _ = record(observer, steps, 3)
+    u = np.zeros((steps - 1, 3, 1))
+    u[4, 1] = 1e-9  # one row is driven, however little, from here on
+    u[7, 2] = -2.0
+    begins = np.array([steps, 5, 8])
+    x_hat, always, never = step_by_step(observer, y, u), driven.estimate(y, u), free.estimate(y)
+    expected = np.where((np.arange(steps)[:, None] >= begins)[..., None], always, never)
+    assert not np.allclose(always, never, atol=0.01)
+    assert np.allclose(x_hat, expected, **CLOSE)
+    assert np.allclose(observer.estimate(y, u), expected, **CLOSE)
+    observer.restart(y[0, 1:2], np.array([False, True, False]))
+    assert np.allclose(observer.decode()[1], free.estimate(y[:1])[0, 1], **CLOSE)
+    alone = KKLObserver(both)
+    for row in range(3):
+        assert np.allclose(step_by_step(alone, y[:, row], u[:, row]), expected[:, row], **CLOSE)
+
+
+def autonomous(linear):
+    return LinearFilter(linear.A, linear.B, linear.dt, 0)
 
 
 @settings(deadline=None, max_examples=40, derandomize=True)

@@ -16,7 +16,7 @@ from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from observers import Artifact, KKLObserver, LinearFilter
 from training import errors, preset, smape, train, unseen_runs
 from training.config import Config, override, spectrum
-from training.data import output, record, record_closed_loop, recording_ages, run_filter
+from training.data import output, record, record_closed_loop, recording_ages, run_filter, trajectories
 from training.evaluate import starts
 from training.forward import ForwardProblem, on_tensors, truncation_time
 from training.inverse import AGE_UNIT, NOISE_UNIT, ClosedLoopSampler, TrajectorySampler, coordinates
@@ -71,6 +71,27 @@ def test_signals_are_bounded_and_of_three_kinds():
     assert not u[:, [0, 2, 4, 6]].any()
     assert all(len(np.unique(u[:, i])) < 1000 / 4 for i in (1, 5))
     assert all(len(np.unique(u[:, i])) > 1000 / 4 for i in (3, 7))
+
+
+def test_pulses_end_and_leave_free_motion_behind():
+    u = random_inputs(VanDerPol(), 200, 500, 0.01, np.random.default_rng(0), ("pulses",))
+    last = np.array([np.flatnonzero(row).max(initial=-1) for row in u[..., 0].T])
+    assert last.min() < 50
+    assert 450 < last.max() < 500
+    assert abs(last.mean() - 250) < 40
+
+
+def test_excited_starts_lie_beyond_the_box_and_the_others_within():
+    system, n = ReverseDuffing(), 400
+    (x, u), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    low, high = system.box()
+    inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
+    assert not rest
+    assert u.shape == (10, n, 0)
+    assert inside[200:].all()
+    assert 5 < (~inside[:200]).sum() < 150
+    (x, _), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    assert np.isfinite(x).all()
 
 
 def test_recording_ages_cover_start_transient_and_end():
@@ -261,7 +282,7 @@ def test_closing_the_loop_is_a_second_stage(tmp_path):
     system = Oscillator()
     config = toy(system, duration=5.0, closed_loop=20)
     result = train(system, config, tmp_path)
-    assert list(result.losses) == ["inverse", "closed-loop"]
+    assert list(result.losses) == ["free", "inverse", "closed-loop"]
     assert result.artifact.training["closed_loop"] == 20
     again = train(system, config, tmp_path, resume=True)
     for a, b in zip(result.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights, strict=True):
@@ -464,6 +485,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
     assert resumed.losses["inverse"][-1][0] == 400
+    assert (whole.free is not None) == (method == "input-aware")
     with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
         train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
     with pytest.raises(ValueError, match="--resume"):

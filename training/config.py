@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args, get_origin
 import numpy as np
 
 from kkl_gym.system import System
+from training.optimise import Optimiser
 
 Method = Literal["input-aware", "spinn"]
 Preset = Literal["fast", "paper"]
@@ -20,7 +21,8 @@ class Config:
     """A training run; together with the system it determines the artifact."""
 
     method: Method
-    """"input-aware": T_inv(z_y, z_u) fitted along driven, noisy trajectories, transients included.
+    """"input-aware": T_inv(z_y, z_u) fitted along driven, noisy trajectories, transients included, and T_inv(z_y)
+    along free ones.
     "spinn": the paper's pipeline, a physics-informed T and then T_inv on z' = T(x')."""
     eigenvalues: tuple[float, ...]
     """The real ones of A, in 1/s; B is all ones for each output."""
@@ -41,6 +43,8 @@ class Config:
     """Number of hidden layers."""
     activation: Literal["tanh", "silu"] = "tanh"
     """Of the hidden layers."""
+    optimiser: Optimiser = "adam"
+    """Of all networks: "adam", or "soap", which needs a fraction of the batches."""
     batch: int = 4096
     """Samples in a batch (for the forward map: of data, and as many collocation points)."""
     learning_rate: float = 8e-3
@@ -55,6 +59,8 @@ class Config:
     """Where a solved forward map holds and is inverted: along motions from this multiple of the training box."""
     physics_weight: float = 0.1
     """nu, the weight of the PDE residual in the forward map's risk."""
+    free: bool = True
+    """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted."""
     noise_max: float = 1.0
     """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
     truncation: float = 1e-6
@@ -68,7 +74,11 @@ class Config:
     """Of everything random."""
 
     def __post_init__(self) -> None:
-        for name, allowed in (("method", get_args(Method)), ("activation", ("tanh", "silu"))):
+        for name, allowed in (
+            ("method", get_args(Method)),
+            ("activation", ("tanh", "silu")),
+            ("optimiser", get_args(Optimiser)),
+        ):
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name} must be one of {', '.join(allowed)}, got {getattr(self, name)!r}")
         if not self.eigenvalues and not self.pairs:
@@ -122,6 +132,10 @@ SPECTRA: dict[str, tuple[int, float, float]] = {
     "rossler": (13, -8.0, -0.4),
     "lorenz": (13, -25.0, -1.5),
 }
+# Complex modes beside them where they help: at frequencies of y, as `kkl-gym tune` chooses them, and slow.
+PAIRS: dict[str, tuple[tuple[float, float], ...]] = {
+    "van_der_pol": ((-0.1, 0.718), (-0.1, 2.128)),
+}
 NOISE_MAX = {"lorenz": 3.0}
 
 
@@ -164,11 +178,25 @@ def preset(system: System, method: Method, name: Preset) -> Config:
     fast = Config(
         method="input-aware",
         eigenvalues=spectrum(system),
+        pairs=PAIRS.get(system.name, ()),
+        optimiser="soap",
+        batch=1024,
+        learning_rate=5e-3,
+        inverse_steps=18000,
         noise_max=NOISE_MAX.get(system.name, 1.0),
     )
     if name == "fast":
         return fast
-    return replace(fast, width=512, depth=4, activation="silu", learning_rate=1e-3, inverse_steps=244_140)
+    return replace(
+        fast,
+        width=512,
+        depth=4,
+        activation="silu",
+        optimiser="adam",
+        batch=4096,
+        learning_rate=1e-3,
+        inverse_steps=244_140,
+    )
 
 
 def papers_spectrum(system: System) -> tuple[float, ...]:

@@ -9,9 +9,10 @@ from kkl_gym.simulate import advance_batch, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, LinearFilter
 from training.controllers import Controller
-from training.signals import random_inputs
+from training.signals import DRIVEN, KINDS, random_inputs
 
 CHUNK = 500  # trajectories simulated at once
+EXCITATION = 10.0  # seconds for which inputs lead starts out of the training box
 EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
@@ -57,14 +58,16 @@ def record(
     ages: np.ndarray,
     rng: np.random.Generator,
     report: Callable[[int], None] = lambda done: None,
+    kinds: tuple[str, ...] = KINDS,
+    excited: float = 0.0,
 ) -> Trajectories:
-    """Simulate n trajectories from starts uniform in the training box, under random inputs if the filter takes any.
+    """Simulate n trajectories from starts in the training box, under such random inputs if the filter takes any.
 
-    Trajectories that leave the declared bounds are replaced by new ones; ``report`` is told how many there are so far.
+    ``report`` is told how many there are so far; for the rest see :func:`trajectories`.
     """
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
-    for x, u in trajectories(system, n, steps, linear.dt, rng, driven=linear.nu > 0):
+    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited):
         xs.append(x[ages])
         zs.append(run_filter(linear, output(system, x), u, ages))
         report(sum(x.shape[1] for x in xs))
@@ -72,18 +75,35 @@ def record(
 
 
 def trajectories(
-    system: System, n: int, steps: int, dt: float, rng: np.random.Generator, driven: bool
+    system: System,
+    n: int,
+    steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    kinds: tuple[str, ...] = (),
+    excited: float = 0.0,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """n trajectories from starts uniform in the training box, in chunks: states and inputs, (steps (+ 1), CHUNK, ...).
 
     Those that leave the declared bounds are replaced by new ones.
+
+    kinds : of random inputs; without any, inputs have no columns.
+    excited : share of the trajectories that start where random inputs have led from X within EXCITATION seconds, if the
+        system has any: beyond X.
     """
     kept = tried = 0
     while kept < n:
         count = min(CHUNK, n - kept)
         x0 = rng.uniform(*system.box(), (count, system.nx))
-        u = random_inputs(system, count, steps, dt, rng) if driven else np.zeros((steps, count, 0))
-        x = simulate(system, x0, steps, dt, u=u if driven else None)
+        if excited and system.nu:
+            some = slice(0, round(excited * count))
+            before = round(EXCITATION / dt)
+            led = simulate(
+                system, x0[some], before, dt, u=random_inputs(system, len(x0[some]), before, dt, rng, DRIVEN)
+            )
+            x0[some] = np.where(np.isfinite(led[-1]).all(-1)[:, None], led[-1], x0[some])
+        u = random_inputs(system, count, steps, dt, rng, kinds) if kinds else np.zeros((steps, count, 0))
+        x = simulate(system, x0, steps, dt, u=u if kinds else None)
         inside = np.isfinite(x[-1]).all(-1)
         kept += int(inside.sum())
         tried += count

@@ -19,26 +19,25 @@ from torch.utils.tensorboard import SummaryWriter
 
 import kkl_gym
 from kkl_gym.system import System
-from observers import Artifact, ForwardMap, LinearFilter
+from observers import Artifact, ForwardMap, InverseMap, LinearFilter
 from training.config import Config
 from training.controllers import controller
-from training.data import output, record, record_closed_loop, recording_ages
+from training.data import Trajectories, output, record, record_closed_loop, recording_ages
 from training.files import write
 from training.forward import ForwardProblem, truncation_time
 from training.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
 from training.networks import Network, on_torch
 from training.optimise import Stage, optimise
+from training.signals import DRIVEN, KINDS
 from training.solved import collocation, solve_forward
 
 # First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
 TRAINING_SEED = 1
-# Of each stage in the cap on CPU time: a step of the forward map costs three of the inverse map's.
-SHARES = {
-    "input-aware": {"inverse": 1.0},
-    "closed-loop": {"inverse": 0.5, "closed-loop": 0.5},
-    "spinn": {"forward": 0.75, "inverse": 0.25},
-    "solved": {"inverse": 0.75},  # solving takes about the rest
-}
+# Of each stage in the cap on CPU time; those of input-aware maps have equal ones. A step of the forward map costs three
+# of the inverse map's.
+SPINN_SHARES = {"forward": 0.75, "inverse": 0.25}
+SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
+EXCITED = 0.4  # share of the free motions that start beyond X, where inputs have led
 INVERTED = 200_000  # states on which a solved forward map is inverted
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
@@ -87,6 +86,7 @@ def train(
 
     nu = system.nu if config.method == "input-aware" else 0
     linear = make_filter(config.eigenvalues, system.ny, config.dt, nu, config.pairs)
+    shares = _shares(config, nu)
     steps = max(1, round(config.duration / config.dt))
     losses: dict[str, list[tuple[int, float]]] = {}
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -96,17 +96,35 @@ def train(
     ):
 
         def run(name: str, problem: Any, count: int) -> None:
-            shares = SHARES["closed-loop" if config.closed_loop else "solved" if config.features else config.method]
             cap = math.inf if config.cap is None else config.cap * shares[name]
-            stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed, cap)
+            stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed, cap, config.optimiser)
             losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)
 
         first = 0 if config.method == "input-aware" else truncation_step(system, linear, steps, config.truncation)
         ages = recording_ages(first, steps, config.samples)
-        task = progress.add_task(f"simulating {system.name}", total=config.trajectories)
-        data = record(
-            system, linear, config.trajectories, steps, ages, rng, lambda done: progress.update(task, completed=done)
-        )
+
+        def simulated(into: LinearFilter, what: str, **how: Any) -> Trajectories:
+            task = progress.add_task(f"simulating {what}", total=config.trajectories)
+
+            def report(done: int) -> None:
+                progress.update(task, completed=done)
+
+            return record(system, into, config.trajectories, steps, ages, rng, report, **how)
+
+        def fit(sampler: Sampler, stage: str) -> Network:
+            inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
+            network = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
+            run(stage, InverseProblem(network, sampler, device), config.inverse_steps)
+            return network
+
+        free: InverseMap | None = None
+        if "free" in shares:
+            unforced = make_filter(config.eigenvalues, system.ny, config.dt, 0, config.pairs)
+            motions = simulated(unforced, f"{system.name}, free", excited=EXCITED)
+            own = TrajectorySampler(motions, unforced, config.noise_max, config.batch, device)
+            free = own.inverse_map(fit(own, "free"), unforced)
+            del motions, own
+        data = simulated(linear, system.name, kinds=DRIVEN if free else KINDS)
         forward: ForwardMap | None = None
         sampler: Sampler
         feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
@@ -127,9 +145,7 @@ def train(
                 run("forward", problem, config.forward_steps)
                 forward, T, error, points = problem.forward_map(), problem.T, problem.error(), None
             sampler = ForwardMapSampler(T, error, system.box(), config.batch, device, points)
-        inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
-        inverse = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
-        run("inverse", InverseProblem(inverse, sampler, device), config.inverse_steps)
+        inverse = fit(sampler, "inverse")
 
         def artifact() -> Artifact:
             return Artifact(
@@ -139,6 +155,7 @@ def train(
                 parameters=system.parameters,
                 forward=forward,
                 C=output_matrix(system),
+                free=free,
                 training={
                     **dataclasses.asdict(config),
                     "seconds": round(time.monotonic() - started),
@@ -170,6 +187,14 @@ def train(
             sampler = ClosedLoopSampler(sampler, driven, config.dt, device)
             run("closed-loop", InverseProblem(inverse, sampler, device), config.inverse_steps)
     return Result(artifact(), losses)
+
+
+def _shares(config: Config, nu: int) -> dict[str, float]:
+    """The stages of a run that train networks, with their parts in the cap on CPU time."""
+    if config.method == "spinn":
+        return SOLVED_SHARES if config.features else SPINN_SHARES
+    stages = ["inverse", *(["free"] if config.free and nu else []), *(["closed-loop"] if config.closed_loop else [])]
+    return {stage: 1 / len(stages) for stage in stages}
 
 
 def describe(system: System) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import numpy as np
 from kkl_gym.system import System
 
 KINDS = ("zero", "steps", "zero", "sine")
+DRIVEN = ("steps", "sine", "pulses")
 
 
 def random_inputs(
@@ -14,6 +15,7 @@ def random_inputs(
 
     - "zero": none (twice as often as each of the others by default);
     - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
+    - "pulses": the same up to a time uniform within the record, and none from there on;
     - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
     """
     u = np.zeros((steps, n, system.nu))
@@ -21,11 +23,13 @@ def random_inputs(
     for row in range(n):
         kind = kinds[row % len(kinds)]
         for j, u_max in enumerate(system.u_max):
-            if kind == "steps":
+            if kind in ("steps", "pulses"):
                 hold = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
                 changes = rng.random(steps) < min(1.0, dt / hold)
                 levels = rng.uniform(-u_max, u_max, steps + 1)
                 u[:, row, j] = levels[np.cumsum(changes)]
+                if kind == "pulses":
+                    u[rng.integers(steps + 1) :, row, j] = 0.0
             elif kind == "sine":
                 amplitude, phase = rng.uniform(0, u_max), rng.uniform(0, 2 * np.pi)
                 u[:, row, j] = amplitude * np.sin(np.exp(rng.uniform(np.log(0.2), np.log(20.0))) * t + phase)

@@ -196,7 +196,7 @@ def certify(
         psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
     noise_term = 2 * (upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)) ** 2
     losses = _squared(measured.x - quiet(measured.z))
-    inverse_dimension = pseudo_dimension_bound(artifact.inverse.mlp)
+    inverse_dimension = pseudo_dimension_bound((artifact.free or artifact.inverse).mlp)
     seen = _training_samples(artifact)
     return Certificate(
         observer=name or f"{artifact.system} ({artifact.training.get('method', 'unknown')})",

@@ -53,8 +53,8 @@ class Smooth:
 
 
 def decoder(artifact: Artifact, measurement_noise: float) -> Smooth:
-    """T_inv at a noise level and long after reset: the filter's state (n, size) to the estimate (n, nx)."""
-    inverse = artifact.inverse
+    """T_inv of free motion at a noise level, long after reset: the filter's state (n, size) to the estimate (n, nx)."""
+    inverse = artifact.free or artifact.inverse
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = []
     if "measurement_noise" in inverse.features:
@@ -64,7 +64,9 @@ def decoder(artifact: Artifact, measurement_noise: float) -> Smooth:
     first = inverse.mlp.weights[0].astype(float)
     modes = len(whiten)
     bias = inverse.mlp.biases[0] - first[:, :modes] @ whiten @ inverse.z_offset + first[:, modes:] @ np.array(told)
-    return _scaled(inverse.mlp, first[:, :modes] @ whiten, bias, inverse.x_scale, inverse.x_offset)
+    filtered = np.zeros((len(first), artifact.filter.size))  # the part of z that holds inputs is 0
+    filtered[:, : whiten.shape[1]] = first[:, :modes] @ whiten
+    return _scaled(inverse.mlp, filtered, bias, inverse.x_scale, inverse.x_offset)
 
 
 def encoder(forward: ForwardMap) -> Smooth:

@@ -17,6 +17,8 @@ from training.tuning import Probe, Spectrum
 FEATURES = 1500
 NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
 TUNED_FOR = 0.5
+# How inverses were trained before SOAP: by Adam, one for free and driven motion.
+EARLIER: dict[str, Any] = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3, "free": False}
 
 
 class Ablation(KKLMethod):
@@ -26,7 +28,7 @@ class Ablation(KKLMethod):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """Settings that differ from the preset's; the paper's spectrum, unless another is the point."""
-        return {"eigenvalues": papers_spectrum(task.system)}
+        return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
@@ -44,51 +46,63 @@ class PapersSPINN(Ablation):
 
 
 class Solved(Ablation):
-    """The same, but the output layer of T found by least squares instead of descent."""
+    """The same, but the output layer of T by least squares, along motions from 2X, on which T is then inverted."""
 
     name: ClassVar[str] = "ablation-solved"
-    label: ClassVar[str] = "SPINN, T solved in X"
+    label: ClassVar[str] = "SPINN, T solved"
     pipeline: ClassVar[Pipeline] = "spinn"
-    reach: ClassVar[float] = 1.0
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """Random features in place of a trained network."""
-        return {
-            "forward_steps": 0,
-            "features": FEATURES,
-            "reach": self.reach,
-            **super().changes(task),
-        }
-
-
-class SolvedBeyond(Solved):
-    """The same with T, and the states on which it is inverted, along motions from 2X."""
-
-    name: ClassVar[str] = "ablation-solved-2x"
-    label: ClassVar[str] = "... in 2X"
-    reach: ClassVar[float] = 2.0
+        return {"forward_steps": 0, "features": FEATURES, "reach": 2.0, **super().changes(task)}
 
 
 class Transients(Ablation):
-    """No T: the inverse fitted to what the filter shows along motions from X, half of them driven."""
+    """No T: one inverse fitted to what the filter shows along motions from X, half of them driven."""
 
     name: ClassVar[str] = "ablation-transients"
     label: ClassVar[str] = "inverse on transients"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """No noise."""
-        return {**super().changes(task), "noise_max": NO_NOISE}
+        return {**super().changes(task), **EARLIER, "noise_max": NO_NOISE}
 
 
 class NoiseAware(Ablation):
-    """The same, also under noise of every level, which it is told; the package's default has more modes beside."""
+    """The same, also under noise of every level, which it is told."""
 
     name: ClassVar[str] = "ablation-noise"
     label: ClassVar[str] = "... and noise"
 
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """All that is not the default's."""
+        return {**super().changes(task), **EARLIER}
+
+
+class MoreModes(Ablation):
+    """The same with the default's spectrum."""
+
+    name: ClassVar[str] = "ablation-modes"
+    label: ClassVar[str] = "... more modes"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """Its modes are the preset's."""
+        return EARLIER
+
+
+class BySOAP(Ablation):
+    """The same by SOAP; the default has an inverse of its own for free motion beside."""
+
+    name: ClassVar[str] = "ablation-soap"
+    label: ClassVar[str] = "... by SOAP"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """One map for free and driven motion."""
+        return {"free": False}
+
 
 class Tuned(Ablation):
-    """Complex modes chosen for the system and a noise level of 0.5 in place of the default's real ones."""
+    """The default with the complex modes that are chosen for the system and a noise level of 0.5."""
 
     name: ClassVar[str] = "ablation-tuned"
     label: ClassVar[str] = "... tuned spectrum"
@@ -97,17 +111,6 @@ class Tuned(Ablation):
         """The modes that ``kkl-gym tune`` chooses."""
         spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
         return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
-
-
-class OneLevel(Tuned):
-    """The same for noise up to that level only."""
-
-    name: ClassVar[str] = "ablation-one-level"
-    label: ClassVar[str] = "... noise up to 0.5"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """The same, and the largest noise."""
-        return {**super().changes(task), "noise_max": TUNED_FOR}
 
 
 @cache
