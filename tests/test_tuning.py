@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from linear_system import F, Oscillator
 from scipy.linalg import expm
+from scipy.stats import spearmanr
 
+import training.tuning.check
 import training.tuning.probe
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
@@ -19,6 +22,7 @@ from training.derivatives import with_sensitivity
 from training.methods.kalman import ExtendedKalmanFilter
 from training.pipeline import make_filter
 from training.tuning import Probe, Spectrum
+from training.tuning.check import rank_correlation
 
 SPECTRUM = Spectrum((-2.0, -0.7), ((-0.3, 1.0),))
 
@@ -203,8 +207,20 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
     assert described["width"] == 8
 
 
+def test_predictions_are_compared_with_trained_observers(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(training.tuning.check, "TRAJECTORIES", 20)
+    system = str(Path(__file__).with_name("linear_system.py")) + ":Oscillator"
+    main(["tune", system, "--duration", "4", "--modes", "5", "--check", "0.3", "--out", str(tmp_path)])
+    rows = pd.read_csv(tmp_path / "check.csv")
+    assert {"chosen", "paper's", "Bessel"} <= set(rows.kind)
+    assert rows.trained.between(0.1, 150).all()
+    expected = spearmanr(rows.predicted, rows.trained).statistic
+    assert f"rank correlation {expected:.2f}, of {len(rows)} spectra" in capsys.readouterr().out
+    assert np.isnan(rank_correlation([1.0, 2.0], [1.0, 2.0]))
+
+
 @pytest.mark.parametrize(
-    "options", [["--measurement-noise", "-1"], ["--modes", "0"], ["--duration", "0"], ["--dt", "0"]]
+    "options", [["--measurement-noise", "-1"], ["--modes", "0"], ["--duration", "0"], ["--dt", "0"], ["--check", "0"]]
 )
 def test_bad_options(options, tmp_path):
     with pytest.raises(SystemExit, match="must"):

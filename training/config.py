@@ -59,6 +59,8 @@ class Config:
     """Where a solved forward map holds and is inverted: along motions from this multiple of the training box."""
     physics_weight: float = 0.1
     """nu, the weight of the PDE residual in the forward map's risk."""
+    inputs: bool = True
+    """Whether the filter of an input-aware map takes in the system's inputs; else it is fitted to free motion only."""
     free: bool = True
     """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted."""
     noise_max: float = 1.0

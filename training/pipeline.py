@@ -84,7 +84,7 @@ def train(
     torch.manual_seed(config.seed)
     rng = np.random.default_rng([TRAINING_SEED, config.seed])
 
-    nu = system.nu if config.method == "input-aware" else 0
+    nu = system.nu if config.method == "input-aware" and config.inputs else 0
     linear = make_filter(config.eigenvalues, system.ny, config.dt, nu, config.pairs)
     shares = _shares(config, nu)
     steps = max(1, round(config.duration / config.dt))

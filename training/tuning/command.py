@@ -6,17 +6,19 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import torch
 import tyro
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.config import papers_spectrum, spectrum
+from training.config import papers_spectrum, preset
 from training.files import write
+from training.tuning.check import LEAST_NOISE, rank_correlation, trained_error
 from training.tuning.probe import Choice, Probe, Spectrum
 
-LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
 CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiples of the frequency of most of y's power
 
 
@@ -42,6 +44,9 @@ class Tune:
     """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
     seed: int = 0
     """Of the motions' starts."""
+    check: float | None = None
+    """Also train an observer for some of the spectra, for this many CPU seconds each, and compare what they leave with
+    what was predicted: check.csv."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: tuning/SYSTEM-NOISE)")] = None
     """Folder for what is written."""
 
@@ -51,6 +56,8 @@ class Tune:
             raise ValueError(
                 f"measurement_noise = {self.measurement_noise} must not be negative, modes = {self.modes} be positive"
             )
+        if self.check is not None and not 0 < self.check < np.inf:
+            raise ValueError(f"check = {self.check} must be a positive number of seconds")
         system = get_system(self.system, self.parameters)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
         folder = self.out or Path("tuning") / f"{system.name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
@@ -85,17 +92,37 @@ class Tune:
         again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
         again += f" --parameters{given}" if given else ""
         console.print(f"wrote config.json, front.csv and front.png in {folder}; to train an observer with it:\n{again}")
+        if self.check is not None:
+            chosen = fronts[noise]
+            some = [chosen[len(chosen) // 2], *([chosen[-1]] if len(chosen) > 1 else []), *others]
+            self._check(console, system, some, folder)
         return best
+
+    def _check(self, console: Console, system: System, choices: list[Choice], folder: Path) -> None:
+        assert self.check is not None
+        torch.set_num_threads(1)
+        measured = [
+            trained_error(system, choice.spectrum, self.measurement_noise, self.check, self.dt, self.duration)
+            for choice in track(choices, f"training observers of {system.name}", console=console)
+        ]
+        predicted = [choice.error for choice in choices]
+        table = Table("modes", "predicted error in %", "trained: median SMAPE in %", "", title=system.name)
+        for choice, found in zip(choices, measured, strict=True):
+            table.add_row(str(choice.spectrum.modes), f"{choice.error:.3g}", f"{found:.3g}", choice.kind)
+        correlation = rank_correlation(predicted, measured)
+        console.print(table, f"rank correlation {correlation:.2f}, of {len(choices)} spectra")
+        lines = [
+            f"{choice.kind},{choice.spectrum.modes},{choice.error:.6g},{found:.6g}"
+            for choice, found in zip(choices, measured, strict=True)
+        ]
+        write(folder / "check.csv", "\n".join(["kind,modes,predicted,trained", *lines]) + "\n")
 
 
 def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choice]:
     """The package's default, the paper's, and Bessel filters."""
-    named = {"default": spectrum(system), "paper's": papers_spectrum(system)}
-    found = [
-        Choice(Spectrum(values), probe.error(Spectrum(values), noise), kind)
-        for kind, values in named.items()
-        if len(values) <= most
-    ]
+    default = preset(system, "input-aware", "fast")
+    named = {"default": Spectrum(default.eigenvalues, default.pairs), "paper's": Spectrum(papers_spectrum(system))}
+    found = [Choice(one, probe.error(one, noise), kind) for kind, one in named.items() if one.modes <= most]
     orders = [order for order in (system.nx + 1, 2 * system.nx + 1, 4 * system.nx + 1) if order <= most]
     if not len(probe.frequencies):  # y does not move
         return found
@@ -120,12 +147,12 @@ def _draw(
     left.set(xlabel="modes for each output", ylabel="predicted error in %", title=system.name.replace("_", " "))
     left.set_ylim(top=10 * left.get_ylim()[1])  # room for the legend
     left.legend(fontsize="small", ncols=2)
-    poles = [complex(value) for value in best.spectrum.eigenvalues]
-    poles += [complex(a, sign * w) for a, w in best.spectrum.pairs for sign in (1, -1)]
     for choice in others:
         if choice.kind == "default":
-            right.plot(choice.spectrum.eigenvalues, np.zeros(choice.spectrum.modes), "s", mfc="none", label="default")
-    right.plot(np.real(poles), np.imag(poles), "x", color=color, label=f"written: {best.kind}")
+            poles = choice.spectrum.poles
+            right.plot(poles.real, poles.imag, "s", mfc="none", label="default")
+    poles = best.spectrum.poles
+    right.plot(poles.real, poles.imag, "x", color=color, label=f"written: {best.kind}")
     right.set(xscale="symlog", xlabel="Re λ in 1/s", ylabel="Im λ in rad/s", title=f"eigenvalues of A, noise {noise:g}")
     right.legend(fontsize="small")
     figure.savefig(path, dpi=110)

@@ -38,6 +38,12 @@ class Spectrum:
         """Their number."""
         return len(self.eigenvalues) + 2 * len(self.pairs)
 
+    @property
+    def poles(self) -> np.ndarray:
+        """All of them, complex, (modes,)."""
+        above = [complex(a, w) for a, w in self.pairs]
+        return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
+
     def __add__(self, other: "Spectrum") -> "Spectrum":
         return Spectrum(self.eigenvalues + other.eigenvalues, self.pairs + other.pairs)
 

@@ -1,0 +1,47 @@
+"""Whether predictions hold: observers trained for several spectra, on runs that nobody trained on."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from scipy.stats import spearmanr
+
+from kkl_gym.system import System
+from training.config import preset
+from training.evaluate import VALIDATION_SEED, errors, unseen_runs
+from training.pipeline import train
+from training.tuning.probe import Spectrum
+
+LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
+TRAJECTORIES = 500  # of each training
+RUNS = 50  # on which its observer is measured
+
+
+def trained_error(
+    system: System, spectrum: Spectrum, measurement_noise: float, seconds: float, dt: float, duration: float
+) -> float:
+    """Median SMAPE in percent, over all steps, of an observer of free motion trained for so many CPU seconds."""
+    config = replace(
+        preset(system, "input-aware", "fast"),
+        eigenvalues=spectrum.eigenvalues,
+        pairs=spectrum.pairs,
+        inputs=False,
+        noise_max=max(measurement_noise, LEAST_NOISE),
+        trajectories=TRAJECTORIES,
+        dt=dt,
+        duration=duration,
+        inverse_steps=10**6,
+        cap=seconds,
+    )
+    with TemporaryDirectory() as folder:
+        artifact = train(system, config, Path(folder), device=torch.device("cpu")).artifact
+    runs = unseen_runs(system, dt, RUNS, duration, 0, first=VALIDATION_SEED)
+    return float(np.median(errors(artifact, system, runs, measurement_noise, 0).full))
+
+
+def rank_correlation(predicted: Sequence[float], measured: Sequence[float]) -> float:
+    """Spearman's; NaN for fewer than three pairs, which tell nothing."""
+    return float(spearmanr(predicted, measured).statistic) if len(predicted) > 2 else np.nan
