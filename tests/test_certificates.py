@@ -175,7 +175,7 @@ def test_the_smooth_maps_are_the_observers(name):
     observer = observers.load(name, 0.3)
     y = np.random.default_rng(2).normal(size=(1, 1))
     observer.reset(y)
-    for _ in range(3000):  # beyond the greatest age that the map tells apart
+    for _ in range(6000):  # beyond the greatest age that the map tells apart
         x_hat = observer.step(y)
     assert np.allclose(decoder(observer.artifact, 0.3)(observer.z), x_hat, atol=1e-4)
     if observer.artifact.forward is not None:

@@ -40,7 +40,8 @@ def test_shipped_maps_say_what_they_are(name, suffix):
     assert artifact.nx == system.nx
     assert artifact.nu == (0 if suffix else system.nu)
     assert (artifact.forward is not None) == bool(suffix)
-    assert resolve(name + suffix) == resolve(f"{name}{suffix}-v1")
+    assert resolve(name + suffix) == resolve(f"{name}{suffix}-v1" if suffix else f"{name}-v2")
+    assert (artifact.free is not None) == (not suffix)
     assert resolve(name + suffix).stat().st_size < 1_000_000
 
 

@@ -12,7 +12,8 @@ from training.controllers import Controller
 from training.signals import DRIVEN, KINDS, random_inputs
 
 CHUNK = 500  # trajectories simulated at once
-EXCITATION = 10.0  # seconds for which inputs lead starts out of the training box
+EXCITATION = 10.0  # seconds for which random inputs lead starts out of the training box
+PUSH = 20.0  # seconds for which constant ones do
 EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
@@ -60,6 +61,7 @@ def record(
     report: Callable[[int], None] = lambda done: None,
     kinds: tuple[str, ...] = KINDS,
     excited: float = 0.0,
+    push: float = 0.0,
 ) -> Trajectories:
     """Simulate n trajectories from starts in the training box, under such random inputs if the filter takes any.
 
@@ -67,7 +69,7 @@ def record(
     """
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
-    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited):
+    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited, push):
         xs.append(x[ages])
         zs.append(run_filter(linear, output(system, x), u, ages))
         report(sum(x.shape[1] for x in xs))
@@ -82,14 +84,16 @@ def trajectories(
     rng: np.random.Generator,
     kinds: tuple[str, ...] = (),
     excited: float = 0.0,
+    push: float = 0.0,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """n trajectories from starts uniform in the training box, in chunks: states and inputs, (steps (+ 1), CHUNK, ...).
 
     Those that leave the declared bounds are replaced by new ones.
 
     kinds : of random inputs; without any, inputs have no columns.
-    excited : share of the trajectories that start where random inputs have led from X within EXCITATION seconds, if the
-        system has any: beyond X.
+    excited : share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
+    push : these inputs are constant, up to so many times their bounds, for PUSH seconds; or, if it is 0, random ones
+        within their bounds, for EXCITATION seconds.
     """
     kept = tried = 0
     while kept < n:
@@ -97,11 +101,8 @@ def trajectories(
         x0 = rng.uniform(*system.box(), (count, system.nx))
         if excited and system.nu:
             some = slice(0, round(excited * count))
-            before = round(EXCITATION / dt)
-            led = simulate(
-                system, x0[some], before, dt, u=random_inputs(system, len(x0[some]), before, dt, rng, DRIVEN)
-            )
-            x0[some] = np.where(np.isfinite(led[-1]).all(-1)[:, None], led[-1], x0[some])
+            led = _led(system, x0[some], dt, rng, push)
+            x0[some] = np.where(np.isfinite(led).all(-1)[:, None], led, x0[some])
         u = random_inputs(system, count, steps, dt, rng, kinds) if kinds else np.zeros((steps, count, 0))
         x = simulate(system, x0, steps, dt, u=u if kinds else None)
         inside = np.isfinite(x[-1]).all(-1)
@@ -113,6 +114,16 @@ def trajectories(
                 f"{system.bounds}; widen the bounds, shrink X or shorten the trajectories"
             )
         yield x[:, inside], u[:, inside]
+
+
+def _led(system: System, x0: np.ndarray, dt: float, rng: np.random.Generator, push: float) -> np.ndarray:
+    """Where inputs lead from starts (n, nx); NaN where that is out of bounds."""
+    steps = round((PUSH if push else EXCITATION) / dt)
+    if push:
+        u = np.broadcast_to(push * rng.uniform(-1, 1, (len(x0), system.nu)) * system.u_max, (steps, len(x0), system.nu))
+    else:
+        u = random_inputs(system, len(x0), steps, dt, rng, DRIVEN)
+    return np.asarray(simulate(system, x0, steps, dt, u=u)[-1])
 
 
 def run_filter(linear: LinearFilter, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:

@@ -120,7 +120,7 @@ def train(
         free: InverseMap | None = None
         if "free" in shares:
             unforced = make_filter(config.eigenvalues, system.ny, config.dt, 0, config.pairs)
-            motions = simulated(unforced, f"{system.name}, free", excited=EXCITED)
+            motions = simulated(unforced, f"{system.name}, free", excited=EXCITED, push=config.push)
             own = TrajectorySampler(motions, unforced, config.noise_max, config.batch, device)
             free = own.inverse_map(fit(own, "free"), unforced)
             del motions, own
