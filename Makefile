@@ -30,7 +30,10 @@ format: $(VENV)/ready
 maps: $(VENV)/ready
 	for system in $(SYSTEMS); do for method in input-aware spinn; do \
 		$(BIN)/kkl-gym train $$system --method $$method --resume || exit 1; done; done
-	for system in $(CLOSED); do $(BIN)/kkl-gym train $$system --closed-loop --resume || exit 1; done
+	for system in $(CLOSED); do \
+		$(BIN)/kkl-gym train $$system --closed-loop --config training/version1.json --resume || exit 1; done
+	for system in $(SYSTEMS); do \
+		$(BIN)/kkl-gym train $$system --config training/version1.json --out runs/$$system-v1 --resume || exit 1; done
 
 # The figures in the README and in docs/.
 results: $(VENV)/ready

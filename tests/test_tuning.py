@@ -1,7 +1,7 @@
 """Choosing a spectrum, against closed forms on a linear system."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,9 @@ import training.tuning.check
 import training.tuning.probe
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
+from observers import load
 from training.cli import main
-from training.config import read_changes
+from training.config import override, preset, read_changes
 from training.data import output, run_filter
 from training.derivatives import with_sensitivity
 from training.methods.kalman import ExtendedKalmanFilter
@@ -239,6 +240,7 @@ def test_bad_options(options, tmp_path):
         ('{"pairs": [[-1, 2, 3]]}', "pairs"),
         ('{"samples": 20.5}', "samples"),
         ('{"dt": true}', "dt"),
+        ('{"free": 1}', "free"),
         ('{"activation": "relu"}', "activation"),
         ('{"cap": "a"}', "cap"),
     ],
@@ -247,6 +249,17 @@ def test_files_that_hold_no_settings(text, message, tmp_path):
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_changes(tmp_path / "c.json")
+
+
+def test_settings_of_the_first_version_of_the_maps_are_still_known():
+    file = Path(training.__file__).with_name("version1.json")
+    config = override(preset(get_system("van_der_pol"), "input-aware", "fast"), read_changes(file))
+    made = load("van_der_pol-v1").artifact.training
+    assert {name: value for name, value in asdict(config).items() if name in made} == {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in made.items()
+        if name in asdict(config)
+    }
 
 
 def test_a_file_of_settings(tmp_path):

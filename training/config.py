@@ -267,7 +267,9 @@ def _fits(value: Any, kind: Any) -> bool:
         return value in options
     if options:  # a union
         return any(_fits(value, option) for option in options)
-    return isinstance(value, (int, float) if kind is float else kind) and not isinstance(value, bool)
+    if kind is bool or isinstance(value, bool):
+        return kind is bool and isinstance(value, bool)
+    return isinstance(value, (int, float) if kind is float else kind)
 
 
 def _hashable(value: Any) -> Any:
