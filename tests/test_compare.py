@@ -28,7 +28,7 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
     assert (results.score <= 0).all()
     assert np.isfinite(results.to_numpy()[:, 4:].astype(float)).all()
     table = (out / "table.md").read_text()
-    assert "Partial: 212 of 216 agents are missing" in table
+    assert "Partial: 204 of 208 agents are missing" in table
     assert (out / "scores.png").stat().st_size > 1000
     before = {path: path.stat().st_mtime_ns for path in out.glob("jobs/**/result.json")}
     shutil.rmtree(out / "jobs" / "lorenz-0.5" / "y" / "1")
@@ -89,7 +89,7 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         toy(tmp_path, knows=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1
-    assert "Partial: 215 of 216 agents are missing" in (tmp_path / "table.md").read_text()
+    assert "Partial: 207 of 208 agents are missing" in (tmp_path / "table.md").read_text()
 
 
 def test_a_recurrent_agent_is_a_case_like_others(tmp_path):
@@ -101,7 +101,7 @@ def test_a_recurrent_agent_is_a_case_like_others(tmp_path):
 
 def test_cases():
     cases = Compare().cases()
-    assert len(cases) == 6 * (6 * 5 + 2 * 3)
+    assert len(cases) == 6 * 6 * 5 + 4 * 2 * 3 + 2 * 2
     assert len({case.folder for case in cases}) == len(cases)
     assert {(case.system, case.measurement_noise) for case in cases} >= set(MORE_NOISE.items())
     assert {case.knows for case in cases} == set(KNOWS)
