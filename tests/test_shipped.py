@@ -1,9 +1,13 @@
+import json
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
+from training.config import preset
 from training.data import output
 from training.evaluate import errors, unseen_runs
 from training.metrics import component_smape
@@ -48,6 +52,14 @@ def test_shipped_maps_say_what_they_are(name, suffix):
     assert resolve(name + suffix) == resolve(f"{name}{suffix}-v1" if suffix else f"{name}-v2")
     assert (artifact.free is not None) == (not suffix)
     assert resolve(name + suffix).stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_default_maps_are_what_the_preset_makes(name):
+    made = observers.load(name).artifact.training
+    config = json.loads(json.dumps(asdict(preset(get_system(name), "input-aware", "fast"))))
+    assert {key: made.get(key, config[key]) for key in config} == config
+    assert made["optimiser"] == "soap"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -33,16 +33,16 @@ class Train:
     system: tyro.conf.Positional[str]
     """A shipped system, or a class of yours as script.py:Class or module:Class."""
     method: Method = "input-aware"
-    """input-aware: fitted along driven, noisy trajectories. spinn: the paper's pipeline, without inputs."""
+    """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
-    """fast: at most ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
+    """fast: about ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Path | None = None
     """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
     closed_loop: bool = False
     """Fit the inverse a second time, also on trajectories of a controller that acts on the estimate (input-aware);
-    takes twice as long. Writes NAME-closed-loop."""
+    takes half as long again. Writes NAME-closed-loop."""
     monitor: bool = True
     """Find limits for the observer's monitor as well, which takes a minute or two; left out where the output is not
     linear."""

@@ -112,10 +112,13 @@ class Config:
         for name in ("seed", "physics_weight", "push"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)} must be finite and not negative")
-        if self.closed_loop and (self.closed_loop < 10 or self.method != "input-aware"):
+        for name in ("inputs", "free"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")
+        if self.closed_loop and (self.closed_loop < 10 or self.method != "input-aware" or not self.inputs):
             raise ValueError(
-                f"closed_loop must be 0 or at least 10, and needs method 'input-aware'; got {self.closed_loop}, "
-                f"{self.method!r}"
+                f"closed_loop must be 0 or at least 10, and needs method 'input-aware' with inputs; got "
+                f"{self.closed_loop}, {self.method!r}, inputs = {self.inputs}"
             )
         if (self.method == "spinn") != (self.forward_steps > 0 or self.features > 0):
             raise ValueError(

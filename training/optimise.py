@@ -158,14 +158,16 @@ def _restore(
     try:
         with safe_open(path, framework="pt") as opened:
             meta = json.loads(opened.metadata()["checkpoint"])
-            fingerprint = meta["fingerprint"]
+            fingerprint, packed = meta["fingerprint"], meta["optimiser"]
             tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the checkpoint {path} is damaged, remove it to train that stage anew: {error}") from error
+        raise ValueError(
+            f"the checkpoint {path} is damaged or of an older version, remove it to train that stage anew: {error}"
+        ) from error
     if fingerprint != stage.fingerprint:
         raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
     module.load_state_dict({k.removeprefix("module."): v for k, v in tensors.items() if k.startswith("module.")})
-    optimiser.load_state_dict(_unpacked(meta["optimiser"], tensors))
+    optimiser.load_state_dict(_unpacked(packed, tensors))
     generator.set_state(tensors["generator"].cpu())
     history = [(int(step), float(value)) for step, value in meta["history"]]
     return int(meta["step"]), float(meta.get("seconds", 0.0)), history

@@ -117,6 +117,7 @@ def train(
             run(stage, InverseProblem(network, sampler, device), config.inverse_steps)
             return network
 
+        feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
         free: InverseMap | None = None
         if "free" in shares:
             unforced = make_filter(config.eigenvalues, system.ny, config.dt, 0, config.pairs)
@@ -127,7 +128,6 @@ def train(
         data = simulated(linear, system.name, kinds=DRIVEN if free else KINDS)
         forward: ForwardMap | None = None
         sampler: Sampler
-        feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
         if config.method == "input-aware":
             sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
         else:

@@ -94,7 +94,7 @@ class Tune:
         console.print(f"wrote config.json, front.csv and front.png in {folder}; to train an observer with it:\n{again}")
         if self.check is not None:
             chosen = fronts[noise]
-            some = [chosen[len(chosen) // 2], *([chosen[-1]] if len(chosen) > 1 else []), *others]
+            some = [chosen[(len(chosen) - 1) // 2], *([chosen[-1]] if len(chosen) > 1 else []), *others]
             self._check(console, system, some, folder)
         return best
 
