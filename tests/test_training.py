@@ -486,6 +486,9 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
         np.testing.assert_array_equal(a, b)
     assert resumed.losses["inverse"][-1][0] == 400
     assert (whole.free is not None) == (method == "input-aware")
+    if whole.free:
+        for a, b in zip(whole.free.mlp.weights, resumed.artifact.free.mlp.weights, strict=True):
+            np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
         train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
     with pytest.raises(ValueError, match="--resume"):

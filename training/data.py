@@ -63,7 +63,7 @@ def record(
     excited: float = 0.0,
     push: float = 0.0,
 ) -> Trajectories:
-    """Simulate n trajectories from starts in the training box, under such random inputs if the filter takes any.
+    """Simulate n trajectories from starts in the training box, driven if the filter takes inputs.
 
     ``report`` is told how many there are so far; for the rest see :func:`trajectories`.
     """
