@@ -84,6 +84,8 @@ class Train:
     """A solved forward map holds along motions that start in this multiple of X."""
     physics_weight: Override[float] = None
     """Weight nu of the PDE residual (spinn)."""
+    disturbed: Override[float] = None
+    """Share of trajectories with process noise (input-aware)."""
     noise_max: Override[float] = None
     """Largest measurement noise to train for (input-aware)."""
     cap: Override[float] = None

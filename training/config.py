@@ -66,8 +66,15 @@ class Config:
     push: float = 0.0
     """A part of the free trajectories starts where inputs have led from X: constant ones up to this multiple of their
     bounds, for 20 s; or, if it is 0, random ones within their bounds, for 10 s."""
+    disturbed: float = 0.0
+    """Share of an input-aware map's trajectories with process noise, each at a level of its own up to the system's."""
     noise_max: float = 1.0
     """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
+    quiet: float = 0.2
+    """Share of an input-aware map's samples without measurement noise."""
+    emphasis: float = 2.0
+    """How much the others are about high levels of it: 1 draws the level evenly on a logarithmic scale over the two
+    decades below noise_max, higher values draw high ones more often, which are harder to learn."""
     truncation: float = 1e-6
     """epsilon in t*: what may be left of z0 where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop: int = 0
@@ -97,7 +104,7 @@ class Config:
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
         if self.pairs and self.features:
             raise ValueError(f"solving for the forward map (features) needs a diagonal A, without pairs = {self.pairs}")
-        for name in ("dt", "duration", "learning_rate", "noise_max", "truncation"):
+        for name in ("dt", "duration", "learning_rate", "noise_max", "emphasis", "truncation"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
         if self.cap is not None and not 0 < self.cap < np.inf:
@@ -112,6 +119,9 @@ class Config:
         for name in ("seed", "physics_weight", "push"):
             if not 0 <= getattr(self, name) < np.inf:
                 raise ValueError(f"{name} = {getattr(self, name)} must be finite and not negative")
+        for name in ("disturbed", "quiet"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must be a share between 0 and 1, got {getattr(self, name)!r}")
         for name in ("inputs", "free"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name} must be True or False, got {getattr(self, name)!r}")

@@ -62,6 +62,7 @@ def record(
     kinds: tuple[str, ...] = KINDS,
     excited: float = 0.0,
     push: float = 0.0,
+    disturbed: float = 0.0,
 ) -> Trajectories:
     """Simulate n trajectories from starts in the training box, driven if the filter takes inputs.
 
@@ -69,7 +70,7 @@ def record(
     """
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
-    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited, push):
+    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited, push, disturbed):
         xs.append(x[ages])
         zs.append(run_filter(linear, output(system, x), u, ages))
         report(sum(x.shape[1] for x in xs))
@@ -85,6 +86,7 @@ def trajectories(
     kinds: tuple[str, ...] = (),
     excited: float = 0.0,
     push: float = 0.0,
+    disturbed: float = 0.0,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """n trajectories from starts uniform in the training box, in chunks: states and inputs, (steps (+ 1), CHUNK, ...).
 
@@ -94,6 +96,7 @@ def trajectories(
     excited : share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
     push : these inputs are constant, up to so many times their bounds, for PUSH seconds; or, if it is 0, random ones
         within their bounds, for EXCITATION seconds.
+    disturbed : share of the trajectories with process noise, at any level up to the system's own.
     """
     kept = tried = 0
     while kept < n:
@@ -104,7 +107,11 @@ def trajectories(
             led = _led(system, x0[some], dt, rng, push)
             x0[some] = np.where(np.isfinite(led).all(-1)[:, None], led, x0[some])
         u = random_inputs(system, count, steps, dt, rng, kinds) if kinds else np.zeros((steps, count, 0))
-        x = simulate(system, x0, steps, dt, u=u if kinds else None)
+        w = None
+        if disturbed:
+            level = system.process_noise * np.where(rng.random(count) < disturbed, rng.random(count), 0.0)
+            w = level[:, None] * system.scale * rng.uniform(-1.0, 1.0, (steps, count, system.nx))
+        x = simulate(system, x0, steps, dt, u=u if kinds else None, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept += int(inside.sum())
         tried += count

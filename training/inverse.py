@@ -57,7 +57,9 @@ class TrajectorySampler:
     """Batches along trajectories: every age since reset, every noise level up to ``noise_max``.
 
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
-    that fits such data in the mean square is the conditional mean of x.
+    that fits such data in the mean square is the conditional mean of x. A share ``quiet`` of the samples has no noise;
+    of the others, levels cover two decades, and the part of these below a level, on their logarithmic scale, is drawn
+    as often as its length to the power ``emphasis`` says: high levels are harder to learn.
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
     into ``cells`` of like age and level, and the loss divides each by its cell's own recent error, so that all
@@ -65,7 +67,6 @@ class TrajectorySampler:
     """
 
     AGES_PER_BATCH = 32
-    QUIET = 0.2  # share of samples without any noise
     LEVELS = 6  # cells of noise level, the quiet one aside
     AGE_CELLS = 8
 
@@ -76,6 +77,8 @@ class TrajectorySampler:
         noise_max: float,
         batch: int,
         device: torch.device,
+        quiet: float = 0.2,
+        emphasis: float = 2.0,
     ) -> None:
         m, n, size = data.z.shape
         rows = np.random.default_rng(0).permutation(m * n)[:100_000]
@@ -84,6 +87,7 @@ class TrajectorySampler:
         self.x_offset = data.x.mean((0, 1))
         self.x_scale = data.x.std((0, 1))
         self.noise_max = noise_max
+        self._quiet, self._emphasis = quiet, emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
         self._per_age = batch // self.AGES_PER_BATCH
         self._modes = torch.empty((m, n, len(gain)), device=device)
@@ -109,8 +113,8 @@ class TrajectorySampler:
         ages = torch.randint(m, (self.AGES_PER_BATCH, 1), generator=generator, device=device)
         shape = (self.AGES_PER_BATCH, self._per_age)
         rows = torch.randint(n, shape, generator=generator, device=device)
-        position = (torch.rand(shape, generator=generator, device=device) - self.QUIET) / (1 - self.QUIET)
-        position = position.sign() * position.abs().sqrt()  # more of the high levels, which are harder to learn
+        position = (torch.rand(shape, generator=generator, device=device) - self._quiet) / (1 - self._quiet)
+        position = position.sign() * position.abs() ** (1 / self._emphasis)
         level = self.noise_max * 100 ** (position - 1)  # over two decades
         level = torch.where(position > 0, level, torch.zeros_like(level))[..., None]
         white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)

@@ -109,7 +109,12 @@ def train(
             def report(done: int) -> None:
                 progress.update(task, completed=done)
 
-            return record(system, into, config.trajectories, steps, ages, rng, report, **how)
+            disturbed = config.disturbed if config.method == "input-aware" else 0.0
+            return record(system, into, config.trajectories, steps, ages, rng, report, disturbed=disturbed, **how)
+
+        def sampled(motions: Trajectories, through: LinearFilter) -> TrajectorySampler:
+            noise = (config.noise_max, config.batch, device, config.quiet, config.emphasis)
+            return TrajectorySampler(motions, through, *noise)
 
         def fit(sampler: Sampler, stage: str) -> Network:
             inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
@@ -122,14 +127,14 @@ def train(
         if "free" in shares:
             unforced = make_filter(config.eigenvalues, system.ny, config.dt, 0, config.pairs)
             motions = simulated(unforced, f"{system.name}, free", excited=EXCITED, push=config.push)
-            own = TrajectorySampler(motions, unforced, config.noise_max, config.batch, device)
+            own = sampled(motions, unforced)
             free = own.inverse_map(fit(own, "free"), unforced)
             del motions, own
         data = simulated(linear, system.name, kinds=DRIVEN if free else KINDS)
         forward: ForwardMap | None = None
         sampler: Sampler
         if config.method == "input-aware":
-            sampler = TrajectorySampler(data, linear, config.noise_max, config.batch, device)
+            sampler = sampled(data, linear)
         else:
             x, z = data.x.reshape(-1, system.nx), data.z.reshape(-1, linear.size)
             if config.features:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +21,25 @@ TRAJECTORIES = 500  # of each training
 RUNS = 50  # on which its observer is measured
 
 
+def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
+    """Of a :class:`training.config.Config` for an observer with this spectrum at this noise: it is all about that."""
+    return {
+        "eigenvalues": spectrum.eigenvalues,
+        "pairs": spectrum.pairs,
+        "noise_max": max(measurement_noise, LEAST_NOISE),
+        "quiet": 0.05 if measurement_noise else 0.9,
+        "emphasis": 4.0,
+    }
+
+
 def trained_error(
     system: System, spectrum: Spectrum, measurement_noise: float, seconds: float, dt: float, duration: float
 ) -> float:
     """Median SMAPE in percent, over all steps, of an observer of free motion trained for so many CPU seconds."""
     config = replace(
         preset(system, "input-aware", "fast"),
-        eigenvalues=spectrum.eigenvalues,
-        pairs=spectrum.pairs,
+        **settings(spectrum, measurement_noise),
         inputs=False,
-        noise_max=max(measurement_noise, LEAST_NOISE),
         trajectories=TRAJECTORIES,
         dt=dt,
         duration=duration,

@@ -1,7 +1,7 @@
 """``kkl-gym tune``: a spectrum for a system and a noise level, and what others would have given."""
 
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +16,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from training.config import papers_spectrum, preset
 from training.files import write
-from training.tuning.check import LEAST_NOISE, rank_correlation, trained_error
+from training.tuning.check import rank_correlation, settings, trained_error
 from training.tuning.probe import Choice, Probe, Spectrum
 
 CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiples of the frequency of most of y's power
@@ -80,7 +80,7 @@ class Tune:
         if noise:
             table.add_row("–", f"{probe.least(noise):.3g}", "who knows the equations and all of y")
         console.print(table)
-        config = {**asdict(best.spectrum), "noise_max": max(noise, LEAST_NOISE), "dt": self.dt}
+        config = {**settings(best.spectrum, noise), "dt": self.dt}
         write(folder / "config.json", json.dumps(config, indent=2) + "\n")
         lines = [
             f"{level:g},{choice.kind},{choice.spectrum.modes},{choice.error:.6g}"
