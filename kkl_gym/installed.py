@@ -79,11 +79,16 @@ class Installed:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """x_hat or z as an observation: float32, within the space."""
-        out: np.ndarray = report["x_hat" if self.estimate == "x" else "z"].astype(np.float32)
-        np.maximum(out, self.space.low, out=out)
-        np.minimum(out, self.space.high, out=out)
-        return out
+        """What is shown of a report: x_hat or z."""
+        return report["x_hat" if self.estimate == "x" else "z"]
+
+
+def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
+    """Values as an observation: float32, within the space, which is of their shape."""
+    out: np.ndarray = values.astype(np.float32)
+    np.maximum(out, space.low, out=out)
+    np.minimum(out, space.high, out=out)
+    return out
 
 
 def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from kkl_gym.installed import Installed
+from kkl_gym.installed import Installed, observation
 from kkl_gym.plant import Plant
 from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes, with_mask
 
@@ -41,7 +41,7 @@ class Estimator(Protocol):
         ...
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The observations that a report makes."""
+        """What is shown of a report."""
         ...
 
 
@@ -64,8 +64,8 @@ class VectorEstimate(VectorWrapper):
         super().__init__(env)
         self._mode = _autoreset_mode(env)
         self._estimator = estimator
-        self.single_observation_space = estimator.space
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+        self.single_observation_space: gym.spaces.Box = estimator.space
+        self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=int)
 
@@ -123,7 +123,7 @@ class VectorEstimate(VectorWrapper):
         for key, values in first.items():
             final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
             info[key][ended] = values
-        shown[ended] = self._estimator.shown(first)
+        shown[ended] = observation(self._estimator.shown(first), self.single_observation_space)
         return shown
 
     def _check(self, expected: np.ndarray, seen: np.ndarray, ended: np.ndarray) -> None:
@@ -142,7 +142,7 @@ class VectorEstimate(VectorWrapper):
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
-        return self._estimator.shown(report)
+        return observation(self._estimator.shown(report), self.observation_space)
 
 
 class KKLVectorObservation(VectorEstimate):

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from kkl_gym.envs import TRAIL, KKLEnv
-from kkl_gym.installed import Installed
+from kkl_gym.installed import Installed, observation
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -100,7 +100,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             info["score"] = float(self.observer.score)
         if self.render_mode is not None:
             self._trail.append(x_hat.tolist())
-        return self._installed.shown(info)
+        return observation(self._installed.shown(info), self._installed.space)
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):

@@ -13,6 +13,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 import training.optimise
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
+from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver, LinearFilter
 from training import errors, preset, smape, train, unseen_runs
 from training.config import Config, override, spectrum
@@ -92,6 +93,17 @@ def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     assert 5 < (~inside[:200]).sum() < 150
     (x, _), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), excited=0.5)
     assert np.isfinite(x).all()
+
+
+def test_a_share_of_the_trajectories_is_disturbed():
+    system, n, steps, dt = VanDerPol(), 400, 50, 0.01
+    (x, u), *_ = trajectories(system, n, steps, dt, np.random.default_rng(0), ("steps",), disturbed=0.25)
+    undisturbed = simulate(system, x[0], steps, dt, u=u)
+    apart = np.abs(x - undisturbed).max((0, 2))
+    assert (apart > 0).mean() == pytest.approx(0.25, abs=0.06)
+    reach = system.process_noise * max(system.scale) * steps * dt
+    assert apart.max() < 3 * reach
+    assert len(np.unique(apart[apart > 0])) == (apart > 0).sum()
 
 
 def test_recording_ages_cover_start_transient_and_end():
@@ -189,9 +201,21 @@ def test_batches_cover_quiet_and_loud(sampler):
     assert cell.max() < sampler.cells
 
 
+@pytest.mark.parametrize(("quiet", "emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.5, 4.0), (1.0, 2.0)])
+def test_how_often_batches_hold_each_noise_level(sampler, quiet, emphasis):
+    _, data, linear = sampler
+    inputs, *_ = TrajectorySampler(data, linear, 0.5, 32_768, CPU, quiet, emphasis)(torch.Generator().manual_seed(0))
+    assert torch.isfinite(inputs).all()
+    level = (NOISE_UNIT * torch.expm1(inputs[:, -2].double())).numpy()
+    assert (level == 0).mean() == pytest.approx(quiet, abs=0.01)
+    for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
+        expected = quiet + (1 - quiet) * (1 + np.log10(below / 0.5) / 2) ** emphasis
+        assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
+
+
 def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypatch):
     sampler, data, linear = sampler
-    monkeypatch.setattr(sampler, "QUIET", 0.0)
+    monkeypatch.setattr(sampler, "_quiet", 0.0)
     zeros, generator = torch.zeros_like(sampler._modes), torch.Generator().manual_seed(0)
     monkeypatch.setattr(sampler, "_modes", zeros)  # what is left in the inputs is noise
     gain = sampler.coordinates.noise_gain
@@ -214,7 +238,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
 
 def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
     sampler, data, linear = sampler
-    monkeypatch.setattr(sampler, "QUIET", 1.0 - 1e-6)
+    monkeypatch.setattr(sampler, "_quiet", 1.0 - 1e-6)
     inputs, x, _, _ = sampler(torch.Generator().manual_seed(0))
     network = Network(inputs.shape[1], 2, 8, 1, "tanh")
     artifact = Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
@@ -619,6 +643,9 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
         ({"noise_max": float("nan")}, "noise_max"),
+        ({"disturbed": 1.5}, "share"),
+        ({"quiet": float("nan")}, "share"),
+        ({"emphasis": 0.0}, "emphasis"),
         ({"closed_loop": 5}, "closed_loop"),
     ],
 )
