@@ -158,7 +158,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "van_der_pol": {
         "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),
         "push": 4.0,
-        "disturbed": 0.2,
+        "disturbed": 0.1,
         "quiet": 0.05,
         "emphasis": 4.0,
         "inverse_steps": 24000,
