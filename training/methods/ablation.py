@@ -17,8 +17,9 @@ from training.tuning import Probe, Spectrum
 FEATURES = 1500
 NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
 TUNED_FOR = 0.5
-# How inverses were trained before SOAP: by Adam, one for free and driven motion.
-EARLIER: dict[str, Any] = {"optimiser": "adam", "batch": 4096, "learning_rate": 8e-3, "free": False}
+# How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
+TOGETHER: dict[str, Any] = {"free": False, "disturbed": 0.0, "quiet": 0.2, "emphasis": 2.0}
+EARLIER: dict[str, Any] = {**TOGETHER, "optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
 
 
 class Ablation(KKLMethod):
@@ -91,14 +92,17 @@ class MoreModes(Ablation):
 
 
 class BySOAP(Ablation):
-    """The same by SOAP; the default has an inverse of its own for free motion beside."""
+    """The same by SOAP.
+
+    The default has an inverse of its own for free motion beside, and for some systems samples of its own.
+    """
 
     name: ClassVar[str] = "ablation-soap"
     label: ClassVar[str] = "... by SOAP"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """One map for free and driven motion."""
-        return {"free": False}
+        return TOGETHER
 
 
 class Tuned(Ablation):
