@@ -71,7 +71,8 @@ class Tune:
                 fronts[level] = probe.choose(level, self.modes)
         with console.status("comparing others"):
             others = _others(probe, system, noise, self.modes)
-        best = min([fronts[noise][-1], *others], key=lambda choice: choice.error)
+        small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
+        best = min(small, key=lambda choice: choice.error)
 
         table = Table("modes", "predicted error in %", "", title=f"{system.name}, measurement noise {noise:g}")
         for choice in [*fronts[noise], *others]:
@@ -119,10 +120,10 @@ class Tune:
 
 
 def _others(probe: Probe, system: System, noise: float, most: int) -> list[Choice]:
-    """The package's default, the paper's, and Bessel filters."""
+    """The package's default and the paper's, whatever their size, and Bessel filters of at most so many modes."""
     default = preset(system, "input-aware", "fast")
     named = {"default": Spectrum(default.eigenvalues, default.pairs), "paper's": Spectrum(papers_spectrum(system))}
-    found = [Choice(one, probe.error(one, noise), kind) for kind, one in named.items() if one.modes <= most]
+    found = [Choice(one, probe.error(one, noise), kind) for kind, one in named.items()]
     orders = [order for order in (system.nx + 1, 2 * system.nx + 1, 4 * system.nx + 1) if order <= most]
     if not len(probe.frequencies):  # y does not move
         return found
