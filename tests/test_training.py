@@ -11,7 +11,9 @@ from rich.progress import Progress
 from scipy.integrate import solve_ivp
 from torch.utils.tensorboard import SummaryWriter
 
+import training.data
 import training.optimise
+import training.pipeline
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, KKLObserver, LinearFilter
@@ -95,15 +97,51 @@ def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     assert np.isfinite(x).all()
 
 
-def test_a_share_of_the_trajectories_is_disturbed():
-    system, n, steps, dt = VanDerPol(), 400, 50, 0.01
-    (x, u), *_ = trajectories(system, n, steps, dt, np.random.default_rng(0), ("steps",), disturbed=0.25)
-    undisturbed = simulate(system, x[0], steps, dt, u=u)
-    apart = np.abs(x - undisturbed).max((0, 2))
-    assert (apart > 0).mean() == pytest.approx(0.25, abs=0.06)
-    reach = system.process_noise * max(system.scale) * steps * dt
-    assert apart.max() < 3 * reach
-    assert len(np.unique(apart[apart > 0])) == (apart > 0).sum()
+def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
+    system, n, seen = VanDerPol(), 400, []
+
+    def spy(*arguments, w, **named):
+        seen.append(w)
+        return simulate(*arguments, w=w, **named)
+
+    monkeypatch.setattr(training.data, "simulate", spy)
+    (x, u), *_ = trajectories(system, n, 50, 0.01, np.random.default_rng(0), ("steps",), disturbed=0.25)
+    (w,) = seen
+    assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
+    relative = w / (system.process_noise * np.array(system.scale))
+    largest = np.abs(relative).max((0, 2))  # of 100 numbers, all but the level of a run
+    assert (largest > 0).mean() == pytest.approx(0.25, abs=0.06)
+    assert np.quantile(largest[largest > 0], [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.12)
+    assert largest.max() <= 1.0
+    assert np.abs(relative.mean((0, 1))).max() < 0.01
+    assert relative.std((0, 1)) == pytest.approx(relative.std(), rel=0.03)  # each component by its own scale
+
+
+def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
+    class ReachedError(Exception):
+        pass
+
+    seen = {}
+
+    def note(name):
+        def spy(*arguments, disturbed=None, **named):
+            seen[name] = disturbed if name == "record" else arguments[2:]
+            if name == "record":
+                return record(*arguments, disturbed=disturbed, **named)
+            raise ReachedError
+
+        return spy
+
+    monkeypatch.setattr(training.pipeline, "record", note("record"))
+    monkeypatch.setattr(training.pipeline, "TrajectorySampler", note("sampler"))
+    small = {"trajectories": 5, "duration": 1.0, "samples": 10, "disturbed": 0.5, "quiet": 0.3, "emphasis": 3.0}
+    config = replace(preset(VanDerPol(), "input-aware", "fast"), **small)
+    with pytest.raises(ReachedError):
+        train(VanDerPol(), config, tmp_path / "aware", device=CPU)
+    assert seen == {"record": 0.5, "sampler": (1.0, 1024, CPU, 0.3, 3.0)}
+    spinn = replace(preset(VanDerPol(), "spinn", "fast"), disturbed=0.5, trajectories=5, duration=20.0, forward_steps=1)
+    train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
+    assert seen["record"] == 0.0
 
 
 def test_recording_ages_cover_start_transient_and_end():
@@ -201,7 +239,7 @@ def test_batches_cover_quiet_and_loud(sampler):
     assert cell.max() < sampler.cells
 
 
-@pytest.mark.parametrize(("quiet", "emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.5, 4.0), (1.0, 2.0)])
+@pytest.mark.parametrize(("quiet", "emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.5, 4.0), (1.0, 2.0), (0.0, 1e-3)])
 def test_how_often_batches_hold_each_noise_level(sampler, quiet, emphasis):
     _, data, linear = sampler
     inputs, *_ = TrajectorySampler(data, linear, 0.5, 32_768, CPU, quiet, emphasis)(torch.Generator().manual_seed(0))

@@ -1,7 +1,7 @@
 """Choosing a spectrum, against closed forms on a linear system."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import load
 from training.cli import main
-from training.config import override, preset, read_changes
+from training.config import Config, override, preset, read_changes
 from training.data import output, run_filter
 from training.derivatives import with_sensitivity
 from training.methods.kalman import ExtendedKalmanFilter
@@ -43,7 +43,7 @@ def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, mo
     monkeypatch.setattr(training.tuning.probe, "RESOLUTION", 0.0)
     rng, n, sigma = np.random.default_rng(0), 8000, 0.4
     flow = expm(np.array([[0.0, 0.01], [-0.01, 0.0]]))
-    x = [rng.normal(size=(n, 2)) / np.sqrt(probe.start)]
+    x = [rng.normal(size=(n, 2)) / np.sqrt(probe._known)]
     for _ in range(600):
         x.append(x[-1] @ flow.T)
     y = output(probe.system, np.array(x)) + sigma * rng.normal(size=(601, n, 1))
@@ -59,7 +59,7 @@ def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, mo
 
 def test_the_least_error_is_that_of_a_kalman_filter(probe):
     kalman = ExtendedKalmanFilter(
-        probe.system, 0.01, np.zeros((2, 2)), 0.09 * np.eye(1), np.zeros(2), np.diag(1 / probe.start)
+        probe.system, 0.01, np.zeros((2, 2)), 0.09 * np.eye(1), np.zeros(2), np.diag(1 / probe._known)
     )
     kalman.reset(probe.y[0])
     P = [kalman.P[0]]
@@ -164,7 +164,7 @@ def test_an_output_that_does_not_move_leaves_the_start_unknown():
     assert only.error == pytest.approx(
         relative(
             probe,
-            np.array([expm(age * 0.01 * F) @ np.diag(1 / probe.start) @ expm(age * 0.01 * F).T for age in probe.ages]),
+            np.array([expm(age * 0.01 * F) @ np.diag(1 / probe._known) @ expm(age * 0.01 * F).T for age in probe.ages]),
         ),
         rel=1e-4,
     )
@@ -175,7 +175,7 @@ def test_chaotic_motions_are_followed_as_far_as_numbers_go():
     probe = Probe(get_system("lorenz"), dt=0.02, duration=20.0, motions=2)
     assert 1e4 < np.abs(probe.Phi).max() < 1e5
     assert len(probe.x) < 900
-    P, nx = np.broadcast_to(np.diag(1 / probe.start), (2, 3, 3)), 3
+    P, nx = np.broadcast_to(np.diag(1 / probe._known), (2, 3, 3)), 3
     H, R, left = np.array([[0.0, 1.0, 0.0]]), 0.25, []
     for k in range(len(probe.x)):
         if k:
@@ -200,6 +200,8 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
         assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
     assert chosen["0"]["eigenvalues"] != chosen["0.5"]["eigenvalues"]
     assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 0.5)
+    assert (chosen["0"]["quiet"], chosen["0.5"]["quiet"]) == (0.9, 0.05)
+    assert chosen["0"]["emphasis"] == chosen["0.5"]["emphasis"] == 4.0
     small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]
     config = ["--config", str(tmp_path / "0.5" / "config.json"), "--no-monitor", "--out", str(tmp_path / "run")]
     main(["train", system, *config, *small, "--batch", "64"])
@@ -255,11 +257,14 @@ def test_settings_of_the_first_version_of_the_maps_are_still_known():
     file = Path(training.__file__).with_name("version1.json")
     config = override(preset(get_system("van_der_pol"), "input-aware", "fast"), read_changes(file))
     made = load("van_der_pol-v1").artifact.training
-    assert {name: value for name, value in asdict(config).items() if name in made} == {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in made.items()
-        if name in asdict(config)
-    }
+    now = asdict(config)
+    for name, value in made.items():
+        if name in now:
+            assert now[name] == (tuple(value) if isinstance(value, list) else value), name
+    # What had no setting then was as the defaults are, but for one map of free and driven motion.
+    later = {entry.name: entry.default for entry in fields(Config) if entry.name not in made} | {"free": False}
+    assert {"quiet", "emphasis", "disturbed", "push", "pairs", "optimiser"} <= set(later)
+    assert {name: now[name] for name in later} == later
 
 
 def test_a_file_of_settings(tmp_path):

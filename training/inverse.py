@@ -58,8 +58,8 @@ class TrajectorySampler:
 
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
     that fits such data in the mean square is the conditional mean of x. A share ``quiet`` of the samples has no noise;
-    of the others, levels cover two decades, and the part of these below a level, on their logarithmic scale, is drawn
-    as often as its length to the power ``emphasis`` says: high levels are harder to learn.
+    of the others a share p ** ``emphasis`` lies below the level at p of the way, on a logarithmic scale, along the two
+    decades up to ``noise_max``: high levels are harder to learn.
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
     into ``cells`` of like age and level, and the loss divides each by its cell's own recent error, so that all
@@ -114,9 +114,10 @@ class TrajectorySampler:
         shape = (self.AGES_PER_BATCH, self._per_age)
         rows = torch.randint(n, shape, generator=generator, device=device)
         position = (torch.rand(shape, generator=generator, device=device) - self._quiet) / (1 - self._quiet)
-        position = position.sign() * position.abs() ** (1 / self._emphasis)
+        loud = position > 0
+        position = position.clamp(min=0.0) ** (1 / self._emphasis)
         level = self.noise_max * 100 ** (position - 1)  # over two decades
-        level = torch.where(position > 0, level, torch.zeros_like(level))[..., None]
+        level = torch.where(loud, level, torch.zeros_like(level))[..., None]
         white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)
         noise = white @ self._noise_root[ages[:, 0]].mT
         modes = self._modes[ages, rows] + level * self._gain * noise
@@ -124,7 +125,7 @@ class TrajectorySampler:
         conditions = [torch.log1p(level / NOISE_UNIT)]
         conditions.append(torch.log1p(self._age[ages].clamp(max=self.age_max) / AGE_UNIT)[..., None].expand_as(level))
         inputs = torch.cat([modes, *conditions], -1)
-        level_cell = torch.where(position > 0, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
+        level_cell = torch.where(loud, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
         cell = self._age_cell[ages] * (1 + self.LEVELS) + level_cell
         batch = self.AGES_PER_BATCH * self._per_age
         return (

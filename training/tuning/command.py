@@ -1,7 +1,7 @@
 """``kkl-gym tune``: a spectrum for a system and a noise level, and what others would have given."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -26,8 +26,9 @@ CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiple
 class Tune:
     """Choose the modes of A for a system and a noise level, by the error that is predicted without training.
 
-    Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`, front.csv and front.png: predicted error
-    against the number of modes, for this noise and others. docs/tuning.md says what the prediction rests on.
+    Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`: the real modes of the system's default and what
+    adds most to them. front.csv and front.png show the predicted error against the number of modes chosen anew, for
+    this noise and others. docs/tuning.md says what the prediction rests on.
     """
 
     system: tyro.conf.Positional[str]
@@ -35,7 +36,8 @@ class Tune:
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y."""
     modes: int = 21
-    """Most modes for each output. They cost time in every step, and training."""
+    """Most modes for each output. They cost time in every step, and training. Below the number of the default's real
+    ones, all are chosen anew."""
     dt: float = 0.01
     """Sampling interval in seconds."""
     duration: float = 50.0
@@ -61,18 +63,23 @@ class Tune:
         system = get_system(self.system, self.parameters)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
         folder = self.out or Path("tuning") / f"{system.name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
+        start = Spectrum(preset(system, "input-aware", "fast").eigenvalues)
         with console.status(f"following motions of {system.name}"):
-            probe = Probe(system, self.dt, self.duration, seed=self.seed)
+            probe = Probe(system, self.dt, self.duration, seed=self.seed, start=start)
         noise = self.measurement_noise
         levels = sorted({0.0, noise, noise / 5 if noise else 0.1, 2 * noise if noise else 0.5})
         fronts = {}
         for level in levels:
             with console.status(f"choosing modes for noise {level:g}"):
-                fronts[level] = probe.choose(level, self.modes)
+                fronts[level] = probe.choose(level, self.modes, anew=True)
         with console.status("comparing others"):
             others = _others(probe, system, noise, self.modes)
-        small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
-        best = min(small, key=lambda choice: choice.error)
+        if start.modes <= self.modes:
+            best = replace(probe.choose(noise, self.modes)[-1], kind="default's real ones and more")
+            others.insert(0, best)
+        else:
+            small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
+            best = min(small, key=lambda choice: choice.error)
 
         table = Table("modes", "predicted error in %", "", title=f"{system.name}, measurement noise {noise:g}")
         for choice in [*fronts[noise], *others]:
@@ -141,7 +148,7 @@ def _draw(
         points = np.array([[choice.spectrum.modes, choice.error] for choice in choices])
         left.semilogy(*points.T, "o-", color=f"C{i}", ms=3, lw=2 if level == noise else 1, label=f"noise {level:g}")
     color = f"C{list(fronts).index(noise)}"
-    for kind, marker in (("default", "s"), ("paper's", "^"), ("Bessel", "x")):
+    for kind, marker in (("default's real ones and more", "*"), ("default", "s"), ("paper's", "^"), ("Bessel", "x")):
         points = np.array([[choice.spectrum.modes, choice.error] for choice in others if choice.kind == kind])
         if len(points):
             left.semilogy(*points.T, marker, color=color, ms=7, mfc="none", label=f"{kind}, noise {noise:g}")

@@ -74,6 +74,7 @@ class Probe:
     system : any system; its input is zero here.
     dt, duration : in seconds; duration is that of the runs over which the error is averaged.
     motions, seed : number and seed of their starts.
+    start : modes to choose more to, beside the library.
 
     Raises
     ------
@@ -85,6 +86,7 @@ class Probe:
     duration: float = 50.0
     motions: int = 40
     seed: int = 0
+    start: Spectrum = Spectrum()
     _of_library: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -114,14 +116,14 @@ class Probe:
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
         self.y = output(system, self.x)
         self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
-        self.start = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
+        self._known = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
         self.ages = np.unique(np.concatenate([early, late])).astype(int)
         self.share = np.gradient(self.ages.astype(float))
         second_half = np.where(self.ages > end / 2, self.share, 0.0)  # what comes later is like it
         self.share += second_half / second_half.sum() * max(0, steps - (end - 1))
         self.share /= self.share.sum()
-        self._of_library = self.response(self.library)
+        self._of_library = self.response(self.start + self.library)
 
     @cached_property
     def library(self) -> Spectrum:
@@ -173,7 +175,7 @@ class Probe:
 
     def _relative(self, information: np.ndarray) -> float:
         """The mean error in percent, from what is known of the start beside X: (ages, motions, nx, nx)."""
-        left = self.Phi[self.ages] @ _inverse_root(information + np.diag(self.start))
+        left = self.Phi[self.ages] @ _inverse_root(information + np.diag(self._known))
         size = np.linalg.norm(self.x[self.ages], axis=-1)
         relative = np.linalg.norm(left, axis=(-2, -1)) / np.maximum(size, SMALLEST * size.max())
         found = float(100.0 * self.share @ np.minimum(relative, 2.0).mean(1))
@@ -181,26 +183,36 @@ class Probe:
             raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
         return found
 
-    def choose(self, measurement_noise: float, most: int = 21) -> list[Choice]:
+    def choose(self, measurement_noise: float, most: int = 21, anew: bool = False) -> list[Choice]:
         """Spectra of more and more modes, each the one before and the mode, or pair, of the library that helps most.
 
-        It ends at ``most`` modes, or where none lowers the error by LEAST_GAIN; there is at least one. With several
-        outputs, each has all.
+        The first is ``start``, unless there is none or ``anew``. It ends at ``most`` modes, or where none lowers the
+        error by LEAST_GAIN; there is at least one. With several outputs, each has all.
         """
         z, Z, P = self._of_library
-        real, pairs, ny = self.library.eigenvalues, self.library.pairs, self.system.ny
-        size = self.library.modes
-        parts = [(Spectrum((value,)), [i]) for i, value in enumerate(real)]
-        parts += [(Spectrum((), (pair,)), [len(real) + 2 * i, len(real) + 2 * i + 1]) for i, pair in enumerate(pairs)]
+        ny, everything = self.system.ny, self.start + self.library
+        size, n = everything.modes, len(everything.eigenvalues)
+        parts = [(Spectrum((value,)), [i]) for i, value in enumerate(everything.eigenvalues)]
+        parts += [(Spectrum((), (pair,)), [n + 2 * i, n + 2 * i + 1]) for i, pair in enumerate(everything.pairs)]
+        first = [*range(len(self.start.eigenvalues)), *range(n, n + 2 * len(self.start.pairs))]
+        given = {*self.start.eigenvalues, *self.start.pairs}  # none of them twice
+        parts = [part for part in parts if given.isdisjoint((*part[0].eigenvalues, *part[0].pairs))]
+
+        def error_of(columns: list[int]) -> float:
+            taken = np.add.outer(size * np.arange(ny), columns).ravel()
+            return self._error(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
+
         chosen, columns, found = Spectrum(), list[int](), list[Choice]()
         before = self._relative(np.zeros(self.Phi[self.ages].shape))
+        if first and not anew:
+            chosen, columns, before = self.start, first, error_of(first)
+            found.append(Choice(chosen, before))
         while True:
             tried = []
             for spectrum, own in parts:
                 if chosen.modes + spectrum.modes > most or own[0] in columns:
                     continue
-                taken = np.add.outer(size * np.arange(ny), [*columns, *own]).ravel()
-                error = self._error(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
+                error = error_of([*columns, *own])
                 tried.append((np.log(before / error) / spectrum.modes, error, spectrum, own))
             if not tried:
                 return found
