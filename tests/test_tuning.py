@@ -1,7 +1,8 @@
 """Choosing a spectrum, against closed forms on a linear system."""
 
 import json
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -208,6 +209,28 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
     described = json.loads((tmp_path / "run" / "config.json").read_text())
     assert described["pairs"] == [list(pair) for pair in chosen["0.5"]["pairs"]]
     assert described["width"] == 8
+
+
+def test_choices_begin_with_given_modes(probe):
+    given = Spectrum(probe.library.eigenvalues[:2], probe.library.pairs[:1])
+    begun = replace(probe, start=given)
+    found = begun.choose(0.5, most=8)
+    assert found[0].spectrum == given
+    assert found[0].error == pytest.approx(probe.error(given, 0.5), rel=1e-6)
+    for before, after in pairwise(found):
+        assert after.error < before.error
+        assert after.spectrum.eigenvalues[:2] == given.eigenvalues
+        assert len(set(after.spectrum.poles)) == after.spectrum.modes  # none twice
+    assert 4 < found[-1].spectrum.modes <= 8
+    anew = begun.choose(0.5, most=8, anew=True)
+    assert [choice.spectrum for choice in anew] == [choice.spectrum for choice in probe.choose(0.5, most=8)]
+
+
+def test_what_is_written_begins_with_the_default(tmp_path):
+    system = str(Path(__file__).with_name("linear_system.py")) + ":Oscillator"
+    main(["tune", system, "--duration", "4", "--modes", "15", "--out", str(tmp_path)])
+    default = preset(Oscillator(), "input-aware", "fast").eigenvalues
+    assert read_changes(tmp_path / "config.json")["eigenvalues"][: len(default)] == default
 
 
 def test_predictions_are_compared_with_trained_observers(tmp_path, capsys, monkeypatch):

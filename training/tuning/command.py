@@ -26,9 +26,9 @@ CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiple
 class Tune:
     """Choose the modes of A for a system and a noise level, by the error that is predicted without training.
 
-    Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`: the real modes of the system's default and what
-    adds most to them. front.csv and front.png show the predicted error against the number of modes chosen anew, for
-    this noise and others. docs/tuning.md says what the prediction rests on.
+    Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`: the real modes of the system's default and
+    what adds most to them. front.csv and front.png show the predicted error against the number of modes chosen anew,
+    for this noise and others. docs/tuning.md says what the prediction rests on.
     """
 
     system: tyro.conf.Positional[str]

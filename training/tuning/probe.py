@@ -195,8 +195,7 @@ class Probe:
         parts = [(Spectrum((value,)), [i]) for i, value in enumerate(everything.eigenvalues)]
         parts += [(Spectrum((), (pair,)), [n + 2 * i, n + 2 * i + 1]) for i, pair in enumerate(everything.pairs)]
         first = [*range(len(self.start.eigenvalues)), *range(n, n + 2 * len(self.start.pairs))]
-        given = {*self.start.eigenvalues, *self.start.pairs}  # none of them twice
-        parts = [part for part in parts if given.isdisjoint((*part[0].eigenvalues, *part[0].pairs))]
+        parts = [part for part in parts if part[1][0] not in first]
 
         def error_of(columns: list[int]) -> float:
             taken = np.add.outer(size * np.arange(ny), columns).ravel()
@@ -207,6 +206,8 @@ class Probe:
         if first and not anew:
             chosen, columns, before = self.start, first, error_of(first)
             found.append(Choice(chosen, before))
+            given = {*chosen.eigenvalues, *chosen.pairs}  # none of them twice
+            parts = [part for part in parts if given.isdisjoint((*part[0].eigenvalues, *part[0].pairs))]
         while True:
             tried = []
             for spectrum, own in parts:
