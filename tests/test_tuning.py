@@ -200,7 +200,7 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
         chosen[noise] = read_changes(folder / "config.json")
         assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
     assert chosen["0"]["eigenvalues"] != chosen["0.5"]["eigenvalues"]
-    assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 0.5)
+    assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 2.0)
     assert (chosen["0"]["quiet"], chosen["0.5"]["quiet"]) == (0.9, 0.05)
     assert chosen["0"]["emphasis"] == chosen["0.5"]["emphasis"] == 4.0
     small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]

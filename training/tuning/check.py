@@ -17,16 +17,17 @@ from training.pipeline import train
 from training.tuning.probe import Spectrum
 
 LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
+HEADROOM = 4.0  # of the noise that a map is trained for over the noise that is expected: it does better so
 TRAJECTORIES = 500  # of each training
 RUNS = 50  # on which its observer is measured
 
 
 def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
-    """Of a :class:`training.config.Config` for an observer with this spectrum at this noise: it is all about that."""
+    """Those of a :class:`training.config.Config` that make an observer with this spectrum for this noise."""
     return {
         "eigenvalues": spectrum.eigenvalues,
         "pairs": spectrum.pairs,
-        "noise_max": max(measurement_noise, LEAST_NOISE),
+        "noise_max": max(HEADROOM * measurement_noise, LEAST_NOISE),
         "quiet": 0.05 if measurement_noise else 0.9,
         "emphasis": 4.0,
     }
