@@ -113,8 +113,9 @@ def train(
             return record(system, into, config.trajectories, steps, ages, rng, report, disturbed=disturbed, **how)
 
         def sampled(motions: Trajectories, through: LinearFilter) -> TrajectorySampler:
-            noise = (config.noise_max, config.batch, device, config.quiet, config.emphasis)
-            return TrajectorySampler(motions, through, *noise)
+            return TrajectorySampler(
+                motions, through, config.noise_max, config.batch, device, config.quiet, config.emphasis
+            )
 
         def fit(sampler: Sampler, stage: str) -> Network:
             inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]

@@ -106,13 +106,13 @@ class BySOAP(Ablation):
 
 
 class Tuned(Ablation):
-    """The default with the complex modes that are chosen for the system and a noise level of 0.5."""
+    """The default with modes chosen anew for the system and a noise level of 0.5."""
 
     name: ClassVar[str] = "ablation-tuned"
     label: ClassVar[str] = "... tuned spectrum"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """The modes that ``kkl-gym tune`` chooses."""
+        """The last of the spectra that ``kkl-gym tune`` shows as chosen; what it writes begins with the default's."""
         spectrum = tuned_spectrum(task.system, task.budget.dt, task.budget.duration)
         return {"eigenvalues": spectrum.eigenvalues, "pairs": spectrum.pairs}
 

@@ -19,6 +19,7 @@ from training.files import write
 from training.tuning.check import rank_correlation, settings, trained_error
 from training.tuning.probe import Choice, Probe, Spectrum
 
+EXTENDED = "default's real ones and more"
 CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiples of the frequency of most of y's power
 
 
@@ -75,7 +76,7 @@ class Tune:
         with console.status("comparing others"):
             others = _others(probe, system, noise, self.modes)
         if start.modes <= self.modes:
-            best = replace(probe.choose(noise, self.modes)[-1], kind="default's real ones and more")
+            best = replace(probe.choose(noise, self.modes)[-1], kind=EXTENDED)
             others.insert(0, best)
         else:
             small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
@@ -148,7 +149,7 @@ def _draw(
         points = np.array([[choice.spectrum.modes, choice.error] for choice in choices])
         left.semilogy(*points.T, "o-", color=f"C{i}", ms=3, lw=2 if level == noise else 1, label=f"noise {level:g}")
     color = f"C{list(fronts).index(noise)}"
-    for kind, marker in (("default's real ones and more", "*"), ("default", "s"), ("paper's", "^"), ("Bessel", "x")):
+    for kind, marker in ((EXTENDED, "*"), ("default", "s"), ("paper's", "^"), ("Bessel", "x")):
         points = np.array([[choice.spectrum.modes, choice.error] for choice in others if choice.kind == kind])
         if len(points):
             left.semilogy(*points.T, marker, color=color, ms=7, mfc="none", label=f"{kind}, noise {noise:g}")
