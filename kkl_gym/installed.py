@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
 from observers import KKLObserver, load, shipped
 
@@ -84,11 +85,8 @@ class Installed:
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values as an observation: float32, within the space, which is of their shape."""
-    out: np.ndarray = values.astype(np.float32)
-    np.maximum(out, space.low, out=out)
-    np.minimum(out, space.high, out=out)
-    return out
+    """Values, one row or many, (..., width), as observations of a row's space: float32, within its bounds."""
+    return clipped(values, space.low, space.high)
 
 
 def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:

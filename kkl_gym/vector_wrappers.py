@@ -91,19 +91,20 @@ class VectorEstimate(VectorWrapper):
             self._ended = ended
         elif ended.any():
             return self._show_and_restart(info, ended), reward, terminated, truncated, info
+        y, u = info["y"], info.get("u")  # no u: every row was reset
+        disabled = self._mode is AutoresetMode.DISABLED
         expected = self._sample + 1
-        if self._mode is AutoresetMode.NEXT_STEP:
-            expected[before] = 0
-        else:
-            expected -= before  # DISABLED: rows that have ended stay as they are
+        over = bool(before.any())
+        if over:  # rows that this step has reset, or that stay at their end
+            expected[before] = self._sample[before] if disabled else 0
+            u = None if u is None else np.where(before[:, None], 0.0, u)
         self._check(expected, info["sample"], before)
-        u = np.where(before[:, None], 0.0, info["u"]) if "u" in info else None  # None: every row was reset
-        if self._mode is AutoresetMode.DISABLED and before.any():
-            self._estimator.advance(info["y"], u, ~before)
+        if over and disabled:
+            self._estimator.advance(y, u, ~before)
         else:
-            self._estimator.advance(info["y"], u)
-            if before.any():
-                self._estimator.restart(info["y"][before], before)
+            self._estimator.advance(y, u)
+            if over:
+                self._estimator.restart(y[before], before)
         self._sample = expected
         return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
 
@@ -142,7 +143,7 @@ class VectorEstimate(VectorWrapper):
         report = self._estimator.report()
         for key, values in report.items():
             info |= {key: values, f"_{key}": rows.copy()}
-        return observation(self._estimator.shown(report), self.observation_space)
+        return observation(self._estimator.shown(report), self.single_observation_space)
 
 
 class KKLVectorObservation(VectorEstimate):

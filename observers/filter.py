@@ -1,6 +1,10 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
+import functools
+
 import numpy as np
+
+from observers.compiled import MANY_ROWS, SparseUpdate
 
 
 class LinearFilter:
@@ -61,7 +65,8 @@ class LinearFilter:
         self.late_y = acts_on_z_y(function_of_A(late) @ B)
         self.held_u = np.kron(np.eye(blocks, nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
         self.equilibrium = acts_on_z_y(-np.linalg.solve(A, B))
-        self._update = np.hstack([self.transition, self.early_y, self.held_u, self.late_y]).T.copy()
+        self._drive = np.hstack([self.early_y, self.held_u, self.late_y]).T.copy()
+        self._update = np.vstack([self.transition.T, self._drive])
 
     @property
     def size(self) -> int:
@@ -76,7 +81,17 @@ class LinearFilter:
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """The state one sample later.
 
-        z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them.
+        z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them. A batch
+        (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
         """
+        if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
+            return self._compiled(z, np.concatenate((y, u, y_next), axis=-1))
         z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
         return z_next
+
+    @functools.cached_property
+    def _compiled(self) -> SparseUpdate | None:
+        try:
+            return SparseUpdate(self.transition, self._drive)
+        except (ImportError, ValueError):
+            return None

@@ -1,9 +1,13 @@
+import sys
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+import observers.compiled
 from observers import LinearFilter
+from observers.compiled import MANY_ROWS
 
 DIAGONAL = -np.diag([0.5, 2.0, 7.0])
 PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])
@@ -94,6 +98,50 @@ def test_batched_equals_looped(A, nu, batch):
     for index in np.ndindex(*batch):
         one = run(linear, y[(slice(None), *index)], u[(slice(None), *index)])
         assert np.allclose(z[(slice(None), *index)], one, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("A", [DIAGONAL, np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.0], [0.0, 0.0, -3.0]])])
+@pytest.mark.parametrize("ny", [1, 2])
+@pytest.mark.parametrize("nu", [0, 1, 2])
+def test_a_large_batch_equals_its_rows(A, ny, nu):
+    """Compiled, for 2 to 6 terms beside z."""
+    linear = random_filter(A, ny, nu)
+    y, u = signals(linear, 3, MANY_ROWS)
+    z = run(linear, y, u)
+    assert linear._compiled is not None
+    for row in range(MANY_ROWS):
+        assert np.allclose(z[:, row], run(linear, y[:, row], u[:, row]), rtol=1e-13, atol=1e-14)
+
+
+def test_a_large_batch_without_numba(monkeypatch):
+    linear, other = random_filter(PAIR), random_filter(PAIR)
+    y, u = signals(linear, 3, MANY_ROWS)
+    expected = run(linear, y, u)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    observers.compiled._kernel.cache_clear()
+    assert np.allclose(run(other, y, u), expected, rtol=1e-13, atol=1e-14)
+    assert other._compiled is None
+
+
+def test_a_full_transition_is_numpys():
+    rng = np.random.default_rng(3)
+    V = rng.normal(size=(4, 4))
+    linear = random_filter(V @ -np.diag([0.5, 1.0, 2.0, 4.0]) @ np.linalg.inv(V))
+    y, u = signals(linear, 2, MANY_ROWS)
+    assert np.allclose(run(linear, y, u)[:, 0], run(linear, y[:, 0], u[:, 0]), rtol=1e-13, atol=1e-14)
+    assert linear._compiled is None
+
+
+@pytest.mark.parametrize("rows", [3, MANY_ROWS])
+@pytest.mark.parametrize("wrong", ["z", "y", "rows"])
+def test_batches_that_do_not_go_together(rows, wrong):
+    linear = random_filter(PAIR, 2, 0)
+    z, y, u = np.zeros((rows, 3)), np.zeros((rows, 2)), np.zeros((rows, 0))
+    z = z[:, :2] if wrong == "z" else z
+    z = z[:-1] if wrong == "rows" and rows < MANY_ROWS else np.vstack([z, z]) if wrong == "rows" else z
+    y = y[:, :1] if wrong == "y" else y
+    with pytest.raises(ValueError):  # noqa: PT011 - NumPy's words or ours
+        linear.advance(z, y, u, y)
 
 
 def test_lists_are_taken():

@@ -22,6 +22,7 @@ from kkl_gym import (
 )
 from kkl_gym.plant import NOISE_BLOCK
 from kkl_gym.simulate import advance_batch
+from observers.compiled import MANY_ROWS
 
 everyone = pytest.mark.parametrize("name", ENV_IDS)
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
@@ -113,6 +114,26 @@ def test_rows_are_single_environments(name, mode, observe):
     ends = compare(vector(name, mode, observe=observe), sync(name, mode, observe=observe), 60, mode)
     assert len({k for k, _ in ends}) > 2  # at different times
     assert {row for _, row in ends} == set(range(N))
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@modes
+def test_many_rows_are_as_few(name, estimate, mode):
+    """Where filter and observations are compiled."""
+    many, few = (KKLVectorObservation(vector(name, mode, n=n), estimate=estimate) for n in (MANY_ROWS, N))
+    results = [many.reset(seed=7), few.reset(seed=7)]
+    for action in actions(30, MANY_ROWS):
+        (obs, *_, info), (obs_few, *_, info_few) = results
+        assert np.allclose(obs[:N], obs_few, rtol=1e-5, atol=1e-5)
+        for key in info_few.keys() - {"final_obs", "final_info"}:
+            assert np.allclose(info[key][:N], info_few[key], rtol=1e-5 if key == "x_hat" else 1e-9, atol=1e-9), key
+        ended = results[1][2] | results[1][3] if len(results[1]) == 5 else np.zeros(N, dtype=bool)
+        if mode is AutoresetMode.DISABLED and ended.any():
+            masks = np.ones(MANY_ROWS, dtype=bool), np.ones(N, dtype=bool)
+            results = [env.reset(options={"reset_mask": mask}) for env, mask in zip((many, few), masks, strict=True)]
+        else:
+            results = [many.step(action), few.step(action[:N])]
 
 
 def test_rows_are_single_environments_without_numba(monkeypatch):
