@@ -65,8 +65,8 @@ agents: $(VENV)/ready  ## every agent in docs/agents.md, and those that ship: ho
 	for system in $(SYSTEMS); do cp agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
 
-speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1
-	$(BIN)/kkl-gym speed
+speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
+	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
 
 clean:
 	rm -rf $(VENV) runs agents certificates tuning demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

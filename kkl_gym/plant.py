@@ -61,9 +61,12 @@ class Plant:
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
-    def draw_noise(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """``NOISE_BLOCK`` samples for :meth:`noise` to scale, (samples, nx) and (samples, ny)."""
-        return rng.random((NOISE_BLOCK, self.system.nx)), rng.standard_normal((NOISE_BLOCK, self.system.ny))
+    def draw_noise(
+        self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """``NOISE_BLOCK`` samples for :meth:`noise` to scale, (samples, nx) and (samples, ny); in w and v, if given."""
+        n, nx, ny = NOISE_BLOCK, self.system.nx, self.system.ny
+        return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Process noise w and measurement noise v of what was drawn, (..., nx) and (..., ny)."""

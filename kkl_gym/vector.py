@@ -75,7 +75,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._target = np.array(self.system.target)[:, None]
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
-        # A block of noise for each row, and where in its block the row is; at first, past the end.
+        # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
         self._w, self._v = (np.empty((NOISE_BLOCK, width, num_envs)) for width in (nx, ny))
         self._used = np.full(num_envs, NOISE_BLOCK)
         self._everyone = np.arange(num_envs)
@@ -245,17 +245,22 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._used[rows] = used + 1
         first = used[0]
         if len(rows) == self.num_envs and (used == first).all():
-            return self._w[first], self._v[first]
-        return self._w[used, :, rows].T, self._v[used, :, rows].T
+            drawn = self._w[first].T, self._v[first].T
+        else:
+            drawn = self._w[used, :, rows], self._v[used, :, rows]
+        w, v = self.plant.noise(*drawn)
+        return w.T, v.T
 
     def _draw(self, rows: np.ndarray) -> None:
         """New blocks of noise for some rows: drawn row by row, stored sample by sample, a few rows at a time."""
+        w, v = (np.empty((ROWS_AT_ONCE, *block.shape[:2])) for block in (self._w, self._v))
         for first in range(0, len(rows), ROWS_AT_ONCE):
             some = rows[first : first + ROWS_AT_ONCE]
-            drawn = zip(*(self.plant.draw_noise(self._rng(row)) for row in some.tolist()), strict=True)
+            for i, row in enumerate(some.tolist()):
+                self.plant.draw_noise(self._rng(row), w[i], v[i])
             at: Any = slice(some[0], some[-1] + 1) if len(rows) == self.num_envs else some
-            for block, values in zip((self._w, self._v), self.plant.noise(*map(np.array, drawn)), strict=True):
-                block[:, :, at] = values.transpose(1, 2, 0)
+            for block, drawn in ((self._w, w), (self._v, v)):
+                block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])

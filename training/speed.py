@@ -103,7 +103,7 @@ def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
 
 
 def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
-    """Seconds that the actions take in an environment that resets by itself."""
+    """Seconds that the actions take in an environment that resets by itself, once it has been reset."""
     env.reset(seed=0)
     started = time.perf_counter()
     for action in actions:
