@@ -39,6 +39,7 @@ class Installed:
             system.name if observer is None else observer,
             plant.measurement_noise if measurement_noise is None else measurement_noise,
             monitor,
+            plant.process_noise,
         )
         self._monitor = monitor
         self.observer.artifact.check(system.name, system.parameters, plant.dt, system.ny, system.nu)

@@ -288,10 +288,9 @@ def plant_of(env: VectorEnv) -> Plant:
         raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {base}") from None
     first = plants[0]
     for plant in plants:
-        if (plant.system, plant.dt, plant.measurement_noise) != (first.system, first.dt, first.measurement_noise):
-            raise ValueError(
-                "the environments differ in system, dt or measurement_noise: one observer cannot serve all"
-            )
+        for name in ("system", "dt", "measurement_noise", "process_noise"):
+            if getattr(plant, name) != getattr(first, name):
+                raise ValueError(f"the environments differ in {name}: one observer cannot serve all")
     return first
 
 

@@ -26,7 +26,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         environment's system.
     estimate : "x" shows the state estimate, clipped to the system's declared bounds; "z" the filter's state
         [z_y, z_u], within the bounds that bounded outputs and inputs imply.
-    measurement_noise : the noise level that the observer assumes; None takes the environment's.
+    measurement_noise : the noise level that the observer assumes; None takes the environment's. (Process noise is
+        taken from the environment always, by maps that ask for it.)
     ignore_input : use a map that knows no inputs (the paper's) although the agent acts.
     monitor : whether to keep the score, see :attr:`observers.KKLObserver.score`.
 

@@ -20,9 +20,10 @@ from observers.monitor import Limits
 from observers.network import MLP
 
 FORMAT = 1
-FEATURES = ("z_y", "z_u", "measurement_noise", "age")
+FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
+_INVERSE_SCALARS = ("noise_unit", "noise_max", "process_unit", "process_max", "age_unit", "age_max")
 _INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
@@ -63,6 +64,8 @@ class InverseMap:
     - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
       data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
     - ``measurement_noise``: log(1 + sigma_v / noise_unit);
+    - ``process_noise``: log(1 + min(level, process_max) / process_unit), the level being that of the environments, a
+      multiple of the system's scale per second;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs).
@@ -77,6 +80,8 @@ class InverseMap:
     x_scale: np.ndarray  # (nx,)
     noise_unit: float = 1.0
     noise_max: float = math.inf  # the largest sigma_v in training; a map without the feature takes any
+    process_unit: float = 1.0
+    process_max: float = math.inf  # the highest level of process noise in training
     age_unit: float = 1.0
     age_max: float = 0.0
 
@@ -87,7 +92,7 @@ class InverseMap:
         if self.features[0] != "z_y":
             raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
         modes, size = self.whiten.shape
-        conditions = sum(name in self.features for name in ("measurement_noise", "age"))
+        conditions = sum(name in self.features for name in ("measurement_noise", "process_noise", "age"))
         if self.mlp.inputs != modes + conditions or self.noise_gain.shape != (modes,) or self.z_offset.shape != (size,):
             raise ArtifactError(
                 f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
@@ -102,6 +107,10 @@ class InverseMap:
     def noise_feature(self, measurement_noise: Any) -> Any:
         """The network's input for a noise level."""
         return np.log1p(measurement_noise / self.noise_unit)
+
+    def process_feature(self, process_noise: float) -> float:
+        """The network's input for a level of process noise."""
+        return math.log1p(min(process_noise, self.process_max) / self.process_unit)
 
     def age_feature(self, age: Any) -> Any:
         """The network's input for a time since reset, in seconds."""
@@ -280,7 +289,7 @@ def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMa
     _put_mlp(tensors, prefix, inverse.mlp)
     for name in _INVERSE_ARRAYS:
         tensors[f"{prefix}.{name}"] = np.ascontiguousarray(getattr(inverse, name), dtype=float)
-    scalars = {name: getattr(inverse, name) for name in ("noise_unit", "noise_max", "age_unit", "age_max")}
+    scalars = {name: getattr(inverse, name) for name in _INVERSE_SCALARS}
     return {
         "features": list(inverse.features),
         "activation": inverse.mlp.activation,

@@ -25,20 +25,27 @@ class KKLObserver:
     artifact : what was learned.
     measurement_noise : standard deviation of the noise on each sample of the output, for maps that ask for it.
     monitor : whether to watch if the samples fit the estimates, see :attr:`score`.
+    process_noise : level of the noise on the state's derivative, in multiples of the system's scale per second as for
+        the environments, for maps that ask for it; what lies beyond their training counts as its end.
 
     Raises
     ------
-    ValueError : if the noise level is negative or beyond what the map was trained for, or if the artifact holds no
-        limits for a monitor.
+    ValueError : if a noise level is negative or not finite, the measurement noise is beyond what the map was trained
+        for, or the artifact holds no limits for a monitor.
     """
 
-    def __init__(self, artifact: Artifact, measurement_noise: float = 0.5, monitor: bool = False) -> None:
+    def __init__(
+        self, artifact: Artifact, measurement_noise: float = 0.5, monitor: bool = False, process_noise: float = 0.0
+    ) -> None:
+        if not 0 <= process_noise < math.inf:
+            raise ValueError(f"process_noise must be finite and not negative, got {process_noise!r}")
         if monitor and artifact.limits is None:
             raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
         self.artifact = artifact
         self._monitored = monitor
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
+        self.process_noise = float(process_noise)
         self.measurement_noise = measurement_noise
         self._age: Any = 0  # samples since reset, an array where rows have restarted
 
@@ -62,8 +69,9 @@ class KKLObserver:
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
         self._measurement_noise, self._monitor, self._x_hat = float(level), monitor, None
-        self._driven = _Decoder(inverse, level)
-        self._free = None if self.artifact.free is None else _Decoder(self.artifact.free, level)
+        self._driven = _Decoder(inverse, level, self.process_noise)
+        free = self.artifact.free
+        self._free = None if free is None else _Decoder(free, level, self.process_noise)
 
     @property
     def z(self) -> np.ndarray:
@@ -261,14 +269,17 @@ class KKLObserver:
 
 
 class _Decoder:
-    """An inverse map at one noise level: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+    """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
-    def __init__(self, inverse: InverseMap, level: float) -> None:
+    def __init__(self, inverse: InverseMap, measurement_noise: float, process_noise: float) -> None:
         self._inverse = inverse
-        self._whiten = np.ascontiguousarray((inverse.gain(level)[:, None] * inverse.whiten).T)
+        self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
-        told = "measurement_noise" in inverse.features
-        self._conditions: list[Any] = [float(inverse.noise_feature(level))] if told else []
+        self._conditions: list[Any] = []
+        if "measurement_noise" in inverse.features:
+            self._conditions.append(float(inverse.noise_feature(measurement_noise)))
+        if "process_noise" in inverse.features:
+            self._conditions.append(inverse.process_feature(process_noise))
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         inverse, conditions = self._inverse, self._conditions
@@ -293,15 +304,22 @@ def _finite(values: np.ndarray) -> bool:
     return bool((np.abs(values) <= _LARGEST).all())
 
 
-def load(name_or_path: str | os.PathLike[str], measurement_noise: float = 0.5, monitor: bool = False) -> KKLObserver:
+def load(
+    name_or_path: str | os.PathLike[str],
+    measurement_noise: float = 0.5,
+    monitor: bool = False,
+    process_noise: float = 0.0,
+) -> KKLObserver:
     """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
 
     A name without a version is the newest; ``"van_der_pol-v1"`` is that version for good.
 
+    The other parameters are those of :class:`KKLObserver`.
+
     Raises ArtifactError (a ValueError) if there is none or the file is damaged, ValueError on a noise level out
     of range, or if it holds no limits and a monitor is asked for.
     """
-    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise, monitor)
+    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise, monitor, process_noise)
 
 
 __all__ = ["ArtifactError", "KKLObserver", "load"]

@@ -15,7 +15,15 @@ def random_mlp(rng, inputs, outputs, activation="silu", width=8):
 
 
 def random_artifact(
-    system="van_der_pol", inputs=True, noise=True, age=True, dt=0.01, pair=False, forward=False, free=False
+    system="van_der_pol",
+    inputs=True,
+    noise=True,
+    age=True,
+    dt=0.01,
+    pair=False,
+    forward=False,
+    free=False,
+    process=False,
 ):
     """A whole observer for a system with weights that nobody trained."""
     system = get_system(system)
@@ -30,10 +38,12 @@ def random_artifact(
         "z_y",
         *(["z_u"] if linear.nu else []),
         *(["measurement_noise"] if noise else []),
+        *(["process_noise"] if process else []),
         *(["age"] if age else []),
     )
+    levels = {"process_unit": 0.01, "process_max": 0.2} if process else {}
     inverse = InverseMap(
-        mlp=random_mlp(rng, modes + noise + age, system.nx),
+        mlp=random_mlp(rng, modes + noise + process + age, system.nx),
         features=told,
         z_offset=rng.normal(size=linear.size),
         whiten=rng.normal(size=(modes, linear.size)),
@@ -42,6 +52,7 @@ def random_artifact(
         x_scale=np.array(system.scale),
         noise_unit=0.1,
         noise_max=1.0 if noise else np.inf,
+        **levels,
         age_unit=0.05,
         age_max=2.0 if age else 0.0,
     )
@@ -57,8 +68,8 @@ def random_artifact(
         if forward
         else None,
         free=InverseMap(
-            mlp=random_mlp(rng, nz + noise, system.nx),
-            features=("z_y", *(["measurement_noise"] if noise else [])),
+            mlp=random_mlp(rng, nz + noise + process, system.nx),
+            features=tuple(name for name in told if name not in ("z_u", "age")),
             z_offset=rng.normal(size=nz),
             whiten=rng.normal(size=(nz, nz)),
             noise_gain=rng.uniform(0.1, 1.0, nz),
@@ -66,6 +77,7 @@ def random_artifact(
             x_scale=np.array(system.scale),
             noise_unit=0.2,
             noise_max=inverse.noise_max,
+            **levels,
         )
         if free
         else None,

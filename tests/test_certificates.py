@@ -170,14 +170,14 @@ def test_jacobians_by_differences(activation):
         assert np.allclose(network.jacobian(x)[..., j], (network(x + step) - network(x - step)) / (2 * eps), atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "rossler-spinn"])
-def test_the_smooth_maps_are_the_observers(name):
-    observer = observers.load(name, 0.3)
+@pytest.mark.parametrize("name", ["van_der_pol", "rossler-spinn", None])
+def test_the_smooth_maps_are_the_observers(name, saved):
+    observer = observers.load(name or saved(process=True), 0.3, process_noise=0.03)
     y = np.random.default_rng(2).normal(size=(1, 1))
     observer.reset(y)
     for _ in range(6000):  # beyond the greatest age that the map tells apart
         x_hat = observer.step(y)
-    assert np.allclose(decoder(observer.artifact, 0.3)(observer.z), x_hat, atol=1e-4)
+    assert np.allclose(decoder(observer.artifact, 0.3, 0.03)(observer.z), x_hat, atol=1e-4)
     if observer.artifact.forward is not None:
         x = np.random.default_rng(3).normal(size=(5, 3))
         assert np.allclose(encoder(observer.artifact.forward)(x), observer.artifact.forward(x), atol=1e-5)

@@ -293,12 +293,45 @@ def test_noise_level_told_changes_the_estimate(make_artifact):
     assert np.array_equal(step_by_step(KKLObserver(make_artifact(), 0.8), y, u), step_by_step(observer, y, u))
 
 
+@pytest.mark.parametrize("free", [False, True])
+def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_artifact, free):
+    artifact = make_artifact(process=True, free=free)
+    estimates = [KKLObserver(artifact, process_noise=level).reset([1.0]) for level in (0.0, 0.1, 0.2, 5.0)]
+    assert not np.allclose(estimates[0], estimates[1], atol=1e-6)
+    assert not np.allclose(estimates[1], estimates[2], atol=1e-6)
+    assert np.array_equal(estimates[2], estimates[3])
+    assert np.array_equal(estimates[0], KKLObserver(artifact).reset([1.0]))
+    inverse = artifact.free or artifact.inverse
+    modes = inverse.gain(0.5) * (
+        inverse.whiten @ (artifact.filter.start(np.ones(1))[: len(inverse.z_offset)] - inverse.z_offset)
+    )
+    told = [math.log1p(0.5 / inverse.noise_unit), math.log1p(0.1 / 0.01), *([] if free else [0.0])]
+    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told]))
+    assert np.allclose(estimates[1], expected, atol=1e-5)
+
+
+def test_process_noise_is_told_only_to_maps_that_ask(make_artifact):
+    artifact = make_artifact()
+    assert np.array_equal(KKLObserver(artifact, process_noise=0.1).reset([1.0]), KKLObserver(artifact).reset([1.0]))
+
+
+@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf])
+def test_wrong_process_noise_raises(level, make_artifact):
+    with pytest.raises(ValueError, match="process_noise must be finite and not negative"):
+        KKLObserver(make_artifact(), process_noise=level)
+
+
 def test_age_changes_the_estimate_until_age_max(make_artifact):
     observer = KKLObserver(make_artifact(age=True))
     x_hat = observer.estimate(np.full((400, 1), 0.3))  # the filter stays at its equilibrium
     assert not np.allclose(x_hat[0], x_hat[1], rtol=1e-3)
     assert not np.allclose(x_hat[198], x_hat[200], rtol=1e-6, atol=0)
     assert np.allclose(x_hat[200:], x_hat[200], rtol=1e-6)
+
+
+def test_load_passes_its_settings_on(saved):
+    observer = load(saved(process=True), 0.3, process_noise=0.1)
+    assert (observer.measurement_noise, observer.process_noise) == (0.3, 0.1)
 
 
 def test_load_from_a_file(saved, make_artifact):

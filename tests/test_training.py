@@ -86,14 +86,15 @@ def test_pulses_end_and_leave_free_motion_behind():
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     system, n = ReverseDuffing(), 400
-    (x, u), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    (x, u, level), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), excited=0.5)
     low, high = system.box()
     inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
     assert not rest
+    assert not level.any()
     assert u.shape == (10, n, 0)
     assert inside[200:].all()
     assert 5 < (~inside[:200]).sum() < 150
-    (x, _), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    (x, *_), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), excited=0.5)
     assert np.isfinite(x).all()
 
 
@@ -105,13 +106,16 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
         return simulate(*arguments, w=w, **named)
 
     monkeypatch.setattr(training.data, "simulate", spy)
-    (x, u), *_ = trajectories(system, n, 50, 0.01, np.random.default_rng(0), ("steps",), disturbed=0.25)
+    (x, u, level), *_ = trajectories(system, n, 50, 0.01, np.random.default_rng(0), ("steps",), disturbed=0.25)
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
     relative = w / (system.process_noise * np.array(system.scale))
     largest = np.abs(relative).max((0, 2))  # of 100 numbers, all but the level of a run
     assert (largest > 0).mean() == pytest.approx(0.25, abs=0.06)
-    assert np.quantile(largest[largest > 0], [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.12)
+    assert np.allclose(largest, level / system.process_noise, atol=0.12)
+    assert ((largest > 0) == (level > 0)).all()
+    quantiles = np.quantile(level[level > 0] / system.process_noise, [0.1, 0.5, 0.9])
+    assert quantiles == pytest.approx(np.sqrt([0.1, 0.5, 0.9]), abs=0.12)
     assert largest.max() <= 1.0
     assert np.abs(relative.mean((0, 1))).max() < 0.01
     assert relative.std((0, 1)) == pytest.approx(relative.std(), rel=0.03)  # each component by its own scale
@@ -138,7 +142,10 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     config = replace(preset(VanDerPol(), "input-aware", "fast"), **small)
     with pytest.raises(ReachedError):
         train(VanDerPol(), config, tmp_path / "aware", device=CPU)
-    assert seen == {"record": 0.5, "sampler": (1.0, 1024, CPU, 0.3, 3.0)}
+    assert seen == {"record": 0.5, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.05)}
+    with pytest.raises(ReachedError):
+        train(VanDerPol(), replace(config, disturbed=0.0), tmp_path / "undisturbed", device=CPU)
+    assert seen == {"record": 0.0, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.0)}
     spinn = replace(preset(VanDerPol(), "spinn", "fast"), disturbed=0.5, trajectories=5, duration=20.0, forward_steps=1)
     train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
     assert seen["record"] == 0.0
@@ -290,13 +297,41 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
 
 
+@pytest.fixture(scope="module")
+def disturbed_sampler():
+    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
+    data = record(VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0), disturbed=0.5)
+    return TrajectorySampler(data, linear, 1.0, 4096, CPU, process_max=VanDerPol.process_noise), data, linear
+
+
+def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler):
+    sampler, data, linear = disturbed_sampler
+    assert 15 < (data.process_noise > 0).sum() < 35
+    inputs, x, _, cell = sampler(torch.Generator().manual_seed(0))
+    assert cell.max() < sampler.cells
+    network = Network(inputs.shape[1], 2, 8, 1, "tanh")
+    artifact = Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
+    assert artifact.inverse.features == ("z_y", "z_u", "measurement_noise", "process_noise", "age")
+    with torch.no_grad():
+        x_hat = network(inputs).numpy() * sampler.x_scale + sampler.x_offset
+    for row in (torch.nonzero(inputs[:, -3] == 0)[::50, 0]).tolist():  # without measurement noise
+        state = x[row].numpy() * sampler.x_scale + sampler.x_offset
+        slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
+        level = data.process_noise[trajectory]
+        observer = KKLObserver(artifact, 0.0, process_noise=level)
+        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
+        assert cell[row] % 3 == int(level > 0) + int(level > 0.025)
+        assert cell[row] // 3 % 7 == 0
+
+
 # Closed loop
 
 
-@pytest.fixture(scope="module")
-def closed_loop(sampler):
-    open_loop, _, linear = sampler
-    network = Network(len(open_loop.coordinates.noise_gain) + 2, 2, 8, 1, "tanh")
+@pytest.fixture(scope="module", params=["sampler", "disturbed_sampler"])
+def closed_loop(request):
+    open_loop, _, linear = request.getfixturevalue(request.param)
+    network = Network(len(open_loop.coordinates.noise_gain) + 2 + bool(open_loop.process_max), 2, 8, 1, "tanh")
     artifact = Artifact(linear, open_loop.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
     seen = []
 
@@ -337,6 +372,9 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
         np.testing.assert_allclose(shown, expected, atol=1e-3)
         at_run_time = cell[row] - sampler.open_loop.cells
+        if sampler.open_loop.process_max:
+            assert at_run_time % 3 == 0  # there is none in closed loop
+            at_run_time = at_run_time // 3
         assert (at_run_time % 7 == 0) == (data.level[trajectory] == 0)
 
 

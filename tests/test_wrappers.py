@@ -10,8 +10,8 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import kkl_gym.installed
-from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation
-from observers import ArtifactError, KKLObserver
+from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
+from observers import Artifact, ArtifactError, KKLObserver
 
 checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 everyone = pytest.mark.parametrize("name", ENV_IDS)
@@ -196,6 +196,19 @@ def test_blind_map_under_action(saved):
     ignoring.reset(seed=0)
     *_, info = ignoring.step(np.array([0.5], np.float32))
     assert info["u"].tolist() == [5.0]
+
+
+@pytest.mark.parametrize("level", [None, 0.0, 0.15])
+def test_the_map_is_told_the_environments_process_noise(saved, level):
+    path = saved(process=True)
+    env = KKLObservation(KKLEnv("van_der_pol", process_noise=level), path)
+    expected = KKLObserver(Artifact.read(path), 0.5, process_noise=0.05 if level is None else level)
+    _, info = env.reset(seed=0)
+    assert np.array_equal(info["x_hat"], expected.reset(info["y"]))
+    assert not np.allclose(info["x_hat"], KKLObserver(Artifact.read(path), 0.5, process_noise=0.01).reset(info["y"]))
+    many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
+    _, info = many.reset(seed=0)
+    assert np.allclose(info["x_hat"], expected.reset(info["y"]), atol=1e-6)
 
 
 def test_map_of_an_autonomous_system_is_not_blind(script, saved):

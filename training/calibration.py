@@ -107,7 +107,8 @@ def _limits(
     """Limits of mean, low and high at one noise level, each (ny,)."""
     dt = artifact.filter.dt
     y = output(system, x) + level * rng.standard_normal((*x.shape[:2], system.ny))
-    residual = y - KKLObserver(artifact, level).estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
+    observer = KKLObserver(artifact, level, process_noise=system.process_noise)
+    residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
     a = -np.expm1(-dt / WINDOW)
     late = slice(round(WARM_UP / dt) + 1, None)
     means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]

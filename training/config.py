@@ -67,7 +67,8 @@ class Config:
     """A part of the free trajectories starts where inputs have led from X: constant ones up to this multiple of their
     bounds, for 20 s; or, if it is 0, random ones within their bounds, for 10 s."""
     disturbed: float = 0.0
-    """Share of an input-aware map's trajectories with process noise, each at a level of its own up to the system's."""
+    """Share of an input-aware map's trajectories with process noise, each at a level of its own up to the system's,
+    which the map is told if the share is not 0."""
     noise_max: float = 1.0
     """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
     quiet: float = 0.2
@@ -158,7 +159,6 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "van_der_pol": {
         "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),
         "push": 4.0,
-        "disturbed": 0.1,
         "quiet": 0.05,
         "emphasis": 4.0,
         "inverse_steps": 24000,
@@ -212,6 +212,7 @@ def preset(system: System, method: Method, name: Preset) -> Config:
         learning_rate=5e-3,
         inverse_steps=18000,
         noise_max=NOISE_MAX.get(system.name, 1.0),
+        disturbed=0.35,
     )
     fast = override(fast, SETTINGS.get(system.name, {}))
     if name == "fast":

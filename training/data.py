@@ -22,16 +22,18 @@ QUIET = 0.2  # share of closed-loop trajectories without noise
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Noise-free trajectories of a system with the filter running beside them from its own start.
+    """Trajectories of a system, measured without noise, with the filter running beside them from its own start.
 
     ages : samples since reset at which they were recorded, sorted, (m,).
     x : (m, n, nx).
     z : (m, n, size of the filter's state).
+    process_noise : its level along each trajectory, (n,).
     """
 
     ages: np.ndarray
     x: np.ndarray
     z: np.ndarray
+    process_noise: np.ndarray
 
 
 def output(system: System, x: np.ndarray) -> np.ndarray:
@@ -70,11 +72,14 @@ def record(
     """
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
-    for x, u in trajectories(system, n, steps, linear.dt, rng, kinds if linear.nu else (), excited, push, disturbed):
+    levels: list[np.ndarray] = []
+    kinds = kinds if linear.nu else ()
+    for x, u, level in trajectories(system, n, steps, linear.dt, rng, kinds, excited, push, disturbed):
         xs.append(x[ages])
         zs.append(run_filter(linear, output(system, x), u, ages))
+        levels.append(level)
         report(sum(x.shape[1] for x in xs))
-    return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1))
+    return Trajectories(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))
 
 
 def trajectories(
@@ -87,16 +92,17 @@ def trajectories(
     excited: float = 0.0,
     push: float = 0.0,
     disturbed: float = 0.0,
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """n trajectories from starts uniform in the training box, in chunks: states and inputs, (steps (+ 1), CHUNK, ...).
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """n trajectories from starts uniform in the training box, in chunks.
 
-    Those that leave the declared bounds are replaced by new ones.
+    States and inputs, (steps (+ 1), CHUNK, ...), and the level of process noise, (CHUNK,). Those that leave the
+    declared bounds are replaced by new ones.
 
     kinds : of random inputs; without any, inputs have no columns.
     excited : share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
     push : these inputs are constant, up to so many times their bounds, for PUSH seconds; or, if it is 0, random ones
         within their bounds, for EXCITATION seconds.
-    disturbed : share of the trajectories with process noise, at any level up to the system's own.
+    disturbed : share of the trajectories with process noise, at any level up to the system's own, high ones more often.
     """
     kept = tried = 0
     while kept < n:
@@ -107,9 +113,9 @@ def trajectories(
             led = _led(system, x0[some], dt, rng, push)
             x0[some] = np.where(np.isfinite(led).all(-1)[:, None], led, x0[some])
         u = random_inputs(system, count, steps, dt, rng, kinds) if kinds else np.zeros((steps, count, 0))
-        w = None
+        w, level = None, np.zeros(count)
         if disturbed:
-            level = system.process_noise * np.where(rng.random(count) < disturbed, rng.random(count), 0.0)
+            level = system.process_noise * np.where(rng.random(count) < disturbed, np.sqrt(rng.random(count)), 0.0)
             w = level[:, None] * system.scale * rng.uniform(-1.0, 1.0, (steps, count, system.nx))
         x = simulate(system, x0, steps, dt, u=u if kinds else None, w=w)
         inside = np.isfinite(x[-1]).all(-1)
@@ -120,7 +126,7 @@ def trajectories(
                 f"of {tried} trajectories of {steps * dt:g} s only {kept} stayed within bounds = "
                 f"{system.bounds}; widen the bounds, shrink X or shorten the trajectories"
             )
-        yield x[:, inside], u[:, inside]
+        yield x[:, inside], u[:, inside], level[inside]
 
 
 def _led(system: System, x0: np.ndarray, dt: float, rng: np.random.Generator, push: float) -> np.ndarray:
@@ -217,4 +223,4 @@ def record_closed_loop(
             f"of {n} trajectories under the controller only {kept} stayed within bounds = {system.bounds}; widen them, "
             "or shrink X"
         )
-    return ClosedLoop(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(levels))
+    return ClosedLoop(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.zeros(kept), np.concatenate(levels))

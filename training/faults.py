@@ -83,6 +83,7 @@ def play(
     undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
     width = np.ptp(undriven, axis=(0, 1))
     at, within = len(y) // 2, round(DEADLINES[system.name] / dt)
+    observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
     for fault in FAULTS:
         seen = y.copy()
@@ -92,7 +93,7 @@ def play(
             seen[at:] = 0.0
         elif fault == "freeze":
             seen[at:] = seen[at]
-        score = _scores(artifact, measurement_noise, seen, u if artifact.nu else None)
+        score = _scores(observer, seen, u if artifact.nu else None)
         judged = score if fault == "none" else score[at : at + within]
         late = score if fault == "none" else score[at:]
         alarmed = (late > 1).any(0)
@@ -169,9 +170,8 @@ def _draw(path: Path, found: pd.DataFrame) -> None:
     figure.savefig(path, dpi=110)
 
 
-def _scores(artifact: Artifact, level: float, y: np.ndarray, u: np.ndarray | None) -> np.ndarray:
+def _scores(observer: KKLObserver, y: np.ndarray, u: np.ndarray | None) -> np.ndarray:
     """The monitor's score at every sample, (steps + 1, n)."""
-    observer = KKLObserver(artifact, level, monitor=True)
     observer.reset(y[0])
     out = np.zeros(y.shape[:2])
     for k in range(1, len(y)):

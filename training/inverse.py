@@ -1,7 +1,9 @@
 """Learning the inverse T_inv, either from simulated trajectories or from a learned forward map."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +18,7 @@ from training.noise import noise_covariance, root, stationary_covariance
 SMALLEST_MODE = 1e-7
 NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 0.05  # s, in the age feature log(1 + t / unit)
+PROCESS_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
 # inputs (batch, inputs), x scaled (batch, nx), weight (batch,), cell (batch,)
 Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
@@ -59,16 +62,18 @@ class TrajectorySampler:
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
     that fits such data in the mean square is the conditional mean of x. A share ``quiet`` of the samples has no noise;
     of the others a share p ** ``emphasis`` lies below the level at p of the way, on a logarithmic scale, along the two
-    decades up to ``noise_max``: high levels are harder to learn.
+    decades up to ``noise_max``: high levels are harder to learn. If ``process_max`` is not 0 the network is told the
+    level of process noise as well, up to this one.
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
-    into ``cells`` of like age and level, and the loss divides each by its cell's own recent error, so that all
+    into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
     improve in proportion.
     """
 
     AGES_PER_BATCH = 32
     LEVELS = 6  # cells of noise level, the quiet one aside
     AGE_CELLS = 8
+    PROCESS_CELLS = 3  # no process noise, weak and strong
 
     def __init__(
         self,
@@ -79,6 +84,7 @@ class TrajectorySampler:
         device: torch.device,
         quiet: float = 0.2,
         emphasis: float = 2.0,
+        process_max: float = 0.0,
     ) -> None:
         m, n, size = data.z.shape
         rows = np.random.default_rng(0).permutation(m * n)[:100_000]
@@ -86,7 +92,7 @@ class TrajectorySampler:
         gain = self.coordinates.noise_gain
         self.x_offset = data.x.mean((0, 1))
         self.x_scale = data.x.std((0, 1))
-        self.noise_max = noise_max
+        self.noise_max, self.process_max = noise_max, process_max
         self._quiet, self._emphasis = quiet, emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
         self._per_age = batch // self.AGES_PER_BATCH
@@ -104,7 +110,12 @@ class TrajectorySampler:
         self._age = tensor(data.ages * linear.dt, device)
         self._oldest = data.ages[-1]
         self._age_cell = self.age_cell(data.ages, device)
-        self.cells = self.AGE_CELLS * (1 + self.LEVELS)
+        self._process_cell = torch.zeros(n, dtype=torch.long, device=device)
+        if process_max:
+            part = data.process_noise / process_max
+            self._process = tensor(np.log1p(part / PROCESS_UNIT), device)
+            self._process_cell = torch.as_tensor((part > 0).astype(int) + (part > 0.5), device=device)
+        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_max else 0) + 1
 
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""
@@ -123,10 +134,12 @@ class TrajectorySampler:
         modes = self._modes[ages, rows] + level * self._gain * noise
         modes = modes / (1.0 + (level * self._gain) ** 2)
         conditions = [torch.log1p(level / NOISE_UNIT)]
+        if self.process_max:
+            conditions.append(self._process[rows][..., None])
         conditions.append(torch.log1p(self._age[ages].clamp(max=self.age_max) / AGE_UNIT)[..., None].expand_as(level))
         inputs = torch.cat([modes, *conditions], -1)
         level_cell = torch.where(loud, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
-        cell = self._age_cell[ages] * (1 + self.LEVELS) + level_cell
+        cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows])
         batch = self.AGES_PER_BATCH * self._per_age
         return (
             inputs.reshape(batch, -1),
@@ -134,6 +147,10 @@ class TrajectorySampler:
             self._weight[ages, rows].reshape(batch),
             cell.reshape(batch),
         )
+
+    def cell(self, age: Any, level: Any, process: Any = 0) -> Any:
+        """Number of the cell where those of age, measurement noise and process noise meet."""
+        return (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_max else 1) + process
 
     def weight(self, x: np.ndarray, device: torch.device) -> torch.Tensor:
         """Of states (..., nx) in the loss: errors count relative to the state's size."""
@@ -150,7 +167,13 @@ class TrajectorySampler:
         """The map that a network trained on these batches makes."""
         return InverseMap(
             mlp=network.export(),
-            features=("z_y", *(["z_u"] if linear.nu else []), "measurement_noise", "age"),
+            features=(
+                "z_y",
+                *(["z_u"] if linear.nu else []),
+                "measurement_noise",
+                *(["process_noise"] if self.process_max else []),
+                "age",
+            ),
             z_offset=self.coordinates.offset,
             whiten=self.coordinates.whiten,
             noise_gain=self.coordinates.noise_gain,
@@ -158,6 +181,8 @@ class TrajectorySampler:
             x_scale=self.x_scale,
             noise_unit=NOISE_UNIT,
             noise_max=self.noise_max,
+            process_unit=PROCESS_UNIT * self.process_max or 1.0,
+            process_max=self.process_max or math.inf,
             age_unit=AGE_UNIT,
             age_max=self.age_max,
         )
@@ -188,8 +213,11 @@ class ClosedLoopSampler:
         half, device = len(x) // 2, self._x.device
         ages = torch.randint(m, (half,), generator=generator, device=device)
         rows = torch.randint(n, (half,), generator=generator, device=device)
-        closed = torch.cat([self._modes[ages, rows], self._level[rows, None], self._age[ages, None]], -1)
-        closed_cell = self._age_cell[ages] * (1 + self.open_loop.LEVELS) + self._level_cell[rows]
+        conditions = [self._level[rows], self._age[ages]]
+        if self.open_loop.process_max:
+            conditions.insert(1, torch.zeros(half, device=device))
+        closed = torch.cat([self._modes[ages, rows], torch.stack(conditions, -1)], -1)
+        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows])
         return (
             torch.cat([inputs[:half], closed]),
             torch.cat([x[:half], self._x[ages, rows]]),

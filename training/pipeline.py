@@ -113,9 +113,9 @@ def train(
             return record(system, into, config.trajectories, steps, ages, rng, report, disturbed=disturbed, **how)
 
         def sampled(motions: Trajectories, through: LinearFilter) -> TrajectorySampler:
-            return TrajectorySampler(
-                motions, through, config.noise_max, config.batch, device, config.quiet, config.emphasis
-            )
+            process_max = system.process_noise if config.disturbed else 0.0
+            levels = (config.quiet, config.emphasis, process_max)
+            return TrajectorySampler(motions, through, config.noise_max, config.batch, device, *levels)
 
         def fit(sampler: Sampler, stage: str) -> Network:
             inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]

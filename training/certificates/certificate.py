@@ -181,10 +181,11 @@ def certify(
     if not 0 < delta < 1:
         raise ValueError(f"delta must lie between 0 and 1, got {delta!r}")
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
+    levels = (measurement_noise, process_noise)
     if motion is None:
-        motion = record_motion(artifact, system, measurement_noise, process_noise, trajectories, seed)
+        motion = record_motion(artifact, system, *levels, trajectories, seed)
     measured, sample = motion.halves()
-    told, quiet = decoder(artifact, measurement_noise), decoder(artifact, 0.0)
+    told, quiet = decoder(artifact, *levels), decoder(artifact, 0.0)
     lower, at = lipschitz_lower(told, motion.z)
     upper = lipschitz_upper(told)
     linear = artifact.filter
@@ -217,7 +218,7 @@ def certify(
         gain_h_infinity=h_infinity(linear),
         gain_h2=h2(linear),
         noise_term=noise_term,
-        predicted_noise_error=float(np.sqrt(noise_variance(artifact, motion.z, measurement_noise).mean())),
+        predicted_noise_error=float(np.sqrt(noise_variance(artifact, motion.z, *levels).mean())),
         measured_noise_error=float(np.sqrt(_squared(told(motion.z + motion.noise) - told(motion.z)).mean())),
         inverse_dimension=inverse_dimension,
         inverse_term=generalisation_term(float(losses.max()), inverse_dimension, seen, delta),
@@ -275,12 +276,14 @@ def record_motion(
     )
 
 
-def noise_variance(artifact: Artifact, z: np.ndarray, measurement_noise: float) -> np.ndarray:
+def noise_variance(
+    artifact: Artifact, z: np.ndarray, measurement_noise: float, process_noise: float = 0.0
+) -> np.ndarray:
     """Variance of the estimate due to stationary measurement noise, trace(J P J^T) at each z (n, size), (n,).
 
     P is the exact stationary covariance of z, J the Jacobian of T_inv: the noise to first order.
     """
-    J = decoder(artifact, measurement_noise).jacobian(z)
+    J = decoder(artifact, measurement_noise, process_noise).jacobian(z)
     P = measurement_noise**2 * stationary_covariance(artifact.filter)
     return np.asarray(np.einsum("nij,jk,nik->n", J, P, J))
 

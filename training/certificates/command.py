@@ -83,7 +83,8 @@ class Certify:
                     motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, self.measurement_noise, name, motion)
+                levels = (self.measurement_noise, process_noise)
+                draw(self.out / f"{name}.png", artifact, system, levels, name, motion)
             found.append(certificate)
         console.print(table(found))
         write(self.out / "table.md", markdown(found))
@@ -168,7 +169,9 @@ def markdown(found: Sequence[Certificate]) -> str:
     return head + "\n".join(rows) + "\n"
 
 
-def draw(path: Path, artifact: Artifact, system: System, measurement_noise: float, name: str, motion: Motion) -> None:
+def draw(
+    path: Path, artifact: Artifact, system: System, levels: tuple[float, float], name: str, motion: Motion
+) -> None:
     """The PDE's residual over X, and along the motion the error that noise will make."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -178,13 +181,13 @@ def draw(path: Path, artifact: Artifact, system: System, measurement_noise: floa
     axes = figure.subplots(1, panels, squeeze=False)[0]
     first, second = (i % system.nx for i in system.portrait)
     shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
-    x, size = motion.x[shown], np.sqrt(noise_variance(artifact, motion.z[shown], measurement_noise))
+    x, size = motion.x[shown], np.sqrt(noise_variance(artifact, motion.z[shown], *levels))
     order = size.argsort()
     points: Any = axes[-1].scatter(
         x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
     )
     figure.colorbar(points, ax=axes[-1], label="predicted rms error")
-    axes[-1].set_title(f"error due to noise {measurement_noise:g}, along the motion")
+    axes[-1].set_title(f"error due to noise {levels[0]:g}, along the motion")
     axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     if artifact.forward is not None:
         draw_residual(figure, axes[0], artifact, system)

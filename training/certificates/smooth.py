@@ -52,13 +52,15 @@ class Smooth:
         return h @ self.weights[-1].T + self.biases[-1], slopes
 
 
-def decoder(artifact: Artifact, measurement_noise: float) -> Smooth:
-    """T_inv of free motion at a noise level, long after reset: the filter's state (n, size) to the estimate (n, nx)."""
+def decoder(artifact: Artifact, measurement_noise: float, process_noise: float = 0.0) -> Smooth:
+    """T_inv of free motion, long after reset, at given noise: filter states, (n, size), to estimates, (n, nx)."""
     inverse = artifact.free or artifact.inverse
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = []
     if "measurement_noise" in inverse.features:
         told.append(float(inverse.noise_feature(measurement_noise)))
+    if "process_noise" in inverse.features:
+        told.append(inverse.process_feature(process_noise))
     if "age" in inverse.features:
         told.append(float(inverse.age_feature(inverse.age_max)))
     first = inverse.mlp.weights[0].astype(float)

@@ -85,7 +85,7 @@ def simulated(system: System, n: int, duration: float, samples: int, dt: float, 
     steps = max(1, round(duration / dt))
     ages = recording_ages(0, steps, samples)
     xs, ys = [], []
-    for x, _ in trajectories(system, n, steps, dt, rng):
+    for x, *_ in trajectories(system, n, steps, dt, rng):
         xs.append(x[ages])
         ys.append(output(system, x).astype(np.float32))
     return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))
