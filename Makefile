@@ -41,13 +41,15 @@ results: $(VENV)/ready
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
 		--csv docs/results/accuracy.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark
 	mkdir -p docs/results/benchmark
 	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-ABLATION := ablation-spinn ablation-solved ablation-transients ablation-noise ablation-modes ablation-soap default ablation-tuned
+ABLATION := ablation-spinn ablation-solved ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
+	default ablation-tuned
 
 ablation: $(VENV)/ready  ## what each idea earns, half an hour on two cores; resumable
 	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out benchmark/ablation

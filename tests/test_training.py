@@ -12,10 +12,11 @@ from scipy.integrate import solve_ivp
 from torch.utils.tensorboard import SummaryWriter
 
 import training.data
+import training.evaluate
 import training.optimise
 import training.pipeline
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import advance_batch, simulate
 from observers import Artifact, KKLObserver, LinearFilter
 from training import errors, preset, smape, train, unseen_runs
 from training.config import Config, override, spectrum
@@ -751,9 +752,32 @@ def test_starts_outside_lie_outside():
     assert (np.abs(x0) <= 2 * high).all()
 
 
-@pytest.mark.parametrize("wrong", [{"n": 0}, {"duration": 0.0}, {"domain": "3X"}, {"seed": -1}])
+def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifact, monkeypatch):
+    system, told = VanDerPol(), []
+    quiet, loud = (unseen_runs(system, 0.01, 20, 1.0, 0, process_noise=level) for level in (0.0, 0.15))
+    assert np.array_equal(quiet.x[0], loud.x[0])
+    x, w, u = loud.x.transpose(0, 2, 1), np.zeros((2, 20)), np.zeros((1, 20))
+    for k in (0, 50):
+        drift = (x[k + 1] - advance_batch(system, x[k], u, w, 0.01)) / 0.01 / np.array(system.scale)[:, None]
+        assert 0.05 < np.abs(drift).max() < 0.16
+
+    class Spy(KKLObserver):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            told.append(self.process_noise)
+
+    monkeypatch.setattr(training.evaluate, "KKLObserver", Spy)
+    for runs in (quiet, loud, loud.first(5)):
+        errors(make_artifact(), system, runs, 0.5, 0)
+    assert told == [0.0, 0.15, 0.15]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"n": 0}, {"duration": 0.0}, {"domain": "3X"}, {"seed": -1}, {"process_noise": -1.0}, {"process_noise": np.nan}],
+)
 def test_impossible_evaluations(wrong):
-    with pytest.raises(ValueError, match=r"cannot run|domain"):
+    with pytest.raises(ValueError, match=r"cannot run|domain|process_noise must"):
         unseen_runs(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 

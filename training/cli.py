@@ -139,8 +139,8 @@ class Evaluate:
 
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
     after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines. Observers are
-    told the noise level if they can use it. There is no process noise. Trajectories that leave the system's declared
-    bounds are counted, and left out.
+    told the levels of noise if they can use them. Trajectories that leave the system's declared bounds are counted, and
+    left out.
     """
 
     observers: tyro.conf.Positional[tuple[str, ...]]
@@ -149,6 +149,8 @@ class Evaluate:
     """For files of your own system: its class, as script.py:Class or module:Class."""
     noise: tuple[float, ...] = (0.0, 0.5)
     """Standard deviations of the measurement noise."""
+    process_noise: float = 0.0
+    """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
     duration: float = 50.0
@@ -173,6 +175,7 @@ class Evaluate:
         return lines
 
     def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> list[str]:
+        suffix = f", process noise {self.process_noise:g}" if self.process_noise else ""
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
             cases.append(("X, driven", "X", True))
@@ -184,8 +187,16 @@ class Evaluate:
         with console.status(f"evaluating {name}"):
             for label, domain, driven in cases:
                 runs = unseen_runs(
-                    system, artifact.filter.dt, self.trajectories, self.duration, self.seed, domain, driven
+                    system,
+                    artifact.filter.dt,
+                    self.trajectories,
+                    self.duration,
+                    self.seed,
+                    domain,
+                    driven,
+                    process_noise=self.process_noise,
                 )
+                label += suffix
                 for level in self.noise:
                     found = errors(
                         artifact, system, runs, level, self.seed, skip=min(5.0, self.duration / 2) if driven else None

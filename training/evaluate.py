@@ -37,16 +37,18 @@ class Errors:
 
 @dataclass(frozen=True)
 class Runs:
-    """Noise-free test trajectories.
+    """Test trajectories, measured without noise.
 
     x : states, (steps + 1, n, nx).
     u : inputs, (steps, n, nu).
     inside : which of the trajectories drawn stayed within the system's declared bounds; the others are not in x and u.
+    process_noise : its level, as of the environments.
     """
 
     x: np.ndarray
     u: np.ndarray
     inside: np.ndarray
+    process_noise: float = 0.0
 
     @property
     def escaped(self) -> int:
@@ -56,7 +58,7 @@ class Runs:
     def first(self, n: int) -> "Runs":
         """The first n of those drawn. (Alone they might differ: rounding depends on the batch, and chaos on it.)"""
         inside = self.inside[:n]
-        return Runs(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside)
+        return Runs(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside, self.process_noise)
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -82,36 +84,44 @@ def unseen_runs(
     domain: Domain = "X",
     driven: bool = False,
     first: int = EVALUATION_SEED,
+    process_noise: float = 0.0,
 ) -> Runs:
-    """Test trajectories without noise; driven ones alternate random bounded steps and sines.
+    """Test trajectories; driven ones alternate random bounded steps and sines.
 
-    ``first`` is the first entry of the seed: of evaluation or of validation.
+    ``first`` is the first entry of the seed: of evaluation or of validation. ``process_noise`` is its level.
 
-    Raises ValueError on an unknown domain, or unless n, duration and seed make sense.
+    Raises ValueError on an unknown domain, or unless n, duration, seed and level make sense.
     """
     if n < 1 or seed < 0 or not duration >= dt:
         raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
     if domain not in get_args(Domain):
         raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
+    if not 0 <= process_noise < np.inf:
+        raise ValueError(f"process_noise must be finite and not negative, got {process_noise!r}")
     rng = np.random.default_rng([first, seed])
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
-    x = simulate(system, x0, steps, dt, u=u if driven else None)
+    w = None
+    if process_noise:
+        uniform = np.random.default_rng([first, seed, 2]).uniform(-1.0, 1.0, (steps, n, system.nx))
+        w = process_noise * np.array(system.scale) * uniform
+    x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
-    return Runs(x[:, inside], u[:, inside], inside)
+    return Runs(x[:, inside], u[:, inside], inside, process_noise)
 
 
 def errors(
     artifact: Artifact, system: System, runs: Runs, measurement_noise: float, seed: int, skip: float | None = None
 ) -> Errors:
-    """Errors of an observer on test trajectories, told the noise level that it sees.
+    """Errors of an observer on test trajectories, told the levels of noise.
 
     skip : seconds left out of ``late``; None is a fifth of the run.
     """
     rng = np.random.default_rng([EVALUATION_SEED, seed, 1])
     y = output(system, runs.x)
     y = y + measurement_noise * rng.standard_normal(y.shape)
-    x_hat = KKLObserver(artifact, measurement_noise).estimate(y, runs.u if artifact.nu else None)
+    observer = KKLObserver(artifact, measurement_noise, process_noise=runs.process_noise)
+    x_hat = observer.estimate(y, runs.u if artifact.nu else None)
     first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
     return Errors(smape(runs.x, x_hat), smape(runs.x, x_hat, first), runs.escaped)

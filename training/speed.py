@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 import kkl_gym
 from kkl_gym.compiled import batch_step
@@ -48,7 +48,7 @@ class Speed:
         tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
         seconds = self._in_turns(tasks)
         ratios = _ratios(seconds, REFERENCE)
-        table = Table("environment", "µs per step", f"speed relative to {REFERENCE}")
+        table = Table(Column("environment", no_wrap=True), "µs per step", f"speed relative to {REFERENCE}")
         for name, ratio in ratios.items():
             table.add_row(name, f"{1e6 * np.median(seconds[name]) / self.steps:.1f}", f"{ratio:.2f}")
         console.print(table)
@@ -74,7 +74,8 @@ class Speed:
             parts[name] = _parts(env, info, np.median(seconds[name]) / self.vector_steps)
         ratios = _ratios(seconds, VECTOR_REFERENCE)
         title = f"{self.num_envs} rows"
-        table = Table(title, "µs per step", "simulation", "network", f"speed relative to {VECTOR_REFERENCE}")
+        first = Column(title, no_wrap=True)
+        table = Table(first, "µs per step", "simulation", "network", f"speed relative to {VECTOR_REFERENCE}")
         for name, ratio in ratios.items():
             whole = f"{1e6 * np.median(seconds[name]) / self.vector_steps:.0f}"
             table.add_row(name, whole, parts[name]["simulation"], parts[name]["network"], f"{ratio:.2f}")

@@ -4,7 +4,7 @@ from inspect import isabstract
 from typing import Any
 
 from kkl_gym.loading import load_class
-from training.methods.ablation import BySOAP, MoreModes, NoiseAware, PapersSPINN, Solved, Transients, Tuned
+from training.methods.ablation import BySOAP, MoreModes, NoiseAware, OwnFree, PapersSPINN, Solved, Transients, Tuned
 from training.methods.autoencoder import AE
 from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task
 from training.methods.dmf import DMF, DMFNoise
@@ -18,7 +18,7 @@ METHODS: dict[str, type[Method[Any]]] = {
 }
 # Steps from the paper's pipeline to the package's and past it, which ``make ablation`` compares in this order.
 ABLATION: dict[str, type[Method[Any]]] = {
-    cls.name: cls for cls in (PapersSPINN, Solved, Transients, NoiseAware, MoreModes, BySOAP, Default, Tuned)
+    cls.name: cls for cls in (PapersSPINN, Solved, Transients, NoiseAware, MoreModes, BySOAP, OwnFree, Default, Tuned)
 }
 
 

@@ -92,10 +92,7 @@ class MoreModes(Ablation):
 
 
 class BySOAP(Ablation):
-    """The same by SOAP.
-
-    The default has an inverse of its own for free motion beside, and for some systems samples of its own.
-    """
+    """The same by SOAP."""
 
     name: ClassVar[str] = "ablation-soap"
     label: ClassVar[str] = "... by SOAP"
@@ -103,6 +100,17 @@ class BySOAP(Ablation):
     def changes(self, task: Task) -> Mapping[str, Any]:
         """One map for free and driven motion."""
         return TOGETHER
+
+
+class OwnFree(Ablation):
+    """The default, which has an inverse of its own for free motion, but no process noise in training."""
+
+    name: ClassVar[str] = "ablation-free"
+    label: ClassVar[str] = "... inverse of free motion"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """No disturbed motions."""
+        return {"disturbed": 0.0}
 
 
 class Tuned(Ablation):
