@@ -118,7 +118,8 @@ def compiled_step(system: System) -> Step:
 
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Values, (..., width), as float32 within bounds, (width,)."""
-    kernel = _clipping() if values.ndim == 2 and len(values) >= MANY_ROWS else None
+    many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
+    kernel = _clipping() if many else None
     if kernel is None:
         out: np.ndarray = values.astype(np.float32)
         np.maximum(out, low, out=out)
@@ -131,9 +132,10 @@ def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
 
 @functools.cache
 def _clipping() -> Callable[..., None] | None:
-    if importlib.util.find_spec("numba") is None:
+    try:
+        import numba
+    except ImportError:
         return None
-    import numba
 
     @numba.njit  # type: ignore[untyped-decorator]
     def kernel(values: np.ndarray, low: np.ndarray, high: np.ndarray, out: np.ndarray) -> None:

@@ -162,7 +162,7 @@ class KKLVectorObservation(VectorEstimate):
     Raises
     ------
     ValueError : as :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what
-        the observer must know.
+        the observer must know (process noise only if the map asks for it).
     """
 
     def __init__(
@@ -175,6 +175,8 @@ class KKLVectorObservation(VectorEstimate):
         monitor: bool = False,
     ) -> None:
         installed = Installed(plant_of(env), observer, estimate, measurement_noise, ignore_input, monitor)
+        if installed.observer.artifact.process_max is not None:
+            plant_of(env, "process_noise")
         super().__init__(env, installed)
         self.observer = installed.observer
         self.estimate = estimate
@@ -277,8 +279,11 @@ def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
     return mode
 
 
-def plant_of(env: VectorEnv) -> Plant:
-    """What the rows of a vector environment have in common; raises ValueError if they are not ours or differ."""
+def plant_of(env: VectorEnv, *also: str) -> Plant:
+    """What the rows of a vector environment have in common; raises ValueError if they are not ours or differ.
+
+    also : attributes of a plant in which they must agree as well.
+    """
     base: Any = env.unwrapped
     if isinstance(base, KKLVectorEnv):
         return base.plant
@@ -288,7 +293,7 @@ def plant_of(env: VectorEnv) -> Plant:
         raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {base}") from None
     first = plants[0]
     for plant in plants:
-        for name in ("system", "dt", "measurement_noise", "process_noise"):
+        for name in ("system", "dt", "measurement_noise", *also):
             if getattr(plant, name) != getattr(first, name):
                 raise ValueError(f"the environments differ in {name}: one observer cannot serve all")
     return first

@@ -19,11 +19,12 @@ from observers.filter import LinearFilter
 from observers.monitor import Limits
 from observers.network import MLP
 
-FORMAT = 1
+FORMATS = (1, 2)  # the second has maps that are told the process noise; the others are still written as the first
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
-_INVERSE_SCALARS = ("noise_unit", "noise_max", "process_unit", "process_max", "age_unit", "age_max")
+_INVERSE_SCALARS = ("noise_unit", "noise_max", "age_unit", "age_max")
+_PROCESS_SCALARS = ("process_unit", "process_max")
 _INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
@@ -92,6 +93,8 @@ class InverseMap:
         if self.features[0] != "z_y":
             raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
         modes, size = self.whiten.shape
+        if not (self.noise_unit > 0 and self.age_unit > 0 and self.process_unit > 0 and self.process_max > 0):
+            raise ArtifactError("units of noise and age, and the highest level of process noise, must be positive")
         conditions = sum(name in self.features for name in ("measurement_noise", "process_noise", "age"))
         if self.mlp.inputs != modes + conditions or self.noise_gain.shape != (modes,) or self.z_offset.shape != (size,):
             raise ArtifactError(
@@ -158,6 +161,8 @@ class Artifact:
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
         if free is not None and (len(free.x_offset) != self.nx or free.noise_max != self.inverse.noise_max):
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
+        if free is not None and _process(free) != _process(self.inverse):
+            raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
         if self.limits is not None and (self.C is None or self.limits.mean.shape[1] != self.ny):
@@ -177,6 +182,12 @@ class Artifact:
     def nu(self) -> int:
         """Number of inputs that the observer takes into account."""
         return self.filter.nu
+
+    @property
+    def process_max(self) -> float | None:
+        """The highest level of process noise that the map was trained for; None if it is not told the level."""
+        found = _process(self.inverse)
+        return None if found is None else found[1]
 
     def check(self, system: str, parameters: Mapping[str, float], dt: float, ny: int, nu: int) -> None:
         """Raise ArtifactError, naming both values, unless the observer was made for this system, dt and sizes."""
@@ -209,7 +220,7 @@ class Artifact:
         if self.free is not None:
             described["free"] = _put_inverse(tensors, "free", self.free)
         meta: dict[str, Any] = {
-            "format": FORMAT,
+            "format": FORMATS[0] if self.process_max is None else FORMATS[1],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
@@ -260,8 +271,8 @@ class Artifact:
 
     @classmethod
     def _assemble(cls, meta: Any, tensors: Mapping[str, np.ndarray]) -> "Artifact":
-        if meta["format"] != FORMAT:
-            raise ArtifactError(f"it has format {meta['format']!r}, this version of kkl-gym reads {FORMAT}")
+        if meta["format"] not in FORMATS:
+            raise ArtifactError(f"it has format {meta['format']!r}, this version of kkl-gym reads {FORMATS}")
         for name, tensor in tensors.items():
             if not np.isfinite(tensor).all():
                 raise ArtifactError(f"its tensor {name} is not finite")
@@ -285,11 +296,17 @@ class Artifact:
         )
 
 
+def _process(inverse: InverseMap) -> tuple[float, float] | None:
+    """Unit and end of the levels of process noise that a map is told, if it is."""
+    return (inverse.process_unit, inverse.process_max) if "process_noise" in inverse.features else None
+
+
 def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
     _put_mlp(tensors, prefix, inverse.mlp)
     for name in _INVERSE_ARRAYS:
         tensors[f"{prefix}.{name}"] = np.ascontiguousarray(getattr(inverse, name), dtype=float)
-    scalars = {name: getattr(inverse, name) for name in _INVERSE_SCALARS}
+    names = (*_INVERSE_SCALARS, *(_PROCESS_SCALARS if _process(inverse) else ()))
+    scalars = {name: getattr(inverse, name) for name in names}
     return {
         "features": list(inverse.features),
         "activation": inverse.mlp.activation,

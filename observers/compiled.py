@@ -10,7 +10,6 @@ from collections.abc import Callable
 import numpy as np
 
 MANY_ROWS = 128  # fewer gain too little to wait a second for the compiler
-_AT_ONCE = 3  # terms in one pass; a filter of one output and one known input has three: y, u and the next y
 
 
 class SparseUpdate:
@@ -31,21 +30,21 @@ class SparseUpdate:
             raise ValueError(f"{len(self._rows)} entries off the diagonal of {len(transition)} are too many to gain")
         self._mixing = transition[self._rows, self._columns]
         self._terms = len(drive)
-        self._padding = -len(drive) % _AT_ONCE
-        self._drive = np.pad(drive, ((0, self._padding), (0, 0)))
+        self._drive = np.pad(drive, ((0, -len(drive) % 3), (0, 0)))  # the kernel takes three terms at once
         _kernel()  # or say now that there is no Numba
 
-    def __call__(self, z: np.ndarray, terms: np.ndarray) -> np.ndarray:
-        """z, (n, size), and the terms, (n, m), to the next z, (n, size); raises ValueError on other shapes."""
-        if z.shape[1:] != self._diagonal.shape or terms.shape != (len(z), self._terms):
-            raise ValueError(
-                f"expected z (n, {len(self._diagonal)}) and {self._terms} terms a row, got {z.shape} and {terms.shape}"
-            )
-        if self._padding:
-            terms = np.pad(terms, ((0, 0), (0, self._padding)))
-        z, terms = (np.ascontiguousarray(values, dtype=float) for values in (z, terms))
+    def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
+        """z, (n, size), and the terms, (n, ...) each and m columns together, to the next z, (n, size).
+
+        Raises ValueError on other shapes.
+        """
+        if z.shape[1:] != self._diagonal.shape:
+            raise ValueError(f"expected z of shape (n, {len(self._diagonal)}), got {z.shape}")
+        columns = np.zeros((len(z), len(self._drive)))
+        np.concatenate(terms, axis=1, out=columns[:, : self._terms])  # raises if they do not fit
+        z = np.ascontiguousarray(z, dtype=float)
         z_next = np.empty(z.shape)
-        _kernel()(z, terms, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
+        _kernel()(z, columns, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
         return z_next
 
 
@@ -66,7 +65,7 @@ def _kernel() -> Callable[..., None]:
     ) -> None:
         n, size = z.shape
         for row in range(n):
-            a, b, c = terms[row, 0], terms[row, 1], terms[row, 2]
+            a, b, c = terms[row, 0], terms[row, 1], terms[row, 2]  # y, u and the next y, if there is one of each
             for i in range(size):
                 z_next[row, i] = diagonal[i] * z[row, i] + drive[0, i] * a + drive[1, i] * b + drive[2, i] * c
             for j in range(3, len(drive), 3):

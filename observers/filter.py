@@ -1,6 +1,7 @@
 """The linear half of the observer, z' = A z + B y, integrated exactly between samples."""
 
 import functools
+from typing import Any
 
 import numpy as np
 
@@ -85,9 +86,12 @@ class LinearFilter:
         (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
-            return self._compiled(z, np.concatenate((y, u, y_next), axis=-1))
+            return self._compiled(z, y, u, y_next)
         z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
         return z_next
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
 
     @functools.cached_property
     def _compiled(self) -> SparseUpdate | None:

@@ -2,6 +2,7 @@
 
 import math
 import os
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,8 @@ class KKLObserver:
     measurement_noise : standard deviation of the noise on each sample of the output, for maps that ask for it.
     monitor : whether to watch if the samples fit the estimates, see :attr:`score`.
     process_noise : level of the noise on the state's derivative, in multiples of the system's scale per second as for
-        the environments, for maps that ask for it; what lies beyond their training counts as its end.
+        the environments, for maps that ask for it. What lies beyond their training counts as its end, and so does None:
+        the system's own level, which is also that of the environments and of the monitor's limits.
 
     Raises
     ------
@@ -35,17 +37,19 @@ class KKLObserver:
     """
 
     def __init__(
-        self, artifact: Artifact, measurement_noise: float = 0.5, monitor: bool = False, process_noise: float = 0.0
+        self,
+        artifact: Artifact,
+        measurement_noise: float = 0.5,
+        monitor: bool = False,
+        process_noise: float | None = None,
     ) -> None:
-        if not 0 <= process_noise < math.inf:
-            raise ValueError(f"process_noise must be finite and not negative, got {process_noise!r}")
         if monitor and artifact.limits is None:
             raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
         self.artifact = artifact
         self._monitored = monitor
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
-        self.process_noise = float(process_noise)
+        self._process_noise = _level((artifact.process_max or 0.0) if process_noise is None else process_noise)
         self.measurement_noise = measurement_noise
         self._age: Any = 0  # samples since reset, an array where rows have restarted
 
@@ -69,9 +73,23 @@ class KKLObserver:
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
         self._measurement_noise, self._monitor, self._x_hat = float(level), monitor, None
-        self._driven = _Decoder(inverse, level, self.process_noise)
-        free = self.artifact.free
-        self._free = None if free is None else _Decoder(free, level, self.process_noise)
+        self._tell()
+
+    @property
+    def process_noise(self) -> float:
+        """Level of process noise that the estimate assumes, in multiples of the system's scale per second."""
+        return self._process_noise
+
+    @process_noise.setter
+    def process_noise(self, level: float) -> None:
+        self._process_noise, self._x_hat = _level(level), None
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tell the maps the levels of noise."""
+        levels, free = (self._measurement_noise, self._process_noise), self.artifact.free
+        self._driven = _Decoder(self.artifact.inverse, *levels)
+        self._free = None if free is None else _Decoder(free, *levels)
 
     @property
     def z(self) -> np.ndarray:
@@ -298,6 +316,12 @@ class _Decoder:
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
 
 
+def _level(process_noise: float) -> float:
+    if isinstance(process_noise, bool) or not isinstance(process_noise, Real) or not 0 <= process_noise < math.inf:
+        raise ValueError(f"process_noise must be a finite number, not negative, got {process_noise!r}")
+    return float(process_noise)
+
+
 def _finite(values: np.ndarray) -> bool:
     if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
         return all(-_LARGEST <= value <= _LARGEST for value in values.tolist())  # false for NaN too
@@ -308,7 +332,7 @@ def load(
     name_or_path: str | os.PathLike[str],
     measurement_noise: float = 0.5,
     monitor: bool = False,
-    process_noise: float = 0.0,
+    process_noise: float | None = None,
 ) -> KKLObserver:
     """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
 

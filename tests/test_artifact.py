@@ -23,6 +23,7 @@ KINDS = [
     {"inputs": False, "noise": False, "age": False},
     {"pair": True},
     {"forward": True},
+    {"process": True, "free": True},
     {"free": True},
     {"free": True, "noise": False},
 ]
@@ -149,7 +150,32 @@ def test_tensors_that_are_not_finite(file, tensor, value):
     assert tensor in str(raised.value)
 
 
-@pytest.mark.parametrize("number", [0, 2, "1", None])
+@pytest.mark.parametrize(("process", "number"), [(False, 1), (True, 2)])
+def test_maps_that_are_told_of_process_noise_have_a_format_of_their_own(tmp_path, make_artifact, process, number):
+    path = tmp_path / "map.safetensors"
+    make_artifact(process=process, free=True).save(path)
+    with safe_open(path, framework="numpy") as opened:
+        text = opened.metadata()["kkl-gym"]
+    assert json.loads(text)["format"] == number
+    assert ("process_max" in text) == process
+    assert Artifact.read(path).process_max == (0.2 if process else None)
+
+
+@pytest.mark.parametrize("wrong", [{"process_unit": 0.0}, {"process_unit": np.nan}, {"process_max": -1.0}])
+def test_impossible_levels_of_process_noise(wrong, make_artifact):
+    with pytest.raises(ArtifactError, match="must be positive"):
+        dataclasses.replace(make_artifact(process=True).inverse, **wrong)
+
+
+def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):
+    artifact, other = make_artifact(process=True, free=True), make_artifact(free=True)
+    with pytest.raises(ArtifactError, match="told of process noise"):
+        dataclasses.replace(artifact, free=other.free)
+    with pytest.raises(ArtifactError, match="told of process noise"):
+        dataclasses.replace(artifact, free=dataclasses.replace(artifact.free, process_max=0.3))
+
+
+@pytest.mark.parametrize("number", [0, 3, "1", None])
 def test_other_formats(file, number):
     rewrite(file, lambda tensors, meta: meta.update(format=number))
     with raises_naming(file) as raised:

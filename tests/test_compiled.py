@@ -233,6 +233,9 @@ def test_clipped(monkeypatch, compiled, dtype):
     assert out.dtype == np.float32
     assert np.array_equal(out, np.clip(values.astype(np.float32), low, high), equal_nan=True)
     assert np.array_equal(out[1], clipped(values[1], low, high))
+    assert (kkl_gym.compiled._clipping() is not None) == compiled
+    with pytest.raises(ValueError, match="broadcast"):
+        clipped(values, low[:2], high[:2])
 
 
 @pytest.mark.parametrize("missing", ["numba", "sympy"])

@@ -6,9 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import training.calibration
+import training.certificates.certificate
 import training.faults
-from observers import Artifact, Limits
+from kkl_gym import VanDerPol
+from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
+from training.certificates.smooth import decoder
 from training.cli import main
 from training.faults import FAULTS, play, report
 
@@ -29,6 +33,38 @@ def found():
     from kkl_gym import get_system
 
     return play(with_limits("lorenz"), get_system("lorenz"), 12, 16.0, 0.5, 0)
+
+
+def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact, monkeypatch):
+    """It acts in all their runs: limits from an observer told less would not be those of one in an environment."""
+    told = []
+
+    class Spy(KKLObserver):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            told.append(self.process_noise)
+
+    def spy(artifact, measurement_noise, process_noise=0.0):
+        told.append((measurement_noise, process_noise))
+        return decoder(artifact, measurement_noise, process_noise)
+
+    class Noisy(VanDerPol):
+        process_noise = 0.12  # not what such an observer takes by default, 0.2
+
+    system = Noisy()
+    monkeypatch.setattr(training.calibration, "KKLObserver", Spy)
+    monkeypatch.setattr(training.faults, "KKLObserver", Spy)
+    artifact = dataclasses.replace(make_artifact(process=True, free=True), C=np.array([[1.0, 0.0]]))
+    calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
+    assert set(told) == {0.12}
+    told.clear()
+    play(calibrated, system, 2, 12.0, 0.5, 0)
+    assert set(told) == {0.12}
+    told.clear()
+    monkeypatch.setattr(training.certificates.certificate, "decoder", spy)
+    training.certify(artifact, system, 0.3, trajectories=4)
+    assert set(told) == {(0.3, 0.12), (0.0, 0.0)}
+    assert told.count((0.3, 0.12)) == 2  # for the errors, and for what noise will do
 
 
 def test_one_row_for_each_run_and_fault(found):

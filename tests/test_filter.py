@@ -1,3 +1,4 @@
+import pickle
 import sys
 
 import numpy as np
@@ -121,6 +122,16 @@ def test_a_large_batch_without_numba(monkeypatch):
     observers.compiled._kernel.cache_clear()
     assert np.allclose(run(other, y, u), expected, rtol=1e-13, atol=1e-14)
     assert other._compiled is None
+
+
+def test_a_filter_that_has_compiled_goes_where_numba_is_not(monkeypatch):
+    linear = random_filter(DIAGONAL)
+    y, u = signals(linear, 3, MANY_ROWS)
+    expected = run(linear, y, u)
+    packed = pickle.dumps(linear)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    observers.compiled._kernel.cache_clear()
+    assert np.allclose(run(pickle.loads(packed), y, u), expected, rtol=1e-13, atol=1e-14)
 
 
 def test_a_full_transition_is_numpys():

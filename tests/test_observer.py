@@ -300,7 +300,12 @@ def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_ar
     assert not np.allclose(estimates[0], estimates[1], atol=1e-6)
     assert not np.allclose(estimates[1], estimates[2], atol=1e-6)
     assert np.array_equal(estimates[2], estimates[3])
-    assert np.array_equal(estimates[0], KKLObserver(artifact).reset([1.0]))
+    assert np.array_equal(estimates[2], KKLObserver(artifact).reset([1.0]))
+    observer = KKLObserver(artifact)
+    observer.process_noise = 0.1
+    assert np.array_equal(estimates[1], observer.reset([1.0]))
+    observer.process_noise = 0.0
+    assert np.array_equal(estimates[0], observer.decode())
     inverse = artifact.free or artifact.inverse
     modes = inverse.gain(0.5) * (
         inverse.whiten @ (artifact.filter.start(np.ones(1))[: len(inverse.z_offset)] - inverse.z_offset)
@@ -315,10 +320,14 @@ def test_process_noise_is_told_only_to_maps_that_ask(make_artifact):
     assert np.array_equal(KKLObserver(artifact, process_noise=0.1).reset([1.0]), KKLObserver(artifact).reset([1.0]))
 
 
-@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf])
+@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf, True, "0.1"])
 def test_wrong_process_noise_raises(level, make_artifact):
-    with pytest.raises(ValueError, match="process_noise must be finite and not negative"):
+    with pytest.raises(ValueError, match="process_noise must be a finite number, not negative, got"):
         KKLObserver(make_artifact(), process_noise=level)
+    observer = KKLObserver(make_artifact(process=True), process_noise=0.1)
+    with pytest.raises(ValueError, match="process_noise must be"):
+        observer.process_noise = level
+    assert observer.process_noise == 0.1
 
 
 def test_age_changes_the_estimate_until_age_max(make_artifact):

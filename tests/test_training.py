@@ -352,7 +352,10 @@ def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(closed_l
     assert 50 <= len(data.level) <= 60
     assert len(np.unique(data.level)) >= 5
     assert ((data.level >= 0) & (data.level <= 1.0)).all()
-    start = KKLObserver(artifact, 0.0).reset(data.x[0, data.level == 0, :1])
+    disturbed = (data.process_noise > 0).mean()
+    assert 0.2 < disturbed < 0.8 if artifact.process_max else disturbed == 0
+    quiet = (data.level == 0) & (data.process_noise == 0)
+    start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, quiet, :1])
     assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen) or not len(start)
     states = {tuple(row) for row in data.x.reshape(-1, 2).round(6).tolist()}
     assert not any(tuple(row) in states for x_hat in seen for row in x_hat.round(6).tolist())
@@ -368,15 +371,28 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop
     for row in range(2048, 4096, 200):
         state = x[row].numpy() * inverse.x_scale + inverse.x_offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-        observer = KKLObserver(artifact, float(data.level[trajectory]))
+        levels = float(data.level[trajectory]), float(data.process_noise[trajectory])
+        observer = KKLObserver(artifact, levels[0], process_noise=levels[1])
         shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
         np.testing.assert_allclose(shown, expected, atol=1e-3)
         at_run_time = cell[row] - sampler.open_loop.cells
         if sampler.open_loop.process_max:
-            assert at_run_time % 3 == 0  # there is none in closed loop
+            level = data.process_noise[trajectory]
+            assert at_run_time % 3 == int(level > 0) + int(level > 0.025)
             at_run_time = at_run_time // 3
         assert (at_run_time % 7 == 0) == (data.level[trajectory] == 0)
+
+
+def test_a_run_is_not_resumed_for_another_process_noise(tmp_path):
+    config = toy(Oscillator(), duration=1.0)
+    train(Oscillator(), config, tmp_path, device=CPU)
+
+    class Disturbed(Oscillator):
+        process_noise = 0.5
+
+    with pytest.raises(ValueError, match=r"process_noise = 0\.05 there, 0\.5 here"):
+        train(Disturbed(), config, tmp_path, resume=True, device=CPU)
 
 
 def test_closing_the_loop_is_a_second_stage(tmp_path):

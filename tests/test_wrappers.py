@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
@@ -176,14 +177,14 @@ def test_wrong_arguments(saved, tmp_path):
 def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
     asked = []
 
-    def load(name, noise, monitor):
-        asked.append((name, noise))
+    def load(name, noise, monitor, process_noise):
+        asked.append((name, noise, process_noise))
         assert not monitor
         return KKLObserver(make_artifact(name), noise)
 
     monkeypatch.setattr(kkl_gym.installed, "load", load)
-    KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7))
-    assert asked == [("van_der_pol", 0.7)]
+    KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7, process_noise=0.02))
+    assert asked == [("van_der_pol", 0.7, 0.02)]
 
 
 def test_blind_map_under_action(saved):
@@ -206,6 +207,10 @@ def test_the_map_is_told_the_environments_process_noise(saved, level):
     _, info = env.reset(seed=0)
     assert np.array_equal(info["x_hat"], expected.reset(info["y"]))
     assert not np.allclose(info["x_hat"], KKLObserver(Artifact.read(path), 0.5, process_noise=0.01).reset(info["y"]))
+    mixed = SyncVectorEnv([lambda level=level: KKLEnv("van_der_pol", process_noise=level) for level in (0.0, 0.1)])
+    with pytest.raises(ValueError, match="differ in process_noise"):
+        KKLVectorObservation(mixed, path)
+    assert KKLVectorObservation(mixed, saved()).observer.process_noise == 0.0  # a map that does not ask
     many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
     _, info = many.reset(seed=0)
     assert np.allclose(info["x_hat"], expected.reset(info["y"]), atol=1e-6)

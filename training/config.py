@@ -153,8 +153,8 @@ SPECTRA: dict[str, tuple[int, float, float]] = {
     "lorenz": (13, -25.0, -1.5),
 }
 # What differs from the preset. Van der Pol's phase is the hardest to tell from noise: slow complex modes at frequencies
-# of y, as `kkl-gym tune` chooses them, help there, and more samples at high noise. What is remembered for so long must
-# not be thrown by process noise. No input within its bound leads the oscillator out of X.
+# of y, as `kkl-gym tune` chooses them, help there, and more samples at high noise. No input within its bound leads the
+# oscillator out of X.
 SETTINGS: dict[str, dict[str, Any]] = {
     "van_der_pol": {
         "pairs": ((-0.1, 0.718), (-0.1, 2.128), (-0.1, 0.6836), (-0.3, 0.718)),

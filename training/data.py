@@ -17,7 +17,8 @@ PUSH = 20.0  # seconds for which constant ones do
 EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
-QUIET = 0.2  # share of closed-loop trajectories without noise
+QUIET = 0.2  # share of closed-loop trajectories without measurement noise
+DISTURBED = 0.5  # share with process noise, where the map is told
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def trajectories(
             x0[some] = np.where(np.isfinite(led).all(-1)[:, None], led, x0[some])
         u = random_inputs(system, count, steps, dt, rng, kinds) if kinds else np.zeros((steps, count, 0))
         w, level = None, np.zeros(count)
-        if disturbed:
+        if disturbed and system.process_noise:
             level = system.process_noise * np.where(rng.random(count) < disturbed, np.sqrt(rng.random(count)), 0.0)
             w = level[:, None] * system.scale * rng.uniform(-1.0, 1.0, (steps, count, system.nx))
         x = simulate(system, x0, steps, dt, u=u if kinds else None, w=w)
@@ -176,15 +177,16 @@ def record_closed_loop(
 
     Never on the true state: such inputs would tell the observer, which filters them, what it is to find out by itself.
     For the same reason noise is not added afterwards, but is what the observer and through it the controller saw.
-    Groups of trajectories differ in noise level, a fifth having none, and in how long an action is held; rows in how
-    much is added to it. Trajectories that leave the declared bounds are dropped, so that there may be fewer than n.
+    Groups of trajectories differ in noise level, a fifth having none, and in how long an action is held, and if the
+    observer is told it in the level of process noise, half having none; rows in how much is added to an action.
+    Trajectories that leave the declared bounds are dropped, so that there may be fewer than n.
 
     Raises ValueError if that happens to more than half of them.
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     u_max = np.array(system.u_max)
-    xs, zs, levels = [], [], []
+    xs, zs, levels, process_levels = [], [], [], []
     groups = np.array_split(np.arange(n), min(n, GROUPS))
     for i, group in enumerate(groups):
         count = len(group)
@@ -192,12 +194,15 @@ def record_closed_loop(
         level = 0.0 if position < 0 else float(artifact.inverse.noise_max * 100 ** (np.sqrt(position) - 1))
         hold = int(rng.choice(HOLDS))
         amplitude = EXPLORATION * rng.random((count, 1))
-        observer = KKLObserver(artifact, level)
+        process_noise = 0.0
+        if artifact.process_max is not None and rng.random() < DISTURBED:
+            process_noise = system.process_noise * float(np.sqrt(rng.random()))
+        observer = KKLObserver(artifact, level, process_noise=process_noise)
         x = rng.uniform(*system.box(), (count, system.nx)).T.copy()
         inside = np.ones(count, dtype=bool)
         x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
         slot = {int(age): i for i, age in enumerate(ages)}
-        no_noise = np.zeros_like(x)
+        w = np.zeros_like(x)
         u = np.zeros((count, system.nu))
         for k in range(steps + 1):
             y = output(system, x.T) + level * rng.standard_normal((count, system.ny))
@@ -210,12 +215,15 @@ def record_closed_loop(
             if k % hold == 0:
                 action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (count, system.nu))
                 u = np.clip(action, -1.0, 1.0) * u_max
-            after = advance_batch(system, x, np.ascontiguousarray(u.T), no_noise, dt)
+            if process_noise:
+                w = process_noise * np.array(system.scale)[:, None] * rng.uniform(-1.0, 1.0, w.shape)
+            after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
             inside &= ((after >= low) & (after <= high)).all(0)
             x = np.where(inside, after, x)
         xs.append(x_rows[:, inside])
         zs.append(z_rows[:, inside])
         levels.append(np.full(int(inside.sum()), level))
+        process_levels.append(np.full(int(inside.sum()), process_noise))
         report(int(group[-1]) + 1)
     kept = sum(map(len, levels))
     if 2 * kept < n:
@@ -223,4 +231,5 @@ def record_closed_loop(
             f"of {n} trajectories under the controller only {kept} stayed within bounds = {system.bounds}; widen them, "
             "or shrink X"
         )
-    return ClosedLoop(ages, np.concatenate(xs, 1), np.concatenate(zs, 1), np.zeros(kept), np.concatenate(levels))
+    parts = np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(process_levels), np.concatenate(levels)
+    return ClosedLoop(ages, *parts)

@@ -112,9 +112,7 @@ class TrajectorySampler:
         self._age_cell = self.age_cell(data.ages, device)
         self._process_cell = torch.zeros(n, dtype=torch.long, device=device)
         if process_max:
-            part = data.process_noise / process_max
-            self._process = tensor(np.log1p(part / PROCESS_UNIT), device)
-            self._process_cell = torch.as_tensor((part > 0).astype(int) + (part > 0.5), device=device)
+            self._process, self._process_cell = self.process_conditions(data.process_noise, device)
         self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_max else 0) + 1
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -148,7 +146,13 @@ class TrajectorySampler:
             cell.reshape(batch),
         )
 
-    def cell(self, age: Any, level: Any, process: Any = 0) -> Any:
+    def process_conditions(self, process_noise: np.ndarray, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the network is told of levels of process noise, (n,), and their parts in the number of the cell."""
+        part = process_noise / self.process_max
+        cell = (part > 0).astype(int) + (part > 0.5)
+        return tensor(np.log1p(part / PROCESS_UNIT), device), torch.as_tensor(cell, device=device)
+
+    def cell(self, age: Any, level: Any, process: Any) -> Any:
         """Number of the cell where those of age, measurement noise and process noise meet."""
         return (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_max else 1) + process
 
@@ -204,6 +208,9 @@ class ClosedLoopSampler:
         position = np.log10(np.maximum(data.level / open_loop.noise_max, 1e-9)) / 2 + 1  # over two decades, as there
         level_cell = np.where(data.level > 0, 1 + np.clip(position * open_loop.LEVELS, 0, open_loop.LEVELS - 1), 0)
         self._level_cell = torch.as_tensor(level_cell.astype(int), device=device)
+        self._process_cell = torch.zeros_like(self._level_cell)
+        if open_loop.process_max:
+            self._process, self._process_cell = open_loop.process_conditions(data.process_noise, device)
         self.cells = 2 * open_loop.cells
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -215,9 +222,9 @@ class ClosedLoopSampler:
         rows = torch.randint(n, (half,), generator=generator, device=device)
         conditions = [self._level[rows], self._age[ages]]
         if self.open_loop.process_max:
-            conditions.insert(1, torch.zeros(half, device=device))
+            conditions.insert(1, self._process[rows])
         closed = torch.cat([self._modes[ages, rows], torch.stack(conditions, -1)], -1)
-        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows])
+        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows], self._process_cell[rows])
         return (
             torch.cat([inputs[:half], closed]),
             torch.cat([x[:half], self._x[ages, rows]]),

@@ -78,9 +78,10 @@ def train(
     started = time.monotonic()
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     folder.mkdir(parents=True, exist_ok=True)
-    identity = json.dumps([describe(system), dataclasses.asdict(config)], sort_keys=True)
-    fingerprint = hashlib.sha256(identity.encode()).hexdigest()[:16]
-    _claim(folder, {**describe(system), **dataclasses.asdict(config)}, resume)
+    noise = {"process_noise": system.process_noise, "scale": system.scale}
+    identity = {**describe(system), **noise, **dataclasses.asdict(config)}
+    fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
+    _claim(folder, identity, resume)
     torch.manual_seed(config.seed)
     rng = np.random.default_rng([TRAINING_SEED, config.seed])
 

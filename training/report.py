@@ -47,7 +47,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     for column, noise in enumerate((0.0, 0.5)):
         level = min(noise, artifact.inverse.noise_max)
         y = output(system, x) + level * rng.standard_normal((*x.shape[:2], system.ny))
-        x_hat = KKLObserver(artifact, level).estimate(y)
+        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])
             ax.plot(t, x[..., i], "k", lw=1.2, label="true")

@@ -27,8 +27,8 @@ class KKLMethod(Method[Artifact]):
     """Whatever trains an artifact."""
 
     def observer(self, trained: Artifact, system: System, dt: float, noise: float) -> CausalObserver:
-        """The observer of the package, told the noise level as far as it was trained for it."""
-        return KKLObserver(trained, min(noise, trained.inverse.noise_max))
+        """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
+        return KKLObserver(trained, min(noise, trained.inverse.noise_max), process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""
@@ -58,7 +58,7 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
 
 
 class Default(KKLMethod):
-    """The package's own: T_inv(z_y, z_u, noise, age) along driven, noisy trajectories (``kkl-gym train``).
+    """The package's own: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
 
     It simulates trajectories of its own, as many as everyone gets for each of its two inverses: free ones, some of
     which start where inputs have led from X, and driven ones. Each inverse has half of the time, though the
