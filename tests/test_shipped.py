@@ -33,7 +33,7 @@ def test_default_maps_are_as_accurate_as_promised(name):
     assert np.median(errors(artifact, system, runs, 0.0, seed=0).full) <= quiet
     assert np.median(errors(artifact, system, runs, 0.5, seed=0).full) <= noisy
     runs = unseen_runs(system, 0.01, 100, 50.0, seed=0, domain="1.5X")
-    x_hat = observers.KKLObserver(artifact, 0.0).estimate(output(system, runs.x), runs.u)
+    x_hat = observers.KKLObserver(artifact, 0.0, process_noise=0.0).estimate(output(system, runs.x), runs.u)
     assert np.median(component_smape(runs.x, x_hat, skip=1000)) <= beyond
     runs = unseen_runs(system, 0.01, 100, 50.0, seed=0, driven=True)
     assert runs.escaped <= 5
