@@ -179,7 +179,9 @@ class Evaluate:
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
             cases.append(("X, driven", "X", True))
-        table = Table(title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s")
+        table = Table(
+            title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s{suffix}"
+        )
         table.add_column("starts")
         for column in ("noise", "all steps", "after transient", "escaped"):
             table.add_column(column, justify="right")
@@ -196,14 +198,13 @@ class Evaluate:
                     driven,
                     process_noise=self.process_noise,
                 )
-                label += suffix
                 for level in self.noise:
                     found = errors(
                         artifact, system, runs, level, self.seed, skip=min(5.0, self.duration / 2) if driven else None
                     )
                     table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
                     lines += [
-                        f'{name},"{label}",{level:g},{i},{full:.6g},{late:.6g}'
+                        f'{name},"{label}{suffix}",{level:g},{i},{full:.6g},{late:.6g}'
                         for i, (full, late) in enumerate(zip(found.full, found.late))
                     ]
         console.print(table)
