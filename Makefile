@@ -25,7 +25,7 @@ format: $(VENV)/ready
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The commands that made the shipped maps, version 1: about two hours on two cores, into runs/; resumable. A new version ships
+# The commands that made the shipped maps, both versions: about three hours on two cores, into runs/; resumable. A new version ships
 # as observers/maps/NAME-vN.safetensors, beside the old ones.
 maps: $(VENV)/ready
 	for system in $(SYSTEMS); do for method in input-aware spinn; do \

@@ -95,6 +95,10 @@ class InverseMap:
         modes, size = self.whiten.shape
         if not (self.noise_unit > 0 and self.age_unit > 0 and self.process_unit > 0 and self.process_max > 0):
             raise ArtifactError("units of noise and age, and the highest level of process noise, must be positive")
+        if "process_noise" in self.features and not math.isfinite(self.process_max):
+            raise ArtifactError(
+                "a map that is told the process noise must say the highest level that it was trained for"
+            )
         conditions = sum(name in self.features for name in ("measurement_noise", "process_noise", "age"))
         if self.mlp.inputs != modes + conditions or self.noise_gain.shape != (modes,) or self.z_offset.shape != (size,):
             raise ArtifactError(

@@ -49,7 +49,7 @@ class KKLObserver:
         self._monitored = monitor
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
-        self._process_noise = _level((artifact.process_max or 0.0) if process_noise is None else process_noise)
+        self._process_noise = self._level(process_noise)
         self.measurement_noise = measurement_noise
         self._age: Any = 0  # samples since reset, an array where rows have restarted
 
@@ -81,9 +81,16 @@ class KKLObserver:
         return self._process_noise
 
     @process_noise.setter
-    def process_noise(self, level: float) -> None:
-        self._process_noise, self._x_hat = _level(level), None
+    def process_noise(self, level: float | None) -> None:
+        self._process_noise, self._x_hat = self._level(level), None
         self._tell()
+
+    def _level(self, process_noise: float | None) -> float:
+        if process_noise is None:
+            return self.artifact.process_max or 0.0
+        if isinstance(process_noise, bool) or not isinstance(process_noise, Real) or not 0 <= process_noise < math.inf:
+            raise ValueError(f"process_noise must be a finite number, not negative, got {process_noise!r}")
+        return float(process_noise)
 
     def _tell(self) -> None:
         """Tell the maps the levels of noise."""
@@ -314,12 +321,6 @@ class _Decoder:
             for i, condition in enumerate(conditions):
                 inputs[..., width + i] = condition
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
-
-
-def _level(process_noise: float) -> float:
-    if isinstance(process_noise, bool) or not isinstance(process_noise, Real) or not 0 <= process_noise < math.inf:
-        raise ValueError(f"process_noise must be a finite number, not negative, got {process_noise!r}")
-    return float(process_noise)
 
 
 def _finite(values: np.ndarray) -> bool:

@@ -165,6 +165,8 @@ def test_maps_that_are_told_of_process_noise_have_a_format_of_their_own(tmp_path
 def test_impossible_levels_of_process_noise(wrong, make_artifact):
     with pytest.raises(ArtifactError, match="must be positive"):
         dataclasses.replace(make_artifact(process=True).inverse, **wrong)
+    with pytest.raises(ArtifactError, match="highest level"):
+        dataclasses.replace(make_artifact(process=True).inverse, process_max=np.inf)
 
 
 def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):

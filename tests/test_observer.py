@@ -306,6 +306,8 @@ def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_ar
     assert np.array_equal(estimates[1], observer.reset([1.0]))
     observer.process_noise = 0.0
     assert np.array_equal(estimates[0], observer.decode())
+    observer.process_noise = None
+    assert np.array_equal(estimates[2], observer.decode())
     inverse = artifact.free or artifact.inverse
     modes = inverse.gain(0.5) * (
         inverse.whiten @ (artifact.filter.start(np.ones(1))[: len(inverse.z_offset)] - inverse.z_offset)

@@ -74,7 +74,7 @@ def test_spinn_maps_recover_states_from_their_own_forward_map(name):
 
 @pytest.mark.parametrize(("name", "seconds", "error"), [("van_der_pol", 1.0, 0.02), ("lorenz", 0.3, 0.02)])
 def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
-    system, observer = get_system(name), observers.load(name, measurement_noise=0.0)
+    system, observer = get_system(name), observers.load(name, 0.0, process_noise=0.0)
     runs = unseen_runs(system, 0.01, 20, 15.0, seed=0)
     y = output(system, runs.x)
     lost = round(seconds / 0.01)

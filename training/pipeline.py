@@ -78,7 +78,7 @@ def train(
     started = time.monotonic()
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     folder.mkdir(parents=True, exist_ok=True)
-    noise = {"process_noise": system.process_noise, "scale": system.scale}
+    noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}
     identity = {**describe(system), **noise, **dataclasses.asdict(config)}
     fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
     _claim(folder, identity, resume)
