@@ -115,9 +115,14 @@ class InverseMap:
         """The network's input for a noise level."""
         return np.log1p(measurement_noise / self.noise_unit)
 
-    def process_feature(self, process_noise: float) -> float:
-        """The network's input for a level of process noise."""
-        return math.log1p(min(process_noise, self.process_max) / self.process_unit)
+    def noise_features(self, measurement_noise: float, process_noise: float) -> list[float]:
+        """What the network is told of noise, in order: of none, one or both."""
+        told = []
+        if "measurement_noise" in self.features:
+            told.append(float(self.noise_feature(measurement_noise)))
+        if "process_noise" in self.features:
+            told.append(math.log1p(min(process_noise, self.process_max) / self.process_unit))
+        return told
 
     def age_feature(self, age: Any) -> Any:
         """The network's input for a time since reset, in seconds."""

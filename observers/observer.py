@@ -300,11 +300,7 @@ class _Decoder:
         self._inverse = inverse
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
-        self._conditions: list[Any] = []
-        if "measurement_noise" in inverse.features:
-            self._conditions.append(float(inverse.noise_feature(measurement_noise)))
-        if "process_noise" in inverse.features:
-            self._conditions.append(inverse.process_feature(process_noise))
+        self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         inverse, conditions = self._inverse, self._conditions

@@ -10,7 +10,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, Limits
 from training.data import output
-from training.signals import random_inputs
+from training.signals import draw_process_noise, random_inputs
 
 CALIBRATION_SEED = 5  # first entry of its seeds; those of training and evaluation are others
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
@@ -85,7 +85,7 @@ def sound_runs(
         u = np.zeros((steps, missing, system.nu))
         if artifact.nu:
             u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt, rng)
-        w = system.process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, (steps, missing, system.nx))
+        w = draw_process_noise(system, system.process_noise, missing, steps, rng)
         x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))

@@ -9,7 +9,7 @@ from kkl_gym.simulate import advance_batch, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, LinearFilter
 from training.controllers import Controller
-from training.signals import DRIVEN, KINDS, random_inputs
+from training.signals import DRIVEN, KINDS, draw_process_noise, random_inputs
 
 CHUNK = 500  # trajectories simulated at once
 EXCITATION = 10.0  # seconds for which random inputs lead starts out of the training box
@@ -117,7 +117,7 @@ def trajectories(
         w, level = None, np.zeros(count)
         if disturbed and system.process_noise:
             level = system.process_noise * np.where(rng.random(count) < disturbed, np.sqrt(rng.random(count)), 0.0)
-            w = level[:, None] * system.scale * rng.uniform(-1.0, 1.0, (steps, count, system.nx))
+            w = draw_process_noise(system, level, count, steps, rng)
         x = simulate(system, x0, steps, dt, u=u if kinds else None, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept += int(inside.sum())
@@ -186,7 +186,7 @@ def record_closed_loop(
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     u_max = np.array(system.u_max)
-    xs, zs, levels, process_levels = [], [], [], []
+    xs, zs, levels, disturbances = [], [], [], []
     groups = np.array_split(np.arange(n), min(n, GROUPS))
     for i, group in enumerate(groups):
         count = len(group)
@@ -194,10 +194,10 @@ def record_closed_loop(
         level = 0.0 if position < 0 else float(artifact.inverse.noise_max * 100 ** (np.sqrt(position) - 1))
         hold = int(rng.choice(HOLDS))
         amplitude = EXPLORATION * rng.random((count, 1))
-        process_noise = 0.0
+        disturbance = 0.0
         if artifact.process_max is not None and rng.random() < DISTURBED:
-            process_noise = system.process_noise * float(np.sqrt(rng.random()))
-        observer = KKLObserver(artifact, level, process_noise=process_noise)
+            disturbance = system.process_noise * float(np.sqrt(rng.random()))
+        observer = KKLObserver(artifact, level, process_noise=disturbance)
         x = rng.uniform(*system.box(), (count, system.nx)).T.copy()
         inside = np.ones(count, dtype=bool)
         x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
@@ -215,15 +215,15 @@ def record_closed_loop(
             if k % hold == 0:
                 action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (count, system.nu))
                 u = np.clip(action, -1.0, 1.0) * u_max
-            if process_noise:
-                w = process_noise * np.array(system.scale)[:, None] * rng.uniform(-1.0, 1.0, w.shape)
+            if disturbance:
+                w = np.ascontiguousarray(draw_process_noise(system, disturbance, count, 1, rng)[0].T)
             after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
             inside &= ((after >= low) & (after <= high)).all(0)
             x = np.where(inside, after, x)
         xs.append(x_rows[:, inside])
         zs.append(z_rows[:, inside])
         levels.append(np.full(int(inside.sum()), level))
-        process_levels.append(np.full(int(inside.sum()), process_noise))
+        disturbances.append(np.full(int(inside.sum()), disturbance))
         report(int(group[-1]) + 1)
     kept = sum(map(len, levels))
     if 2 * kept < n:
@@ -231,5 +231,5 @@ def record_closed_loop(
             f"of {n} trajectories under the controller only {kept} stayed within bounds = {system.bounds}; widen them, "
             "or shrink X"
         )
-    parts = np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(process_levels), np.concatenate(levels)
+    parts = np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(disturbances), np.concatenate(levels)
     return ClosedLoop(ages, *parts)

@@ -10,7 +10,7 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.data import output
 from training.metrics import smape
-from training.signals import random_inputs
+from training.signals import draw_process_noise, random_inputs
 
 # First entry of every evaluation seed; training's is another (training.pipeline.TRAINING_SEED).
 EVALUATION_SEED = 2
@@ -104,8 +104,7 @@ def unseen_runs(
     u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
     w = None
     if process_noise:
-        uniform = np.random.default_rng([first, seed, 2]).uniform(-1.0, 1.0, (steps, n, system.nx))
-        w = process_noise * np.array(system.scale) * uniform
+        w = draw_process_noise(system, process_noise, n, steps, np.random.default_rng([first, seed, 2]))
     x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return Runs(x[:, inside], u[:, inside], inside, process_noise)

@@ -1,4 +1,6 @@
-"""Random bounded inputs that excite a system."""
+"""Random bounded inputs that excite a system, and process noise that disturbs it."""
+
+from typing import Any
 
 import numpy as np
 
@@ -34,3 +36,9 @@ def random_inputs(
                 amplitude, phase = rng.uniform(0, u_max), rng.uniform(0, 2 * np.pi)
                 u[:, row, j] = amplitude * np.sin(np.exp(rng.uniform(np.log(0.2), np.log(20.0))) * t + phase)
     return u
+
+
+def draw_process_noise(system: System, level: Any, n: int, steps: int, rng: np.random.Generator) -> np.ndarray:
+    """w held over each sample, (steps, n, nx): uniform up to a level (one, or (n,)) in multiples of the scale."""
+    bound = np.multiply.outer(level, system.scale)
+    return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))

@@ -15,6 +15,7 @@ from training.certificates.generalisation import generalisation_term, pseudo_dim
 from training.certificates.smooth import Smooth, decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
 from training.data import output, run_filter
 from training.noise import stationary_covariance
+from training.signals import draw_process_noise
 
 CERTIFICATE_SEED = 4  # first entry of its seeds; those of training and evaluation are others
 SETTLED = 1e-4  # part of the filter's start that is left where recording begins
@@ -248,7 +249,7 @@ def record_motion(
     x0 = rng.uniform(*system.box(), (trajectories, system.nx))
     x = noisy_x = simulate(system, x0, steps, dt)
     if process_noise:
-        w = process_noise * np.array(system.scale) * rng.uniform(-1.0, 1.0, (steps, trajectories, system.nx))
+        w = draw_process_noise(system, process_noise, trajectories, steps, rng)
         noisy_x = simulate(system, x0, steps, dt, w=w)
     inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
     if 2 * inside.sum() < trajectories:

@@ -56,11 +56,7 @@ def decoder(artifact: Artifact, measurement_noise: float, process_noise: float =
     """T_inv of free motion, long after reset, at given noise: filter states, (n, size), to estimates, (n, nx)."""
     inverse = artifact.free or artifact.inverse
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
-    told = []
-    if "measurement_noise" in inverse.features:
-        told.append(float(inverse.noise_feature(measurement_noise)))
-    if "process_noise" in inverse.features:
-        told.append(inverse.process_feature(process_noise))
+    told = inverse.noise_features(measurement_noise, process_noise)
     if "age" in inverse.features:
         told.append(float(inverse.age_feature(inverse.age_max)))
     first = inverse.mlp.weights[0].astype(float)
