@@ -16,7 +16,7 @@ from rich.console import Console
 
 import kkl_gym
 from kkl_gym.elementary import sin
-from training import errors, preset, train, unseen_runs
+from training import errors, preset, train, unseen_trajectories
 from training.config import override
 
 
@@ -53,7 +53,12 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
         out: the run's folder.
     """
     system = Pendulum()
-    sizes = {"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 20.0, "noise_max": 0.5}
+    sizes = {
+        "inverse_steps": inverse_steps,
+        "trajectories": trajectories,
+        "duration": 20.0,
+        "measurement_noise_max": 0.5,
+    }
     config = override(preset(system, "input-aware", "fast"), sizes)
     artifact = train(system, config, out, resume=True, console=Console()).artifact
     path = out / "pendulum.safetensors"
@@ -65,7 +70,7 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
         x_hat, _, _, _, info = env.step(np.zeros(1, np.float32))
     print(f"after 10 s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")
 
-    runs = unseen_runs(system, env.unwrapped.dt, n=20, duration=20.0, seed=0)
+    runs = unseen_trajectories(system, env.unwrapped.dt, n=20, duration=20.0, seed=0)
     found = errors(artifact, system, runs, measurement_noise=0.0, seed=0)
     print(f"SMAPE without noise, median of 20 runs: {np.median(found.full):.2f} %")
     return float(np.median(found.full))

@@ -6,8 +6,8 @@ from kkl_gym.envs import KKLEnv
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
-from kkl_gym.vector_wrappers import KKLVectorObservation, VectorActionRepeat
-from kkl_gym.wrappers import ActionRepeat, KKLObservation
+from kkl_gym.wrappers.single import ActionRepeat, KKLObservation
+from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
 
 __version__ = "0.1.0"
 

@@ -20,7 +20,7 @@ class Canvas:
     estimates : whether there are any.
     box : of the states to show, with a margin; None is the training box.
 
-    Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not installed.
+    Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not estimator.
     """
 
     def __init__(self, system: System, estimates: bool = False, box: Box | None = None) -> None:

@@ -13,6 +13,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.loading import load_class
+
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
@@ -84,10 +86,8 @@ class System:
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
         # A class from a user's script can be found again, in another process too, by the script's path.
-        from kkl_gym.systems import get_system
-
         script = getattr(sys.modules.get(type(self).__module__), "__kkl_gym_script__", None)
-        return get_system, (f"{script}:{type(self).__qualname__}" if script else type(self), self.parameters)
+        return _restored, (f"{script}:{type(self).__qualname__}" if script else type(self), self.parameters)
 
     @property
     def nx(self) -> int:
@@ -126,6 +126,14 @@ class System:
         """Output map: ``ny`` components of h(x)."""
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
+    def output(self, x: np.ndarray) -> np.ndarray:
+        """h on states of shape (..., nx), as (..., ny)."""
+        return on_states(self.h, x)
+
+    def drift(self, x: np.ndarray) -> np.ndarray:
+        """f on states of shape (..., nx), as (..., nx)."""
+        return on_states(self.f, x)
+
     def rate(self, x: Components) -> Any:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
 
@@ -150,3 +158,13 @@ class System:
             if name not in known:
                 raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
+
+
+def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
+    """A system's f or h, which take and give components, on an array of states (..., nx), as (..., components)."""
+    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in equations(np.moveaxis(x, -1, 0))], axis=-1)
+
+
+def _restored(kind: "type[System] | str", parameters: Mapping[str, float]) -> System:
+    """What pickle makes a system from: its class, or where a user's script defines it."""
+    return (load_class(kind, System) if isinstance(kind, str) else kind)(**parameters)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
+from observers import Artifact
 
 
 @dataclass(frozen=True)
@@ -184,3 +185,14 @@ def _find(name: str) -> type[System]:
 
 
 __all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]
+
+
+def system_of(artifact: Artifact, given: str | None) -> System:
+    """The system that an artifact was made for, checked against it."""
+    if given is None and artifact.system not in SYSTEMS:
+        raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
+    base = get_system(given or artifact.system)
+    if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
+        base = base.replace(artifact.parameters)
+    artifact.check(base.name, base.parameters, artifact.filter.dt, base.ny, base.nu)
+    return base

@@ -23,8 +23,15 @@ FORMATS = (1, 2)  # the second has maps that are told the process noise; the oth
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
-_INVERSE_SCALARS = ("noise_unit", "noise_max", "age_unit", "age_max")
-_PROCESS_SCALARS = ("process_unit", "process_max")
+# Scalars of an inverse map, and what the files call them.
+_SCALARS = {
+    "measurement_noise_unit": "noise_unit",
+    "measurement_noise_max": "noise_max",
+    "process_noise_unit": "process_unit",
+    "process_noise_max": "process_max",
+    "age_unit": "age_unit",
+    "age_max": "age_max",
+}
 _INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
@@ -64,9 +71,9 @@ class InverseMap:
 
     - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
       data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
-    - ``measurement_noise``: log(1 + sigma_v / noise_unit);
-    - ``process_noise``: log(1 + min(level, process_max) / process_unit), the level being that of the environments, a
-      multiple of the system's scale per second;
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit);
+    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), the level being that of the
+      environments, a multiple of the system's scale per second;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs).
@@ -79,10 +86,10 @@ class InverseMap:
     noise_gain: np.ndarray  # (modes,) standard deviation of each whitened mode per unit of sigma_v
     x_offset: np.ndarray  # (nx,)
     x_scale: np.ndarray  # (nx,)
-    noise_unit: float = 1.0
-    noise_max: float = math.inf  # the largest sigma_v in training; a map without the feature takes any
-    process_unit: float = 1.0
-    process_max: float = math.inf  # the highest level of process noise in training
+    measurement_noise_unit: float = 1.0
+    measurement_noise_max: float = math.inf  # the largest sigma_v in training; a map without the feature takes any
+    process_noise_unit: float = 1.0
+    process_noise_max: float = math.inf  # the highest level of process noise in training
     age_unit: float = 1.0
     age_max: float = 0.0
 
@@ -93,9 +100,14 @@ class InverseMap:
         if self.features[0] != "z_y":
             raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
         modes, size = self.whiten.shape
-        if not (self.noise_unit > 0 and self.age_unit > 0 and self.process_unit > 0 and self.process_max > 0):
+        if not (
+            self.measurement_noise_unit > 0
+            and self.age_unit > 0
+            and self.process_noise_unit > 0
+            and self.process_noise_max > 0
+        ):
             raise ArtifactError("units of noise and age, and the highest level of process noise, must be positive")
-        if "process_noise" in self.features and not math.isfinite(self.process_max):
+        if "process_noise" in self.features and not math.isfinite(self.process_noise_max):
             raise ArtifactError(
                 "a map that is told the process noise must say the highest level that it was trained for"
             )
@@ -111,17 +123,17 @@ class InverseMap:
         """What the whitened modes are multiplied with at this noise level, (modes,)."""
         return np.asarray(1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2))
 
-    def noise_feature(self, measurement_noise: Any) -> Any:
+    def measurement_noise_feature(self, measurement_noise: Any) -> Any:
         """The network's input for a noise level."""
-        return np.log1p(measurement_noise / self.noise_unit)
+        return np.log1p(measurement_noise / self.measurement_noise_unit)
 
     def noise_features(self, measurement_noise: float, process_noise: float) -> list[float]:
         """What the network is told of noise, in order: of none, one or both."""
         told = []
         if "measurement_noise" in self.features:
-            told.append(float(self.noise_feature(measurement_noise)))
+            told.append(float(self.measurement_noise_feature(measurement_noise)))
         if "process_noise" in self.features:
-            told.append(math.log1p(min(process_noise, self.process_max) / self.process_unit))
+            told.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
         return told
 
     def age_feature(self, age: Any) -> Any:
@@ -142,8 +154,8 @@ class Artifact:
     forward : T, where one was learned.
     C : (ny, nx) where the output is linear, h(x) = C x: what coasting and monitoring need.
     limits : of the residual y - C x_hat in sound operation, where they were found.
-    free : T_inv of z_y alone, in use as long as no input has acted since reset: motions without input keep to far fewer
-        states than driven ones, which a map that knows of no input can rely on.
+    free_inverse : T_inv of z_y alone, in use as long as no input has acted since reset: motions without input keep to
+        far fewer states than driven ones, which a map that knows of no input can rely on.
     training : how it was made: method, preset, configuration, seed, measures.
     versions : of the libraries that made it.
     """
@@ -155,7 +167,7 @@ class Artifact:
     forward: ForwardMap | None = None
     C: np.ndarray | None = None
     limits: Limits | None = None
-    free: InverseMap | None = None
+    free_inverse: InverseMap | None = None
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -165,10 +177,12 @@ class Artifact:
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
                 f"a filter of {self.filter.size} values and {self.filter.nu} inputs"
             )
-        free, nz = self.free, len(self.filter.A)
+        free, nz = self.free_inverse, len(self.filter.A)
         if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
-        if free is not None and (len(free.x_offset) != self.nx or free.noise_max != self.inverse.noise_max):
+        if free is not None and (
+            len(free.x_offset) != self.nx or free.measurement_noise_max != self.inverse.measurement_noise_max
+        ):
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if free is not None and _process(free) != _process(self.inverse):
             raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
@@ -193,7 +207,7 @@ class Artifact:
         return self.filter.nu
 
     @property
-    def process_max(self) -> float | None:
+    def process_noise_max(self) -> float | None:
         """The highest level of process noise that the map was trained for; None if it is not told the level."""
         found = _process(self.inverse)
         return None if found is None else found[1]
@@ -226,10 +240,10 @@ class Artifact:
         if self.C is not None:
             tensors["C"] = np.ascontiguousarray(self.C, dtype=float)
         described = {"inverse": _put_inverse(tensors, "inverse", self.inverse)}
-        if self.free is not None:
-            described["free"] = _put_inverse(tensors, "free", self.free)
+        if self.free_inverse is not None:
+            described["free"] = _put_inverse(tensors, "free", self.free_inverse)
         meta: dict[str, Any] = {
-            "format": FORMATS[0] if self.process_max is None else FORMATS[1],
+            "format": FORMATS[0] if self.process_noise_max is None else FORMATS[1],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
@@ -299,7 +313,7 @@ class Artifact:
             forward=forward,
             C=tensors.get("C"),
             limits=_get_limits(tensors, meta["limits"]) if "limits" in meta else None,
-            free=_get_inverse(tensors, "free", meta["free"]) if "free" in meta else None,
+            free_inverse=_get_inverse(tensors, "free", meta["free"]) if "free" in meta else None,
             training=meta["training"],
             versions=meta["versions"],
         )
@@ -307,15 +321,15 @@ class Artifact:
 
 def _process(inverse: InverseMap) -> tuple[float, float] | None:
     """Unit and end of the levels of process noise that a map is told, if it is."""
-    return (inverse.process_unit, inverse.process_max) if "process_noise" in inverse.features else None
+    return (inverse.process_noise_unit, inverse.process_noise_max) if "process_noise" in inverse.features else None
 
 
 def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
     _put_mlp(tensors, prefix, inverse.mlp)
     for name in _INVERSE_ARRAYS:
         tensors[f"{prefix}.{name}"] = np.ascontiguousarray(getattr(inverse, name), dtype=float)
-    names = (*_INVERSE_SCALARS, *(_PROCESS_SCALARS if _process(inverse) else ()))
-    scalars = {name: getattr(inverse, name) for name in names}
+    names = [name for name in _SCALARS if _process(inverse) or not name.startswith("process")]
+    scalars = {_SCALARS[name]: getattr(inverse, name) for name in names}
     return {
         "features": list(inverse.features),
         "activation": inverse.mlp.activation,
@@ -324,10 +338,10 @@ def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMa
 
 
 def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:
-    scalars = dict(described)
+    scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
     return InverseMap(
-        mlp=_get_mlp(tensors, prefix, scalars.pop("activation")),
-        features=tuple(scalars.pop("features")),
+        mlp=_get_mlp(tensors, prefix, described["activation"]),
+        features=tuple(described["features"]),
         **{**scalars, **{name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}},
     )
 

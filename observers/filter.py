@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from observers.compiled import MANY_ROWS, SparseUpdate
+from observers.sparse import MANY_ROWS, SparseUpdate
 
 
 class LinearFilter:
@@ -83,12 +83,24 @@ class LinearFilter:
         """The state one sample later.
 
         z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them. A batch
-        (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
+        (n, size) of many rows goes through Numba where it is estimator, which rounds a little differently.
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
             return self._compiled(z, y, u, y_next)
         z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
         return z_next
+
+    def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
+        """States at ``ages``, (m, n, size), along outputs (steps + 1, n, ny) and inputs (steps, n, nu)."""
+        z = self.start(y[0])
+        out = np.empty((len(ages), *z.shape))
+        slot = {int(age): i for i, age in enumerate(ages)}
+        for k in range(len(y)):
+            if k > 0:
+                z = self.advance(z, y[k - 1], u[k - 1], y[k])
+            if k in slot:
+                out[slot[k]] = z
+        return out
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere

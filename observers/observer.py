@@ -63,10 +63,10 @@ class KKLObserver:
         inverse = self.artifact.inverse
         if not 0 <= level < math.inf:
             raise ValueError(f"measurement_noise must be finite and not negative, got {level!r}")
-        if "measurement_noise" in inverse.features and level > inverse.noise_max:
+        if "measurement_noise" in inverse.features and level > inverse.measurement_noise_max:
             raise ValueError(
-                f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.noise_max}; "
-                f"pass measurement_noise={inverse.noise_max} to use it all the same"
+                f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
+                f"pass measurement_noise={inverse.measurement_noise_max} to use it all the same"
             )
         limits = self.artifact.limits
         monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
@@ -87,14 +87,14 @@ class KKLObserver:
 
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
-            return self.artifact.process_max or 0.0
+            return self.artifact.process_noise_max or 0.0
         if isinstance(process_noise, bool) or not isinstance(process_noise, Real) or not 0 <= process_noise < math.inf:
             raise ValueError(f"process_noise must be a finite number, not negative, got {process_noise!r}")
         return float(process_noise)
 
     def _tell(self) -> None:
         """Tell the maps the levels of noise."""
-        levels, free = (self._measurement_noise, self._process_noise), self.artifact.free
+        levels, free = (self._measurement_noise, self._process_noise), self.artifact.free_inverse
         self._driven = _Decoder(self.artifact.inverse, *levels)
         self._free = None if free is None else _Decoder(free, *levels)
 

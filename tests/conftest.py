@@ -22,7 +22,7 @@ def random_artifact(
     dt=0.01,
     pair=False,
     forward=False,
-    free=False,
+    free_inverse=False,
     process=False,
 ):
     """A whole observer for a system with weights that nobody trained."""
@@ -41,7 +41,7 @@ def random_artifact(
         *(["process_noise"] if process else []),
         *(["age"] if age else []),
     )
-    levels = {"process_unit": 0.01, "process_max": 0.2} if process else {}
+    levels = {"process_noise_unit": 0.01, "process_noise_max": 0.2} if process else {}
     inverse = InverseMap(
         mlp=random_mlp(rng, modes + noise + process + age, system.nx),
         features=told,
@@ -50,8 +50,8 @@ def random_artifact(
         noise_gain=rng.uniform(0.1, 1.0, modes),
         x_offset=rng.normal(size=system.nx),
         x_scale=np.array(system.scale),
-        noise_unit=0.1,
-        noise_max=1.0 if noise else np.inf,
+        measurement_noise_unit=0.1,
+        measurement_noise_max=1.0 if noise else np.inf,
         **levels,
         age_unit=0.05,
         age_max=2.0 if age else 0.0,
@@ -67,7 +67,7 @@ def random_artifact(
         )
         if forward
         else None,
-        free=InverseMap(
+        free_inverse=InverseMap(
             mlp=random_mlp(rng, nz + noise + process, system.nx),
             features=tuple(name for name in told if name not in ("z_u", "age")),
             z_offset=rng.normal(size=nz),
@@ -75,11 +75,11 @@ def random_artifact(
             noise_gain=rng.uniform(0.1, 1.0, nz),
             x_offset=rng.normal(size=system.nx),
             x_scale=np.array(system.scale),
-            noise_unit=0.2,
-            noise_max=inverse.noise_max,
+            measurement_noise_unit=0.2,
+            measurement_noise_max=inverse.measurement_noise_max,
             **levels,
         )
-        if free
+        if free_inverse
         else None,
         training={"preset": "none", "seed": 0},
         versions={"numpy": np.__version__},

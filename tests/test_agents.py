@@ -12,14 +12,14 @@ from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
 from training.agents import SB3VecEnv
-from training.agents.command import find
-from training.agents.compare import EVALUATION_SEED
+from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.information import observer_of
 from training.agents.learn import WORST, Cost, hyperparameters, learn, learn_recurrent
 from training.agents.play import play
-from training.agents.policy import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.tasks import TASKS, ControlTask, scores
 from training.cli import main
+from training.commands.agent import find
+from training.seeds import AGENT_EVALUATION_SEED
 
 TASK = ControlTask("van_der_pol", measurement_noise=0.2, duration=0.5)
 
@@ -139,7 +139,7 @@ def test_training_never_sees_the_episodes_of_the_evaluation(algorithm, tmp_path,
         else:
             learn(task, "y", tmp_path / str(seed), seed, 1, algorithm=algorithm)
     first, second = seeds
-    evaluation = range(EVALUATION_SEED, EVALUATION_SEED + 10_000)
+    evaluation = range(AGENT_EVALUATION_SEED, AGENT_EVALUATION_SEED + 10_000)
     assert not set(first) & set(second)
     assert not any(one in evaluation for one in (*first, *second))
 

@@ -23,9 +23,9 @@ KINDS = [
     {"inputs": False, "noise": False, "age": False},
     {"pair": True},
     {"forward": True},
-    {"process": True, "free": True},
-    {"free": True},
-    {"free": True, "noise": False},
+    {"process": True, "free_inverse": True},
+    {"free_inverse": True},
+    {"free_inverse": True, "noise": False},
 ]
 
 
@@ -64,8 +64,8 @@ def test_round_trip(system, options, make_artifact, tmp_path):
     assert again.filter.dt == artifact.filter.dt
     for part in ("transition", "early_y", "late_y", "held_u", "equilibrium"):
         assert np.array_equal(getattr(again.filter, part), getattr(artifact.filter, part))
-    assert (again.free is None) == (artifact.free is None)
-    for after, before in ((again.inverse, artifact.inverse), (again.free, artifact.free)):
+    assert (again.free_inverse is None) == (artifact.free_inverse is None)
+    for after, before in ((again.inverse, artifact.inverse), (again.free_inverse, artifact.free_inverse)):
         for part in dataclasses.fields(before) if before else ():
             if part.name != "mlp":
                 assert np.array_equal(getattr(after, part.name), getattr(before, part.name))
@@ -153,28 +153,30 @@ def test_tensors_that_are_not_finite(file, tensor, value):
 @pytest.mark.parametrize(("process", "number"), [(False, 1), (True, 2)])
 def test_maps_that_are_told_of_process_noise_have_a_format_of_their_own(tmp_path, make_artifact, process, number):
     path = tmp_path / "map.safetensors"
-    make_artifact(process=process, free=True).save(path)
+    make_artifact(process=process, free_inverse=True).save(path)
     with safe_open(path, framework="numpy") as opened:
         text = opened.metadata()["kkl-gym"]
     assert json.loads(text)["format"] == number
-    assert ("process_max" in text) == process
-    assert Artifact.read(path).process_max == (0.2 if process else None)
+    assert ("process_noise_max" in text) == process
+    assert Artifact.read(path).process_noise_max == (0.2 if process else None)
 
 
-@pytest.mark.parametrize("wrong", [{"process_unit": 0.0}, {"process_unit": np.nan}, {"process_max": -1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"process_noise_unit": 0.0}, {"process_noise_unit": np.nan}, {"process_noise_max": -1.0}]
+)
 def test_impossible_levels_of_process_noise(wrong, make_artifact):
     with pytest.raises(ArtifactError, match="must be positive"):
         dataclasses.replace(make_artifact(process=True).inverse, **wrong)
     with pytest.raises(ArtifactError, match="highest level"):
-        dataclasses.replace(make_artifact(process=True).inverse, process_max=np.inf)
+        dataclasses.replace(make_artifact(process=True).inverse, process_noise_max=np.inf)
 
 
 def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):
-    artifact, other = make_artifact(process=True, free=True), make_artifact(free=True)
+    artifact, other = make_artifact(process=True, free_inverse=True), make_artifact(free_inverse=True)
     with pytest.raises(ArtifactError, match="told of process noise"):
-        dataclasses.replace(artifact, free=other.free)
+        dataclasses.replace(artifact, free_inverse=other.free_inverse)
     with pytest.raises(ArtifactError, match="told of process noise"):
-        dataclasses.replace(artifact, free=dataclasses.replace(artifact.free, process_max=0.3))
+        dataclasses.replace(artifact, free_inverse=dataclasses.replace(artifact.free_inverse, process_noise_max=0.3))
 
 
 @pytest.mark.parametrize("number", [0, 3, "1", None])
@@ -380,13 +382,15 @@ def test_mlp_shape_errors():
 
 
 def test_a_map_of_free_motion_must_fit_the_one_of_driven_motion(make_artifact):
-    artifact, autonomous = make_artifact(free=True), make_artifact(inputs=False)
-    other = make_artifact("lorenz", free=True).free
+    artifact, autonomous = make_artifact(free_inverse=True), make_artifact(inputs=False)
+    other = make_artifact("lorenz", free_inverse=True).free_inverse
     with pytest.raises(ArtifactError, match="must be of z_y, 5 values"):
-        dataclasses.replace(artifact, free=artifact.inverse)
+        dataclasses.replace(artifact, free_inverse=artifact.inverse)
     with pytest.raises(ArtifactError, match="must be of z_y, 5 values, beside one that knows of inputs"):
-        dataclasses.replace(autonomous, free=artifact.free)
+        dataclasses.replace(autonomous, free_inverse=artifact.free_inverse)
     with pytest.raises(ArtifactError, match="must be of z_y"):
-        dataclasses.replace(artifact, free=other)
+        dataclasses.replace(artifact, free_inverse=other)
     with pytest.raises(ArtifactError, match="differ in states, or in noise"):
-        dataclasses.replace(artifact, free=dataclasses.replace(artifact.free, noise_max=2.0))
+        dataclasses.replace(
+            artifact, free_inverse=dataclasses.replace(artifact.free_inverse, measurement_noise_max=2.0)
+        )

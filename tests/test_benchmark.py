@@ -9,21 +9,21 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
+import training.benchmark.command as command
 from filelock import FileLock
 from PIL import Image
 from rich.console import Console
 
-import training.benchmark.command as command
 from kkl_gym import get_system
-from training.benchmark.command import Benchmark
 from training.benchmark.jobs import Job, run_job
 from training.benchmark.protocol import Protocol, measure, noisy_output, run, step_time, validate
 from training.benchmark.tables import _number, summarise
-from training.data import output
-from training.evaluate import EVALUATION_SEED, VALIDATION_SEED, starts, unseen_runs
+from training.commands.benchmark import Benchmark
+from training.evaluation.errors import starts, unseen_trajectories
+from training.evaluation.metrics import component_smape, rmse, settling_time, smape
+from training.jobs import run_all
 from training.methods import METHODS, Budget, Method, get_method
-from training.metrics import component_smape, rmse, settling_time, smape
-from training.parallel import run_all
+from training.seeds import Stream
 
 TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
@@ -108,8 +108,8 @@ def tiny(monkeypatch):
     monkeypatch.setattr(command, "step_time", lambda *_: 1.0)
 
 
-def quiet():
-    return Console(quiet=True)
+def noise_free_share():
+    return Console(noise_free_share=True)
 
 
 def test_metrics_by_hand():
@@ -166,7 +166,7 @@ class Oracle(Method):
 def test_measure_marks_the_lost_and_the_escaped():
     system, dt = get_system("rossler"), 0.01
     protocol = Protocol(domains=("2X",), noise=(0.0,), trajectories=100, duration=20.0)
-    runs = unseen_runs(system, dt, 100, 20.0, 0, "2X")
+    runs = unseen_trajectories(system, dt, 100, 20.0, 0, "2X")
     assert runs.escaped > 0
     frame = measure(Oracle(runs.x, wrong=((0, np.nan), (1, 1e6))), None, system, dt, protocol)
     assert len(frame) == 100
@@ -181,7 +181,7 @@ def test_measure_marks_the_lost_and_the_escaped():
 
 def test_methods_that_are_slow_get_the_first_trajectories():
     system, dt = get_system("van_der_pol"), 0.05
-    many = unseen_runs(system, dt, 100, 1.0, 0, "X")
+    many = unseen_trajectories(system, dt, 100, 1.0, 0, "X")
     runs = many.first(2)
     assert runs.inside.tolist() == [True, True]
     method = Oracle(runs.x)
@@ -209,11 +209,11 @@ def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
             seen[-1].append(y)
             return super().step(y)
 
-    runs = unseen_runs(system, 0.01, 20, 2.0, 0, "X")
+    runs = unseen_trajectories(system, 0.01, 20, 2.0, 0, "X")
     method = Spy(runs.x)
     measure(method, None, system, 0.01, Protocol(domains=("X",), trajectories=20, duration=2.0))
     quiet_y, noisy_y = (np.array(record) for record in seen)
-    np.testing.assert_array_equal(quiet_y, output(system, runs.x))
+    np.testing.assert_array_equal(quiet_y, system.output(runs.x))
     assert (noisy_y - quiet_y).std() == pytest.approx(0.5, rel=0.05)
     assert method.told == 0.5
 
@@ -221,10 +221,11 @@ def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
 def test_validation_trajectories_are_not_those_of_evaluation():
     system = get_system("lorenz")
     evaluation, validation = (
-        unseen_runs(system, 0.01, 5, 0.1, 0, first=first).x for first in (EVALUATION_SEED, VALIDATION_SEED)
+        unseen_trajectories(system, 0.01, 5, 0.1, 0, stream=stream).x
+        for stream in (Stream.EVALUATION, Stream.VALIDATION)
     )
     assert np.abs(evaluation[0] - validation[0]).min() > 1e-3
-    exact = unseen_runs(system, 0.01, 5, 0.1, 0, first=VALIDATION_SEED).x
+    exact = unseen_trajectories(system, 0.01, 5, 0.1, 0, stream=Stream.VALIDATION).x
     protocol = Protocol(noise=(0.0, 0.5), trajectories=5, duration=0.1)
     assert validate(Oracle(exact), None, system, 0.01, protocol) == pytest.approx(1e-6)
     double = validate(Oracle(2 * exact), None, system, 0.01, protocol)
@@ -242,7 +243,7 @@ def test_methods_made_for_one_noise_level_are_validated_there():
             return self
 
     protocol = Protocol(noise=(0.0, 0.5), trajectories=2, duration=0.1)
-    exact = unseen_runs(system, 0.01, 2, 0.1, 0, first=VALIDATION_SEED).x
+    exact = unseen_trajectories(system, 0.01, 2, 0.1, 0, stream=Stream.VALIDATION).x
     validate(Particular(exact), None, system, 0.01, protocol)
     assert asked == [0.25]
 
@@ -266,10 +267,10 @@ def test_step_time_is_positive():
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     name, trainings = toy
     out = tmp_path / "out"
-    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(noise_free_share())
     results = pd.read_csv(out / "results.csv")
     assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
-    expected = unseen_runs(get_system("lorenz"), TINY.dt, 2, 2.0, 0).x
+    expected = unseen_trajectories(get_system("lorenz"), TINY.dt, 2, 2.0, 0).x
     info = json.loads((out / "jobs" / "lorenz" / "constant" / "info.json").read_text())
     assert info["configuration"] == {"shift": 0.0}  # the sensible one of the three won on validation
     assert info["validation"][1] == min(info["validation"])
@@ -300,15 +301,15 @@ def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path):
     benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, jobs=1)
     stop.touch()
     with pytest.raises(KeyboardInterrupt):
-        benchmark.run(quiet())
+        benchmark.run(noise_free_share())
     begun = trainings.read_text().split()
     assert (begun.count("van_der_pol"), begun.count("lorenz")) == (4, 1)
     stop.unlink()
-    benchmark.run(quiet())
+    benchmark.run(noise_free_share())
     after = trainings.read_text().split()
     assert (after.count("van_der_pol"), after.count("lorenz")) == (4, 5)  # the one interrupted was begun anew
     results = (out / "results.csv").read_bytes()
-    benchmark.run(quiet())
+    benchmark.run(noise_free_share())
     assert trainings.read_text().split() == after
     assert (out / "results.csv").read_bytes() == results
 
@@ -349,7 +350,7 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     script.write_text(script.read_text() + BROKEN)
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="1 of 2 jobs failed; the first: lorenz/broken"):
-        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(noise_free_share())
     assert set(pd.read_csv(out / "methods.csv").method) == {"constant"}
     assert "in train" in (out / "jobs" / "lorenz" / "broken" / "failure.txt").read_text()
 
@@ -357,25 +358,25 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
 def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
     monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(noise_free_share())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
     with pytest.raises(ValueError, match="holds jobs of several benchmarks: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(noise_free_share())
 
 
 def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_path):
     name, _ = toy
     script, out = Path(name.rpartition(":")[0]), tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
     changed = script.with_name("changed.py")
     changed.write_text(
         script.read_text().replace("self.mean, (len(y0)", "2 * self.mean, (len(y0)").replace("x.mean", "x.max")
     )
     with pytest.raises(ValueError, match="another benchmark: code"):
-        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(noise_free_share())
 
 
 @pytest.mark.parametrize(
@@ -394,7 +395,7 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
 )
 def test_impossible_benchmarks(wrong, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(quiet())
+        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(noise_free_share())
     assert not (tmp_path / "out").exists()
 
 
@@ -415,7 +416,7 @@ def test_worker_processes_do_what_one_process_does(toy, tmp_path):
 
 def test_every_method_at_toy_size(tiny, tmp_path):
     out = tmp_path / "out"
-    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(quiet())
+    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(noise_free_share())
     methods = pd.read_csv(out / "methods.csv")
     assert set(methods.method) == set(METHODS)
     results = pd.read_csv(out / "results.csv")
@@ -447,11 +448,11 @@ def test_infinite_values_have_a_median_and_a_sign():
 def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
     before = {file: (out / file).read_bytes() for file in ("table.md", "heatmap.png")}
     for file in before:
         (out / file).unlink()
-    Benchmark(report=True, out=out).run(quiet())
+    Benchmark(report=True, out=out).run(noise_free_share())
     assert {file: (out / file).read_bytes() for file in before} == before
 
 
@@ -459,7 +460,7 @@ def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
 def test_committed_results_give_the_committed_table_and_figure(tmp_path):
     for file in ("results.csv", "methods.csv"):
         shutil.copy(COMMITTED / file, tmp_path)
-    Benchmark(report=True, out=tmp_path).run(quiet())
+    Benchmark(report=True, out=tmp_path).run(noise_free_share())
     assert (tmp_path / "table.md").read_text() == (COMMITTED / "table.md").read_text()
     with Image.open(COMMITTED / "heatmap.png") as committed, Image.open(tmp_path / "heatmap.png") as drawn:
         if committed.info["Software"] != drawn.info["Software"]:

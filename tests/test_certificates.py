@@ -15,12 +15,12 @@ from kkl_gym import get_system
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.artifact import resolve
 from training import certify
-from training.certificates.certificate import output_lipschitz, record_motion, residual
-from training.certificates.gains import h2, h_infinity, theorem_gain
-from training.certificates.generalisation import generalisation_term, pseudo_dimension_bound
-from training.certificates.smooth import Smooth, decoder, encoder, lipschitz_lower, lipschitz_upper, norm_product
 from training.cli import main
-from training.data import output
+from training.evaluation.certificates.certificate import output_lipschitz, record_settled
+from training.evaluation.certificates.gains import h2, h_infinity, theorem_gain
+from training.evaluation.certificates.generalisation import generalisation_term, pseudo_dimension_bound
+from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product
+from training.maps.smooth import Smooth, decoder, encoder, residual
 
 A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
 M = sylvester(A, B)
@@ -247,12 +247,12 @@ def test_psi_covers_what_noise_does_where_motions_settle():
     found = certify(artifact, Damped(), 0.0, process_noise=0.05, trajectories=10)
     assert found.error < 1e-8
     assert 1e-6 < found.noisy_error < found.forward.noisy_bound
-    motion = record_motion(artifact, Damped(), 0.0, 0.05, 10, 0)
+    motion = record_settled(artifact, Damped(), 0.0, 0.05, 10, 0)
     assert np.linalg.norm(motion.noisy_x - motion.x, axis=1).max() <= found.psi
 
 
 def test_motions_come_in_two_halves_of_whole_motions():
-    motion = record_motion(linear_observer(), Oscillator(), 0.3, 0.1, 5, 0)
+    motion = record_settled(linear_observer(), Oscillator(), 0.3, 0.1, 5, 0)
     first, second = motion.halves()
     assert (first.motions, second.motions) == (2, 3)
     assert len(first.x) + len(second.x) == len(motion.x)
@@ -268,11 +268,11 @@ def test_each_bound_has_the_map_that_its_observer_uses():
     artifact = random_artifact("van_der_pol", inputs=False, age=False, forward=True)
     artifact = dataclasses.replace(artifact, training={"physics_weight": 0.1})
     found = certify(artifact, get_system("van_der_pol"), 0.7, process_noise=0.0, trajectories=4)
-    quiet = lipschitz_upper(decoder(artifact, 0.0))
+    noise_free_share = lipschitz_upper(decoder(artifact, 0.0))
     risk = found.forward.reconstruction_risk
-    assert found.forward.bound == pytest.approx(4 * risk + 4 * quiet**2 * found.forward.physics_risk)
+    assert found.forward.bound == pytest.approx(4 * risk + 4 * noise_free_share**2 * found.forward.physics_risk)
     assert found.lipschitz_upper == pytest.approx(lipschitz_upper(decoder(artifact, 0.7)))
-    assert abs(quiet / found.lipschitz_upper - 1) > 0.01
+    assert abs(noise_free_share / found.lipschitz_upper - 1) > 0.01
 
 
 def test_generalisation_terms():
@@ -316,7 +316,7 @@ def test_output_of_a_nonlinear_h():
             return (x[0] ** 2,)
 
     assert output_lipschitz(Squared(), 0) == pytest.approx(2.0, rel=0.01)
-    assert output(Squared(), np.array([[0.5, 0.0]])) == pytest.approx(0.25)
+    assert Squared().output(np.array([[0.5, 0.0]])) == pytest.approx(0.25)
 
 
 def test_command(tmp_path, capsys):
@@ -333,7 +333,7 @@ def test_command(tmp_path, capsys):
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
     main(["certify", "reverse_duffing-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
-          "--out", str(tmp_path / "quiet")])  # fmt: skip
-    assert (tmp_path / "quiet" / "reverse_duffing-spinn.png").exists()
+          "--out", str(tmp_path / "noise_free_share")])  # fmt: skip
+    assert (tmp_path / "noise_free_share" / "reverse_duffing-spinn.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])

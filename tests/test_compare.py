@@ -9,10 +9,11 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-import training.agents.compare
+import training.agents.comparison
 import training.agents.learn
-from training.agents.compare import KNOWS, MORE_NOISE, Compare, interval, middle, normalised, report, run_case
+from training.agents.comparison import KNOWS, MORE_NOISE, interval, middle, normalised, run_case
 from training.agents.tasks import TASKS
+from training.commands.compare import Compare, report
 
 
 def toy(out, **options):
@@ -85,7 +86,7 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
         yield jobs[0], None, []
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.agents.compare, "run_all", interrupted)
+    monkeypatch.setattr(training.agents.comparison, "run_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         toy(tmp_path, knows=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1

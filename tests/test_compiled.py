@@ -12,7 +12,7 @@ from kkl_gym import SYSTEMS, System, get_system
 from kkl_gym.compiled import batch_step, clipped, compiled_step
 from kkl_gym.elementary import cos, sin, tanh
 from kkl_gym.simulate import advance_batch
-from observers.compiled import MANY_ROWS
+from observers.sparse import MANY_ROWS
 
 DT = 0.01
 

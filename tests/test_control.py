@@ -6,8 +6,8 @@ import pytest
 from kkl_gym import SYSTEMS, get_system
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
-from training.controllers import controller, linear_quadratic
-from training.derivatives import linearised
+from training.trajectories.controllers import controller, linear_quadratic
+from training.trajectories.derivatives import linearised
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 

@@ -6,15 +6,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-import training.calibration
-import training.certificates.certificate
-import training.faults
+import training.commands.faults
+import training.evaluation.calibration
+import training.evaluation.certificates.certificate
 from kkl_gym import VanDerPol
 from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
-from training.certificates.smooth import decoder
 from training.cli import main
-from training.faults import FAULTS, play, report
+from training.commands.faults import report
+from training.evaluation.faults import FAULTS, play
+from training.maps.smooth import decoder
 
 
 def with_limits(name):
@@ -52,16 +53,16 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
         process_noise = 0.12  # not what such an observer takes by default, 0.2
 
     system = Noisy()
-    monkeypatch.setattr(training.calibration, "KKLObserver", Spy)
-    monkeypatch.setattr(training.faults, "KKLObserver", Spy)
-    artifact = dataclasses.replace(make_artifact(process=True, free=True), C=np.array([[1.0, 0.0]]))
+    monkeypatch.setattr(training.evaluation.calibration, "KKLObserver", Spy)
+    monkeypatch.setattr(training.commands.faults, "KKLObserver", Spy)
+    artifact = dataclasses.replace(make_artifact(process=True, free_inverse=True), C=np.array([[1.0, 0.0]]))
     calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
     assert set(told) == {0.12}
     told.clear()
     play(calibrated, system, 2, 12.0, 0.5, 0)
     assert set(told) == {0.12}
     told.clear()
-    monkeypatch.setattr(training.certificates.certificate, "decoder", spy)
+    monkeypatch.setattr(training.evaluation.certificates.certificate, "decoder", spy)
     training.certify(artifact, system, 0.3, trajectories=4)
     assert set(told) == {(0.3, 0.12), (0.0, 0.0)}
     assert told.count((0.3, 0.12)) == 2  # for the errors, and for what noise will do
@@ -100,7 +101,7 @@ def test_duffing_is_reported_by_amplitude(tmp_path):
 
 def test_command(tmp_path, monkeypatch, capsys):
     artifact = with_limits("lorenz")
-    monkeypatch.setattr(training.faults.Artifact, "read", lambda path: artifact)
+    monkeypatch.setattr(training.commands.faults.Artifact, "read", lambda path: artifact)
     main(["faults", "--systems", "lorenz", "--runs", "4", "--duration", "12", "--out", str(tmp_path)])
     assert "noticed" in capsys.readouterr().out
     assert len(pd.read_csv(tmp_path / "faults.csv")) == 16

@@ -6,9 +6,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-import observers.compiled
+import observers.sparse
 from observers import LinearFilter
-from observers.compiled import MANY_ROWS
+from observers.sparse import MANY_ROWS
 
 DIAGONAL = -np.diag([0.5, 2.0, 7.0])
 PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])
@@ -119,7 +119,7 @@ def test_a_large_batch_without_numba(monkeypatch):
     y, u = signals(linear, 3, MANY_ROWS)
     expected = run(linear, y, u)
     monkeypatch.setitem(sys.modules, "numba", None)
-    observers.compiled._kernel.cache_clear()
+    observers.sparse._kernel.cache_clear()
     assert np.allclose(run(other, y, u), expected, rtol=1e-13, atol=1e-14)
     assert other._compiled is None
 
@@ -130,7 +130,7 @@ def test_a_filter_that_has_compiled_goes_where_numba_is_not(monkeypatch):
     expected = run(linear, y, u)
     packed = pickle.dumps(linear)
     monkeypatch.setitem(sys.modules, "numba", None)
-    observers.compiled._kernel.cache_clear()
+    observers.sparse._kernel.cache_clear()
     assert np.allclose(run(pickle.loads(packed), y, u), expected, rtol=1e-13, atol=1e-14)
 
 

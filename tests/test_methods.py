@@ -17,21 +17,16 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
-from training.data import output, run_filter
-from training.derivatives import jacobian, with_sensitivity
+from training.kalman import ExtendedKalmanFilter, UnscentedFilters, unknown_start
 from training.methods import ABLATION, METHODS, Budget, Task, get_method
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.autoencoder import bessel_filter
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
 from training.methods.gru import _Problem as _GRUProblem
-from training.methods.kalman import (
-    ExtendedKalmanFilter,
-    UnscentedFilters,
-    faster,
-    unknown_start,
-)
+from training.methods.kalman import faster
 from training.methods.recurrent import rollout
+from training.trajectories.derivatives import jacobian, with_sensitivity
 
 SMALL = Budget(
     "small", trajectories=100, duration=25.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.05, steps=600
@@ -96,7 +91,7 @@ def decay_rate(difference, dt, first, last):
 def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     method, system, artifact, dt = trained_on_oscillator("node", tmp_path, configuration=1)
     x = oscillations(dt)
-    y = output(system, x)
+    y = system.output(x)
     x_hat = run(method.observer(artifact, system, dt, 0.0), y)
     assert late_error(x, x_hat) < 0.1
     misled = y.copy()
@@ -112,7 +107,7 @@ def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     for stage in ("transient", "asymptotic"):
         assert np.abs(np.linalg.eigvals(arrays[f"{stage}.A"])).max() < 1
     x = oscillations(dt)
-    y = output(system, x)
+    y = system.output(x)
     x_hat = run(method.observer(arrays, system, dt, 0.0), y)
     assert late_error(x, x_hat) < 0.1
     one_stage = {**arrays, **{k.replace("transient", "asymptotic"): v for k, v in arrays.items() if "transient" in k}}
@@ -126,7 +121,7 @@ def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
 def test_dmf_switches_to_the_smaller_filtered_innovation(tmp_path):
     method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, steps=5)
     broken = {**arrays, "transient.x_offset": np.array([5.0, 5.0])}  # its innovation is about 5 from now on
-    y = output(system, oscillations(dt, 1.0))
+    y = system.output(oscillations(dt, 1.0))
     observer = method.observer(broken, system, dt, 0.0)
     first = run(observer, y)
     assert np.abs(first[0] - 5).max() < 3  # the transient observer begins
@@ -142,7 +137,7 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
     linear = LinearFilter(A, rng.normal(size=(4, ny)), 0.05)
     y = rng.normal(size=(301, 3, ny))
     ages = np.array([0, 1, 2, 7, 8, 150, 300])
-    expected = run_filter(linear, y, np.zeros((300, 3, 0)), ages)
+    expected = linear.run(y, np.zeros((300, 3, 0)), ages)
     parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y, expected[0]))
     found = rollout(*parts, torch.as_tensor(y.swapaxes(0, 1)), ages)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-10, atol=1e-12)
@@ -172,7 +167,7 @@ def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
 def test_gru_learns_and_steps_as_it_was_trained(tmp_path):
     method, system, arrays, dt = trained_on_oscillator("gru", tmp_path, steps=200)
     x = oscillations(dt)
-    y = output(system, x)
+    y = system.output(x)
     x_hat = run(method.observer(arrays, system, dt, 0.0), y)
     assert late_error(x, x_hat) < 0.3
     network = _Network(1, 2, 64)
@@ -188,7 +183,7 @@ def test_default_estimates_the_oscillator(tmp_path):
     method, system, artifact, dt = trained_on_oscillator("default", tmp_path, steps=600)
     assert artifact.nu == 1
     x = oscillations(dt)
-    x_hat = run(method.observer(artifact, system, dt, 0.0), output(system, x))
+    x_hat = run(method.observer(artifact, system, dt, 0.0), system.output(x))
     assert late_error(x, x_hat) < 0.2
 
 
@@ -222,7 +217,7 @@ def test_ekf_against_filterpy(name):
     x0, P0 = unknown_start(system)
     Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
     x = simulate(system, np.array([x0 + 0.1 * np.array(system.scale)]), 100, dt)
-    y = output(system, x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
+    y = system.output(x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
     found = run(ExtendedKalmanFilter(system, dt, Q, R, x0, P0), y)
 
     def flow(state):
@@ -369,7 +364,7 @@ def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path)
     assert data is Task(Oscillator(), replace(SMALL, seconds=1.0), tmp_path).data
     assert data.x.shape == (len(data.ages), 100, 2)
     assert data.y.shape == (501, 100, 1)
-    np.testing.assert_allclose(data.y[data.ages], output(system, data.x), atol=1e-6)
+    np.testing.assert_allclose(data.y[data.ages], system.output(data.x), atol=1e-6)
 
 
 @pytest.mark.parametrize("name", sorted(METHODS | ABLATION))
@@ -383,7 +378,7 @@ def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
     assert 1 <= len(method.configurations(system)) <= 3
     path = tmp_path / "trained.safetensors"
     method.save(trained, path)
-    y = output(system, oscillations(0.02, 1.0, n=3))
+    y = system.output(oscillations(0.02, 1.0, n=3))
     before, after = (run(method.observer(one, system, 0.02, 0.1), y) for one in (trained, method.load(path)))
     np.testing.assert_allclose(after, before, rtol=1e-6, atol=1e-9)
     assert before.shape == (51, 3, 2)

@@ -10,8 +10,7 @@ from linear_system import Oscillator, sylvester
 
 from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
 from observers import MLP, Artifact, ArtifactError, InverseMap, KKLObserver, Limits, LinearFilter, Monitor
-from training.calibration import WARM_UP, calibrate, sound_runs
-from training.data import output
+from training.evaluation.calibration import WARM_UP, calibrate, sound_trajectories
 
 ONES, ZEROS = np.ones, np.zeros
 
@@ -184,9 +183,9 @@ def test_calibration_keeps_its_promise():
     assert found.low[0] == 0.0
     assert found.low[-1] < 1.0 < found.high[-1]  # about the variance of the noise
     rng = np.random.default_rng(11)
-    x, _ = sound_runs(calibrated, system, 600, 20.0, rng)
+    x, _ = sound_trajectories(calibrated, system, 600, 20.0, rng)
     for level in (0.2, 1.0):
-        y = output(system, x) + level * rng.standard_normal((*x.shape[:2], 1))
+        y = system.output(x) + level * rng.standard_normal((*x.shape[:2], 1))
         observer = KKLObserver(calibrated, level, monitor=True)
         observer.reset(y[0])
         alarms = np.zeros(x.shape[1], dtype=bool)
@@ -201,10 +200,10 @@ def test_faults_are_seen(fault):
     system = Noiseless()
     calibrated = calibrate(oscillator_observer(), system, duration=20.0)
     rng = np.random.default_rng(12)
-    x, _ = sound_runs(calibrated, system, 50, 30.0, rng)
+    x, _ = sound_trajectories(calibrated, system, 50, 30.0, rng)
     x = x[:, np.abs(x[0]).max(-1) > 0.5]
     level, at = 0.1, 300
-    y = output(system, x) + level * rng.standard_normal((*x.shape[:2], 1))
+    y = system.output(x) + level * rng.standard_normal((*x.shape[:2], 1))
     y[at:] = {"bias": y[at:] + 0.4, "drop-out": 0.0 * y[at:], "freeze": np.broadcast_to(y[at], y[at:].shape)}[fault]
     observer = KKLObserver(calibrated, level, monitor=True)
     observer.reset(y[0])
@@ -219,7 +218,7 @@ def test_faults_are_seen(fault):
 
 
 def test_limits_reach_as_far_as_the_map_is_told():
-    told = dataclasses.replace(oscillator_observer().inverse, noise_max=3.0)
+    told = dataclasses.replace(oscillator_observer().inverse, measurement_noise_max=3.0)
     artifact = dataclasses.replace(oscillator_observer(), inverse=told)
     assert calibrate(artifact, Noiseless(), duration=6.0).limits.levels[-1] == 3.0
     assert calibrate(oscillator_observer(), Noiseless(), duration=6.0).limits.levels[-1] == 1.0
@@ -235,13 +234,13 @@ def test_runs_that_leave_are_drawn_anew():
         bounds = ((-1.0, 1.0), (-1.0, 1.0))
 
     rng = np.random.default_rng(0)
-    x, u = sound_runs(oscillator_observer(), Tight(), 50, 10.0, rng)
+    x, u = sound_trajectories(oscillator_observer(), Tight(), 50, 10.0, rng)
     assert x.shape[1] == u.shape[1] == 50
     assert np.isfinite(x).all()
 
     Leaving.process_noise = 30.0
     with pytest.raises(ValueError, match="leave bounds"):
-        sound_runs(oscillator_observer(), Leaving(), 50, 10.0, rng)
+        sound_trajectories(oscillator_observer(), Leaving(), 50, 10.0, rng)
 
 
 def test_impossible_calibrations():

@@ -13,7 +13,7 @@ from observers import KKLObserver, LinearFilter, load
 everyone = pytest.mark.parametrize("system", SYSTEMS)
 KINDS = [{"inputs": inputs, "noise": noise, "age": age} for inputs in (0, 1) for noise in (0, 1) for age in (0, 1)] + [
     {"pair": True},
-    {"free": True},
+    {"free_inverse": True},
 ]
 CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # the network works in float32
 
@@ -92,11 +92,11 @@ def test_estimate_takes_a_last_row_of_u_more_and_none(make_artifact):
 
 
 def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
-    both = make_artifact(free=True)
+    both = make_artifact(free_inverse=True)
     driven, free = (
-        KKLObserver(dataclasses.replace(both, free=None)),
+        KKLObserver(dataclasses.replace(both, free_inverse=None)),
         KKLObserver(
-            dataclasses.replace(make_artifact(inputs=False), filter=autonomous(both.filter), inverse=both.free)
+            dataclasses.replace(make_artifact(inputs=False), filter=autonomous(both.filter), inverse=both.free_inverse)
         ),
     )
     observer, steps = KKLObserver(both), 12
@@ -295,7 +295,7 @@ def test_noise_level_told_changes_the_estimate(make_artifact):
 
 @pytest.mark.parametrize("free", [False, True])
 def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_artifact, free):
-    artifact = make_artifact(process=True, free=free)
+    artifact = make_artifact(process=True, free_inverse=free)
     estimates = [KKLObserver(artifact, process_noise=level).reset([1.0]) for level in (0.0, 0.1, 0.2, 5.0)]
     assert not np.allclose(estimates[0], estimates[1], atol=1e-6)
     assert not np.allclose(estimates[1], estimates[2], atol=1e-6)
@@ -308,11 +308,11 @@ def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_ar
     assert np.array_equal(estimates[0], observer.decode())
     observer.process_noise = None
     assert np.array_equal(estimates[2], observer.decode())
-    inverse = artifact.free or artifact.inverse
+    inverse = artifact.free_inverse or artifact.inverse
     modes = inverse.gain(0.5) * (
         inverse.whiten @ (artifact.filter.start(np.ones(1))[: len(inverse.z_offset)] - inverse.z_offset)
     )
-    told = [math.log1p(0.5 / inverse.noise_unit), math.log1p(0.1 / 0.01), *([] if free else [0.0])]
+    told = [math.log1p(0.5 / inverse.measurement_noise_unit), math.log1p(0.1 / 0.01), *([] if free else [0.0])]
     expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told]))
     assert np.allclose(estimates[1], expected, atol=1e-5)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from training.parallel import run_all
+from training.jobs import run_all
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ import pytest
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
-from training.config import preset
-from training.data import output
-from training.evaluate import errors, unseen_runs
-from training.metrics import component_smape
+from training.evaluation.errors import errors, unseen_trajectories
+from training.evaluation.metrics import component_smape
+from training.presets import preset
 
 # Medians over 100 unseen runs of 50 s, in percent, that the default maps promise. The paper's SMAPE over all steps from
 # X: without noise, at sigma_v = 0.5, and (first 5 s left out) driven by random steps and sines; and component-wise,
@@ -27,15 +26,15 @@ NAMES = sorted(SYSTEMS)
 @pytest.mark.parametrize("name", NAMES)
 def test_default_maps_are_as_accurate_as_promised(name):
     system, artifact = get_system(name), observers.Artifact.read(resolve(name))
-    quiet, noisy, driven, beyond = PROMISED[name]
-    runs = unseen_runs(system, 0.01, 100, 50.0, seed=0)
+    noise_free_share, noisy, driven, beyond = PROMISED[name]
+    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0)
     assert runs.escaped == 0
-    assert np.median(errors(artifact, system, runs, 0.0, seed=0).full) <= quiet
+    assert np.median(errors(artifact, system, runs, 0.0, seed=0).full) <= noise_free_share
     assert np.median(errors(artifact, system, runs, 0.5, seed=0).full) <= noisy
-    runs = unseen_runs(system, 0.01, 100, 50.0, seed=0, domain="1.5X")
-    x_hat = observers.KKLObserver(artifact, 0.0, process_noise=0.0).estimate(output(system, runs.x), runs.u)
+    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0, domain="1.5X")
+    x_hat = observers.KKLObserver(artifact, 0.0, process_noise=0.0).estimate(system.output(runs.x), runs.u)
     assert np.median(component_smape(runs.x, x_hat, skip=1000)) <= beyond
-    runs = unseen_runs(system, 0.01, 100, 50.0, seed=0, driven=True)
+    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0, driven=True)
     assert runs.escaped <= 5
     assert np.median(errors(artifact, system, runs, 0.0, seed=0, skip=5.0).late) <= driven
 
@@ -50,7 +49,7 @@ def test_shipped_maps_say_what_they_are(name, suffix):
     assert artifact.nu == (0 if suffix else system.nu)
     assert (artifact.forward is not None) == bool(suffix)
     assert resolve(name + suffix) == resolve(f"{name}{suffix}-v1" if suffix else f"{name}-v2")
-    assert (artifact.free is not None) == (not suffix)
+    assert (artifact.free_inverse is not None) == (not suffix)
     assert resolve(name + suffix).stat().st_size < 1_000_000
 
 
@@ -75,8 +74,8 @@ def test_spinn_maps_recover_states_from_their_own_forward_map(name):
 @pytest.mark.parametrize(("name", "seconds", "error"), [("van_der_pol", 1.0, 0.02), ("lorenz", 0.3, 0.02)])
 def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
     system, observer = get_system(name), observers.load(name, 0.0, process_noise=0.0)
-    runs = unseen_runs(system, 0.01, 20, 15.0, seed=0)
-    y = output(system, runs.x)
+    runs = unseen_trajectories(system, 0.01, 20, 15.0, seed=0)
+    y = system.output(runs.x)
     lost = round(seconds / 0.01)
     x_hat = observer.reset(y[0])
     for k in range(1, 1501 - lost):
@@ -100,7 +99,7 @@ def test_every_map_can_be_monitored(name):
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
 def test_maps_fitted_in_closed_loop(name):
-    system, runs = get_system(name), unseen_runs(get_system(name), 0.01, 100, 50.0, seed=0)
+    system, runs = get_system(name), unseen_trajectories(get_system(name), 0.01, 100, 50.0, seed=0)
     fitted = observers.Artifact.read(resolve(f"{name}-closed-loop"))
     assert fitted.training["closed_loop"] == 2000
     assert np.median(errors(fitted, system, runs, 0.0, seed=0).full) <= 1.5

@@ -11,24 +11,28 @@ from rich.progress import Progress
 from scipy.integrate import solve_ivp
 from torch.utils.tensorboard import SummaryWriter
 
-import training.data
-import training.evaluate
-import training.optimise
+import training.evaluation.errors
+import training.maps.optimise
 import training.pipeline
+import training.trajectories.record
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from kkl_gym.simulate import advance_batch, simulate
 from observers import Artifact, KKLObserver, LinearFilter
-from training import errors, preset, smape, train, unseen_runs
-from training.config import Config, override, spectrum
-from training.data import output, record, record_closed_loop, recording_ages, run_filter, trajectories
-from training.evaluate import starts
-from training.forward import ForwardProblem, on_tensors, truncation_time
-from training.inverse import AGE_UNIT, NOISE_UNIT, ClosedLoopSampler, TrajectorySampler, coordinates
-from training.networks import Network, on_torch
-from training.noise import noise_covariance, root, stationary_covariance
-from training.pipeline import make_filter, output_matrix
-from training.signals import random_inputs
-from training.solved import solve_forward
+from training import errors, preset, smape, train, unseen_trajectories
+from training.config import Config, override
+from training.evaluation.errors import starts
+from training.filter_noise import noise_covariance, root, stationary_covariance
+from training.maps.coordinates import coordinates
+from training.maps.forward import ForwardProblem, on_tensors, truncation_time
+from training.maps.least_squares import solve_forward
+from training.maps.networks import Network, on_torch
+from training.maps.samplers import AGE_UNIT, MEASUREMENT_NOISE_UNIT, ClosedLoopSampler, TrajectorySampler
+from training.presets import spectrum
+from training.spectrum import make_filter
+from training.trajectories.closed_loop import record_closed_loop
+from training.trajectories.derivatives import output_matrix
+from training.trajectories.record import record, recording_ages, trajectories
+from training.trajectories.signals import random_inputs
 
 CPU = torch.device("cpu")
 
@@ -87,7 +91,7 @@ def test_pulses_end_and_leave_free_motion_behind():
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     system, n = ReverseDuffing(), 400
-    (x, u, level), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    (x, u, level), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), lead_in_share=0.5)
     low, high = system.box()
     inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
     assert not rest
@@ -95,7 +99,7 @@ def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     assert u.shape == (10, n, 0)
     assert inside[200:].all()
     assert 5 < (~inside[:200]).sum() < 150
-    (x, *_), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), excited=0.5)
+    (x, *_), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), lead_in_share=0.5)
     assert np.isfinite(x).all()
 
 
@@ -106,8 +110,10 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
         seen.append(w)
         return simulate(*arguments, w=w, **named)
 
-    monkeypatch.setattr(training.data, "simulate", spy)
-    (x, u, level), *_ = trajectories(system, n, 50, 0.01, np.random.default_rng(0), ("steps",), disturbed=0.25)
+    monkeypatch.setattr(training.trajectories.record, "simulate", spy)
+    (x, u, level), *_ = trajectories(
+        system, n, 50, 0.01, np.random.default_rng(0), ("steps",), process_noise_share=0.25
+    )
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
     relative = w / (system.process_noise * np.array(system.scale))
@@ -129,25 +135,34 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     seen = {}
 
     def note(name):
-        def spy(*arguments, disturbed=None, **named):
-            seen[name] = disturbed if name == "record" else arguments[2:]
+        def spy(*arguments, process_noise_share=None, **named):
+            seen[name] = process_noise_share if name == "record" else arguments[2:]
             if name == "record":
-                return record(*arguments, disturbed=disturbed, **named)
+                return record(*arguments, process_noise_share=process_noise_share, **named)
             raise ReachedError
 
         return spy
 
     monkeypatch.setattr(training.pipeline, "record", note("record"))
     monkeypatch.setattr(training.pipeline, "TrajectorySampler", note("sampler"))
-    small = {"trajectories": 5, "duration": 1.0, "samples": 10, "disturbed": 0.5, "quiet": 0.3, "emphasis": 3.0}
+    small = {
+        "trajectories": 5,
+        "duration": 1.0,
+        "samples": 10,
+        "process_noise_share": 0.5,
+        "noise_free_share": 0.3,
+        "high_noise_emphasis": 3.0,
+    }
     config = replace(preset(VanDerPol(), "input-aware", "fast"), **small)
     with pytest.raises(ReachedError):
         train(VanDerPol(), config, tmp_path / "aware", device=CPU)
     assert seen == {"record": 0.5, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.05)}
     with pytest.raises(ReachedError):
-        train(VanDerPol(), replace(config, disturbed=0.0), tmp_path / "undisturbed", device=CPU)
+        train(VanDerPol(), replace(config, process_noise_share=0.0), tmp_path / "undisturbed", device=CPU)
     assert seen == {"record": 0.0, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.0)}
-    spinn = replace(preset(VanDerPol(), "spinn", "fast"), disturbed=0.5, trajectories=5, duration=20.0, forward_steps=1)
+    spinn = replace(
+        preset(VanDerPol(), "spinn", "fast"), process_noise_share=0.5, trajectories=5, duration=20.0, forward_steps=1
+    )
     train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
     assert seen["record"] == 0.0
 
@@ -166,7 +181,7 @@ def test_recorded_filter_states_are_those_of_the_observer_at_run_time():
     linear = LinearFilter(np.diag([-1.0, -3.0]), np.ones((2, 1)), 0.01, 1)
     rng = np.random.default_rng(0)
     y, u = rng.normal(size=(31, 4, 1)), rng.normal(size=(30, 4, 1))
-    z = run_filter(linear, y, u, np.array([0, 7, 30]))
+    z = linear.run(y, u, np.array([0, 7, 30]))
     state = linear.start(y[0])
     np.testing.assert_allclose(z[0], state)
     for k in range(30):
@@ -200,7 +215,7 @@ def test_noise_covariance_against_simulation_at_every_age():
     ages = np.array([0, 1, 2, 5, 50])
     n = 200_000
     y = np.random.default_rng(0).normal(size=(51, n, 1))
-    e = run_filter(linear, y, np.zeros((50, n, 0)), ages)
+    e = linear.run(y, np.zeros((50, n, 0)), ages)
     for predicted, sample in zip(noise_covariance(linear, ages), e, strict=True):
         measured = sample.T @ sample / n
         size = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
@@ -241,21 +256,25 @@ def test_batches_cover_quiet_and_loud(sampler):
     assert x.shape == (4096, 2)
     assert torch.isfinite(inputs).all()
     assert (weight > 0).all()
-    quiet = inputs[:, -2] == 0
-    assert 0.15 < quiet.float().mean() < 0.25
-    assert ((cell % 7 == 0) == quiet).all()
+    noise_free_share = inputs[:, -2] == 0
+    assert 0.15 < noise_free_share.float().mean() < 0.25
+    assert ((cell % 7 == 0) == noise_free_share).all()
     assert cell.max() < sampler.cells
 
 
-@pytest.mark.parametrize(("quiet", "emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.5, 4.0), (1.0, 2.0), (0.0, 1e-3)])
-def test_how_often_batches_hold_each_noise_level(sampler, quiet, emphasis):
+@pytest.mark.parametrize(
+    ("noise_free_share", "high_noise_emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.5, 4.0), (1.0, 2.0), (0.0, 1e-3)]
+)
+def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high_noise_emphasis):
     _, data, linear = sampler
-    inputs, *_ = TrajectorySampler(data, linear, 0.5, 32_768, CPU, quiet, emphasis)(torch.Generator().manual_seed(0))
+    inputs, *_ = TrajectorySampler(data, linear, 0.5, 32_768, CPU, noise_free_share, high_noise_emphasis)(
+        torch.Generator().manual_seed(0)
+    )
     assert torch.isfinite(inputs).all()
-    level = (NOISE_UNIT * torch.expm1(inputs[:, -2].double())).numpy()
-    assert (level == 0).mean() == pytest.approx(quiet, abs=0.01)
+    level = (MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2].double())).numpy()
+    assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
     for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
-        expected = quiet + (1 - quiet) * (1 + np.log10(below / 0.5) / 2) ** emphasis
+        expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
         assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
 
 
@@ -270,7 +289,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
     sums, counts = np.zeros_like(expected), np.zeros(len(data.ages))
     for _ in range(150):
         inputs, _, _, _ = sampler(generator)
-        level = NOISE_UNIT * torch.expm1(inputs[:, -2:-1]).double().numpy()
+        level = MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2:-1]).double().numpy()
         age = AGE_UNIT * np.expm1(inputs[:, -1].double().numpy())
         noise = inputs[:, :-2].double().numpy() * (1 + (level * gain) ** 2) / level
         slot = np.abs(age[:, None] - data.ages * linear.dt).argmin(1)
@@ -301,8 +320,10 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
 @pytest.fixture(scope="module")
 def disturbed_sampler():
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    data = record(VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0), disturbed=0.5)
-    return TrajectorySampler(data, linear, 1.0, 4096, CPU, process_max=VanDerPol.process_noise), data, linear
+    data = record(
+        VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0), process_noise_share=0.5
+    )
+    return TrajectorySampler(data, linear, 1.0, 4096, CPU, process_noise_max=VanDerPol.process_noise), data, linear
 
 
 def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler):
@@ -332,7 +353,7 @@ def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler
 @pytest.fixture(scope="module", params=["sampler", "disturbed_sampler"])
 def closed_loop(request):
     open_loop, _, linear = request.getfixturevalue(request.param)
-    network = Network(len(open_loop.coordinates.noise_gain) + 2 + bool(open_loop.process_max), 2, 8, 1, "tanh")
+    network = Network(len(open_loop.coordinates.noise_gain) + 2 + bool(open_loop.process_noise_max), 2, 8, 1, "tanh")
     artifact = Artifact(linear, open_loop.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
     seen = []
 
@@ -352,10 +373,10 @@ def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(closed_l
     assert 50 <= len(data.level) <= 60
     assert len(np.unique(data.level)) >= 5
     assert ((data.level >= 0) & (data.level <= 1.0)).all()
-    disturbed = (data.process_noise > 0).mean()
-    assert 0.2 < disturbed < 0.8 if artifact.process_max else disturbed == 0
-    quiet = (data.level == 0) & (data.process_noise == 0)
-    start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, quiet, :1])
+    process_noise_share = (data.process_noise > 0).mean()
+    assert 0.2 < process_noise_share < 0.8 if artifact.process_noise_max else process_noise_share == 0
+    noise_free_share = (data.level == 0) & (data.process_noise == 0)
+    start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, noise_free_share, :1])
     assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen) or not len(start)
     states = {tuple(row) for row in data.x.reshape(-1, 2).round(6).tolist()}
     assert not any(tuple(row) in states for x_hat in seen for row in x_hat.round(6).tolist())
@@ -377,7 +398,7 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
         np.testing.assert_allclose(shown, expected, atol=1e-3)
         at_run_time = cell[row] - sampler.open_loop.cells
-        if sampler.open_loop.process_max:
+        if sampler.open_loop.process_noise_max:
             level = data.process_noise[trajectory]
             assert at_run_time % 3 == int(level > 0) + int(level > 0.025)
             at_run_time = at_run_time // 3
@@ -545,20 +566,27 @@ def test_what_cannot_be_solved():
 
     with pytest.raises(ValueError, match="too soon"):
         solve_forward(Tight(), make_filter((-1.0,), 1, 0.01, 0), 1000, 1.0, np.random.default_rng(0))
-    for wrong in ({"reach": 0.5}, {"reach": 2.0}, {"features": -1}, {"features": 10}):
-        with pytest.raises(ValueError, match=r"features|reach"):
+    for wrong in ({"box_factor": 0.5}, {"box_factor": 2.0}, {"features": -1}, {"features": 10}):
+        with pytest.raises(ValueError, match=r"features|box_factor"):
             replace(preset(ReverseDuffing(), "spinn", "fast"), **wrong)
     with pytest.raises(ValueError, match="does not go with"):
         replace(preset(ReverseDuffing(), "input-aware", "fast"), features=10)
 
 
 def test_training_on_a_solved_map(tmp_path):
-    sizes = {"features": 200, "forward_steps": 0, "reach": 1.5, "inverse_steps": 2000, "duration": 15.0, "width": 32}
+    sizes = {
+        "features": 200,
+        "forward_steps": 0,
+        "box_factor": 1.5,
+        "inverse_steps": 2000,
+        "duration": 15.0,
+        "width": 32,
+    }
     config = toy(Oscillator(), "spinn", **sizes)
     result = train(Oscillator(), config, tmp_path)
     assert list(result.losses) == ["inverse"]
     assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
-    runs = unseen_runs(Oscillator(), config.dt, 20, 20.0, seed=0, domain="1.5X")
+    runs = unseen_trajectories(Oscillator(), config.dt, 20, 20.0, seed=0, domain="1.5X")
     # long after the start, whose last traces in z an inverse of exact T(x) magnifies
     assert np.median(errors(result.artifact, Oscillator(), runs, 0.0, 0, skip=12.0).late) < 5.0
 
@@ -569,13 +597,13 @@ def test_training_on_a_solved_map(tmp_path):
 def test_training_makes_the_error_fall(tmp_path):
     system = Oscillator()
     config = toy(system, trajectories=100, duration=20.0, inverse_steps=1500, width=32)
-    runs = unseen_runs(system, config.dt, 20, 20.0, seed=0)
+    runs = unseen_trajectories(system, config.dt, 20, 20.0, seed=0)
     before = train(system, replace(config, inverse_steps=1), tmp_path / "a").artifact
     after = train(system, config, tmp_path / "b").artifact
     errors_before, errors_after = (np.median(errors(a, system, runs, 0.0, 0).late) for a in (before, after))
     assert errors_after < 0.1 * errors_before
     assert errors_after < 5.0
-    driven = unseen_runs(system, config.dt, 20, 20.0, seed=0, driven=True)
+    driven = unseen_trajectories(system, config.dt, 20, 20.0, seed=0, driven=True)
     assert np.median(errors(after, system, driven, 0.0, 0).late) < 10.0
 
 
@@ -585,8 +613,8 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     config = toy(system, method, duration=20.0, inverse_steps=400)
     whole = train(system, config, tmp_path / "whole").artifact
 
-    monkeypatch.setattr(training.optimise, "CHECKPOINT_SECONDS", 0.0)
-    save, saved = training.optimise._save, []
+    monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
+    save, saved = training.maps.optimise._save, []
 
     def save_and_stop(path, stage, module, optimiser, generator, step, *rest):
         save(path, stage, module, optimiser, generator, step, *rest)
@@ -594,17 +622,17 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
         if stage.name == "inverse" and step == 200:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.optimise, "_save", save_and_stop)
+    monkeypatch.setattr(training.maps.optimise, "_save", save_and_stop)
     with pytest.raises(KeyboardInterrupt):
         train(system, config, tmp_path / "cut")
-    monkeypatch.setattr(training.optimise, "_save", save)
+    monkeypatch.setattr(training.maps.optimise, "_save", save)
     resumed = train(system, config, tmp_path / "cut", resume=True)
     for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
     assert resumed.losses["inverse"][-1][0] == 400
-    assert (whole.free is not None) == (method == "input-aware")
-    if whole.free:
-        for a, b in zip(whole.free.mlp.weights, resumed.artifact.free.mlp.weights, strict=True):
+    assert (whole.free_inverse is not None) == (method == "input-aware")
+    if whole.free_inverse:
+        for a, b in zip(whole.free_inverse.mlp.weights, resumed.artifact.free_inverse.mlp.weights, strict=True):
             np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
         train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
@@ -628,7 +656,7 @@ class Clock:
 
 
 def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypatch):
-    monkeypatch.setattr(training.optimise.time, "process_time", Clock())
+    monkeypatch.setattr(training.maps.optimise.time, "process_time", Clock())
     rates = []
 
     class Line(torch.nn.Module):
@@ -645,19 +673,19 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
                 raise KeyboardInterrupt
             return {"loss": ((module.a - 1.0) ** 2).sum()}
 
-        stage = training.optimise.Stage("line", 10**9, 0.1, tmp_path, "same", 0, cap=4.0)
+        stage = training.maps.optimise.Stage("line", 10**9, 0.1, tmp_path, "same", 0, cpu_seconds=4.0)
         with SummaryWriter(tmp_path) as writer, Progress(disable=True) as progress:
-            training.optimise.optimise(stage, module, loss, progress, writer, resume=True)
+            training.maps.optimise.optimise(stage, module, loss, progress, writer, resume=True)
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
-    monkeypatch.setattr(training.optimise, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         fit(stop_after=150)  # the checkpoint is of step 100
-    spent = training.optimise.seconds_spent(tmp_path)
+    spent = training.maps.optimise.seconds_spent(tmp_path)
     assert 1.5 < spent < 3.0
     rest = fit()
-    assert 4.0 <= training.optimise.seconds_spent(tmp_path) < 4.1
+    assert 4.0 <= training.maps.optimise.seconds_spent(tmp_path) < 4.1
     assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
     assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
     assert fit() == 0
@@ -735,10 +763,10 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"activation": "relu"}, "activation"),
         ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
-        ({"noise_max": float("nan")}, "noise_max"),
-        ({"disturbed": 1.5}, "share"),
-        ({"quiet": float("nan")}, "share"),
-        ({"emphasis": 0.0}, "emphasis"),
+        ({"measurement_noise_max": float("nan")}, "measurement_noise_max"),
+        ({"process_noise_share": 1.5}, "share"),
+        ({"noise_free_share": float("nan")}, "share"),
+        ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
         ({"closed_loop": 5}, "closed_loop"),
     ],
 )
@@ -770,8 +798,10 @@ def test_starts_outside_lie_outside():
 
 def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifact, monkeypatch):
     system, told = VanDerPol(), []
-    quiet, loud = (unseen_runs(system, 0.01, 20, 1.0, 0, process_noise=level) for level in (0.0, 0.15))
-    assert np.array_equal(quiet.x[0], loud.x[0])
+    noise_free_share, loud = (
+        unseen_trajectories(system, 0.01, 20, 1.0, 0, process_noise=level) for level in (0.0, 0.15)
+    )
+    assert np.array_equal(noise_free_share.x[0], loud.x[0])
     x, w, u = loud.x.transpose(0, 2, 1), np.zeros((2, 20)), np.zeros((1, 20))
     for k in (0, 50):
         drift = (x[k + 1] - advance_batch(system, x[k], u, w, 0.01)) / 0.01 / np.array(system.scale)[:, None]
@@ -782,8 +812,8 @@ def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifa
             super().__init__(*arguments, **named)
             told.append(self.process_noise)
 
-    monkeypatch.setattr(training.evaluate, "KKLObserver", Spy)
-    for runs in (quiet, loud, loud.first(5)):
+    monkeypatch.setattr(training.evaluation.errors, "KKLObserver", Spy)
+    for runs in (noise_free_share, loud, loud.first(5)):
         errors(make_artifact(), system, runs, 0.5, 0)
     assert told == [0.0, 0.15, 0.15]
 
@@ -794,11 +824,11 @@ def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifa
 )
 def test_impossible_evaluations(wrong):
     with pytest.raises(ValueError, match=r"cannot run|domain|process_noise must"):
-        unseen_runs(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
+        unseen_trajectories(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 
 def test_escapes_are_counted():
-    runs = unseen_runs(get_system("rossler"), 0.01, 200, 20.0, seed=0, domain="2X")
+    runs = unseen_trajectories(get_system("rossler"), 0.01, 200, 20.0, seed=0, domain="2X")
     assert runs.escaped > 0
     assert runs.x.shape[1] == 200 - runs.escaped
     assert np.isfinite(runs.x).all()
@@ -806,7 +836,7 @@ def test_escapes_are_counted():
 
 def test_output_of_constant_and_state():
     x = np.arange(12.0).reshape(2, 3, 2)
-    np.testing.assert_array_equal(output(Oscillator(), x), x[..., :1])
+    np.testing.assert_array_equal(Oscillator().output(x), x[..., :1])
 
 
 # Command line
@@ -850,7 +880,7 @@ def test_demo_and_maps(tmp_path, capsys):
 
 
 def test_speed_measures_every_environment(capsys):
-    from training.speed import Speed
+    from training.commands.speed import Speed
 
     ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
     assert len(ratios) == 9 + 13

@@ -18,11 +18,11 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import load
 from training.cli import main
-from training.config import Config, override, preset, read_changes
-from training.data import output, run_filter
-from training.derivatives import with_sensitivity
-from training.methods.kalman import ExtendedKalmanFilter
-from training.pipeline import make_filter
+from training.config import Config, override, read_changes
+from training.kalman import ExtendedKalmanFilter
+from training.presets import preset
+from training.spectrum import make_filter
+from training.trajectories.derivatives import with_sensitivity
 from training.tuning import Probe, Spectrum
 from training.tuning.check import rank_correlation
 
@@ -47,9 +47,9 @@ def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, mo
     x = [rng.normal(size=(n, 2)) / np.sqrt(probe._known)]
     for _ in range(600):
         x.append(x[-1] @ flow.T)
-    y = output(probe.system, np.array(x)) + sigma * rng.normal(size=(601, n, 1))
+    y = probe.system.output(np.array(x)) + sigma * rng.normal(size=(601, n, 1))
     linear = make_filter(SPECTRUM.eigenvalues, 1, 0.01, 0, SPECTRUM.pairs)
-    z = run_filter(linear, y, np.zeros((600, n, 0)), probe.ages)
+    z = linear.run(y, np.zeros((600, n, 0)), probe.ages)
     left = []
     for i, age in enumerate(probe.ages):
         best, *_ = np.linalg.lstsq(z[i], x[age], rcond=None)
@@ -200,9 +200,9 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
         chosen[noise] = read_changes(folder / "config.json")
         assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
     assert chosen["0"]["eigenvalues"] != chosen["0.5"]["eigenvalues"]
-    assert (chosen["0"]["noise_max"], chosen["0.5"]["noise_max"]) == (0.01, 2.0)
-    assert (chosen["0"]["quiet"], chosen["0.5"]["quiet"]) == (0.9, 0.05)
-    assert chosen["0"]["emphasis"] == chosen["0.5"]["emphasis"] == 4.0
+    assert (chosen["0"]["measurement_noise_max"], chosen["0.5"]["measurement_noise_max"]) == (0.01, 2.0)
+    assert (chosen["0"]["noise_free_share"], chosen["0.5"]["noise_free_share"]) == (0.9, 0.05)
+    assert chosen["0"]["high_noise_emphasis"] == chosen["0.5"]["high_noise_emphasis"] == 4.0
     small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]
     config = ["--config", str(tmp_path / "0.5" / "config.json"), "--no-monitor", "--out", str(tmp_path / "run")]
     main(["train", system, *config, *small, "--batch", "64"])
@@ -267,7 +267,7 @@ def test_bad_options(options, tmp_path):
         ('{"dt": true}', "dt"),
         ('{"free": 1}', "free"),
         ('{"activation": "relu"}', "activation"),
-        ('{"cap": "a"}', "cap"),
+        ('{"cpu_seconds": "a"}', "cpu_seconds"),
     ],
 )
 def test_files_that_hold_no_settings(text, message, tmp_path):
@@ -285,13 +285,22 @@ def test_settings_of_the_first_version_of_the_maps_are_still_known():
         if name in now:
             assert now[name] == (tuple(value) if isinstance(value, list) else value), name
     # What had no setting then was as the defaults are, but for one map of free and driven motion.
-    later = {entry.name: entry.default for entry in fields(Config) if entry.name not in made} | {"free": False}
-    assert {"quiet", "emphasis", "disturbed", "push", "pairs", "optimiser"} <= set(later)
+    later = {entry.name: entry.default for entry in fields(Config) if entry.name not in made} | {"free_inverse": False}
+    assert {
+        "noise_free_share",
+        "high_noise_emphasis",
+        "process_noise_share",
+        "lead_in_input",
+        "pairs",
+        "optimiser",
+    } <= set(later)
     assert {name: now[name] for name in later} == later
 
 
 def test_a_file_of_settings(tmp_path):
-    (tmp_path / "c.json").write_text('{"eigenvalues": [-1, -2.5], "pairs": [[-1, 2]], "cap": null, "samples": 20}')
+    (tmp_path / "c.json").write_text(
+        '{"eigenvalues": [-1, -2.5], "pairs": [[-1, 2]], "cpu_seconds": null, "samples": 20}'
+    )
     assert read_changes(tmp_path / "c.json") == {
-        "eigenvalues": (-1, -2.5), "pairs": ((-1, 2),), "cap": None, "samples": 20,
+        "eigenvalues": (-1, -2.5), "pairs": ((-1, 2),), "cpu_seconds": None, "samples": 20,
     }  # fmt: skip

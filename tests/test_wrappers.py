@@ -2,6 +2,7 @@ import copy
 import json
 
 import gymnasium as gym
+import kkl_gym.estimator
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
@@ -10,7 +11,6 @@ from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import kkl_gym.installed
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
 from observers import Artifact, ArtifactError, KKLObserver
 
@@ -182,7 +182,7 @@ def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
         assert not monitor
         return KKLObserver(make_artifact(name), noise)
 
-    monkeypatch.setattr(kkl_gym.installed, "load", load)
+    monkeypatch.setattr(kkl_gym.estimator, "load", load)
     KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7, process_noise=0.02))
     assert asked == [("van_der_pol", 0.7, 0.02)]
 

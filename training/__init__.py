@@ -1,12 +1,13 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
 try:
-    from training.calibration import calibrate
-    from training.certificates import Certificate, certify
-    from training.config import Config, preset
-    from training.evaluate import errors, unseen_runs
-    from training.metrics import smape
+    from training.config import Config
+    from training.evaluation.calibration import calibrate
+    from training.evaluation.certificates import Certificate, certify
+    from training.evaluation.errors import errors, unseen_trajectories
+    from training.evaluation.metrics import smape
     from training.pipeline import Result, train
+    from training.presets import preset
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         f'{error}: training and the kkl-gym command need pip install "kkl-gym[train]"', name=error.name
@@ -22,5 +23,5 @@ __all__ = [
     "preset",
     "smape",
     "train",
-    "unseen_runs",
+    "unseen_trajectories",
 ]

@@ -6,45 +6,50 @@ import json
 import math
 import platform
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from scipy.linalg import block_diag
-from torch.utils.tensorboard import SummaryWriter
+from rich.progress import Progress
 
 import kkl_gym
 from kkl_gym.system import System
 from observers import Artifact, ForwardMap, InverseMap, LinearFilter
 from training.config import Config
-from training.controllers import controller
-from training.data import Trajectories, output, record, record_closed_loop, recording_ages
-from training.files import write
-from training.forward import ForwardProblem, truncation_time
-from training.inverse import ClosedLoopSampler, ForwardMapSampler, InverseProblem, Sampler, TrajectorySampler
-from training.networks import Network, on_torch
-from training.optimise import Stage, optimise
-from training.signals import DRIVEN, KINDS
-from training.solved import collocation, solve_forward
+from training.jobs import claimed_run, describe
+from training.maps.collocation import collocation
+from training.maps.forward import ForwardProblem, truncation_step
+from training.maps.inverse import InverseProblem
+from training.maps.least_squares import solve_forward
+from training.maps.networks import Network, on_torch
+from training.maps.optimise import Log, Stage, log_to, optimise
+from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
+from training.progress import progress_bars
+from training.seeds import Stream, generator
+from training.spectrum import Spectrum
+from training.systems import controller
+from training.trajectories.closed_loop import record_closed_loop
+from training.trajectories.controllers import Controller
+from training.trajectories.derivatives import output_matrix
+from training.trajectories.record import Motions, Trajectories, record, recording_ages
+from training.trajectories.signals import DRIVEN, KINDS
 
-# First entry of the seed of training trajectories; evaluation's is another (training.evaluate.EVALUATION_SEED).
-TRAINING_SEED = 1
-# Of each stage in the cap on CPU time; those of input-aware maps have equal ones. A step of the forward map costs three
-# of the inverse map's.
+# Of each stage in the CPU time; those of input-aware maps have equal shares. A step of the forward map costs three of
+# the inverse map's.
 SPINN_SHARES = {"forward": 0.75, "inverse": 0.25}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
-EXCITED = 0.4  # share of the free motions that start beyond X, where inputs have led
+LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 INVERTED = 200_000  # states on which a solved forward map is inverted
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a run leaves behind."""
+    """What a run leaves behind: the artifact, and the course of the error in each stage, by batch."""
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
@@ -54,6 +59,7 @@ def train(
     system: System,
     config: Config,
     folder: Path,
+    *,
     resume: bool = False,
     device: torch.device | None = None,
     console: Console | None = None,
@@ -71,200 +77,189 @@ def train(
 
     Raises
     ------
-    ValueError : if there are checkpoints, but not ``resume`` or not of this configuration, or if the system's
-        trajectories leave its bounds.
+    ValueError : if there are checkpoints, but not ``resume`` or not of this configuration, if another process is at
+        work in the folder, or if the system's trajectories leave its bounds.
     FloatingPointError : if the loss stops being a number.
     """
-    started = time.monotonic()
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    folder.mkdir(parents=True, exist_ok=True)
     noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}
     identity = {**describe(system), **noise, **dataclasses.asdict(config)}
-    fingerprint = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:16]
-    _claim(folder, identity, resume)
-    torch.manual_seed(config.seed)
-    rng = np.random.default_rng([TRAINING_SEED, config.seed])
-
-    nu = system.nu if config.method == "input-aware" and config.inputs else 0
-    linear = make_filter(config.eigenvalues, system.ny, config.dt, nu, config.pairs)
-    shares = _shares(config, nu)
-    steps = max(1, round(config.duration / config.dt))
-    losses: dict[str, list[tuple[int, float]]] = {}
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with (
-        SummaryWriter(folder) as writer,
-        Progress(*columns, TimeRemainingColumn(), console=console, disable=console is None) as progress,
-    ):
-
-        def run(name: str, problem: Any, count: int) -> None:
-            cap = math.inf if config.cap is None else config.cap * shares[name]
-            stage = Stage(name, count, config.learning_rate, folder, fingerprint, config.seed, cap, config.optimiser)
-            losses[name] = optimise(stage, problem, problem.loss, progress, writer, resume)
-
-        first = 0 if config.method == "input-aware" else truncation_step(system, linear, steps, config.truncation)
-        ages = recording_ages(first, steps, config.samples)
-
-        def simulated(into: LinearFilter, what: str, **how: Any) -> Trajectories:
-            task = progress.add_task(f"simulating {what}", total=config.trajectories)
-
-            def report(done: int) -> None:
-                progress.update(task, completed=done)
-
-            disturbed = config.disturbed if config.method == "input-aware" else 0.0
-            return record(system, into, config.trajectories, steps, ages, rng, report, disturbed=disturbed, **how)
-
-        def sampled(motions: Trajectories, through: LinearFilter) -> TrajectorySampler:
-            process_max = system.process_noise if config.disturbed else 0.0
-            levels = (config.quiet, config.emphasis, process_max)
-            return TrajectorySampler(motions, through, config.noise_max, config.batch, device, *levels)
-
-        def fit(sampler: Sampler, stage: str) -> Network:
-            inputs = sampler(torch.Generator(device).manual_seed(0))[0].shape[1]
-            network = Network(inputs, system.nx, config.width, config.depth, config.activation).to(device)
-            run(stage, InverseProblem(network, sampler, device), config.inverse_steps)
-            return network
-
-        feedback = controller(system) if config.closed_loop else None  # an error now rather than in ten minutes
-        free: InverseMap | None = None
-        if "free" in shares:
-            unforced = make_filter(config.eigenvalues, system.ny, config.dt, 0, config.pairs)
-            motions = simulated(unforced, f"{system.name}, free", excited=EXCITED, push=config.push)
-            own = sampled(motions, unforced)
-            free = own.inverse_map(fit(own, "free"), unforced)
-            del motions, own
-        data = simulated(linear, system.name, kinds=DRIVEN if free else KINDS)
+    feedback = controller(system) if config.closed_loop_trajectories else None  # an error now, not in ten minutes
+    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console) as progress:
+        run = _Run(system, config, folder, resume, device, progress, log, identity)
+        free = run.learn_free_inverse() if "free" in run.shares else None
+        trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS))
         forward: ForwardMap | None = None
         sampler: Sampler
-        if config.method == "input-aware":
-            sampler = sampled(data, linear)
+        if config.pipeline == "input-aware":
+            sampler = run.transients(trajectories, run.linear)
         else:
-            x, z = data.x.reshape(-1, system.nx), data.z.reshape(-1, linear.size)
-            if config.features:
-                task = progress.add_task(f"solving for T with {config.features} features", total=1)
-                forward = solve_forward(system, linear, config.features, config.reach, rng)
-                progress.update(task, completed=1)
-                some = np.random.default_rng(0).permutation(len(x))[:100_000]
-                T, error = on_torch(forward, device), z[some] - forward(x[some])
-                points = collocation(system, INVERTED, config.reach, rng)
-            else:
-                network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
-                problem = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
-                run("forward", problem, config.forward_steps)
-                forward, T, error, points = problem.forward_map(), problem.T, problem.error(), None
-            sampler = ForwardMapSampler(T, error, system.box(), config.batch, device, points)
-        inverse = fit(sampler, "inverse")
+            forward, sampler = run.learn_forward(trajectories)
+        inverse = run.fit_inverse("inverse", sampler)
+        artifact = run.artifact(sampler.inverse_map(inverse, run.linear), forward, free)
+        if feedback is not None and isinstance(sampler, TrajectorySampler):
+            both = run.close_the_loop(sampler, artifact, feedback)
+            run.minimise("closed-loop", InverseProblem(inverse, both, device), config.inverse_steps)
+            artifact = run.artifact(both.inverse_map(inverse, run.linear), forward, free)
+    return Result(artifact, run.losses)
 
-        def artifact() -> Artifact:
-            return Artifact(
-                filter=linear,
-                inverse=sampler.inverse_map(inverse, linear),
-                system=system.name,
-                parameters=system.parameters,
-                forward=forward,
-                C=output_matrix(system),
-                free=free,
-                training={
-                    **dataclasses.asdict(config),
-                    "seconds": round(time.monotonic() - started),
-                    "device": device.type,
-                    "threads": torch.get_num_threads(),
-                    "resumed": resume,
-                },
-                versions={
-                    "kkl-gym": kkl_gym.__version__,
-                    "python": platform.python_version(),
-                    "torch": torch.__version__,
-                    "numpy": np.__version__,
-                },
-            )
 
-        if feedback and isinstance(sampler, TrajectorySampler):
-            steps = min(steps, round(CLOSED_LOOP_SECONDS / config.dt))
-            task = progress.add_task("closing the loop", total=config.closed_loop)
-            driven = record_closed_loop(
-                system,
-                artifact(),
-                feedback,
-                config.closed_loop,
-                steps,
-                recording_ages(0, steps, config.samples),
-                rng,
-                lambda done: progress.update(task, completed=done),
-            )
-            sampler = ClosedLoopSampler(sampler, driven, config.dt, device)
-            run("closed-loop", InverseProblem(inverse, sampler, device), config.inverse_steps)
-    return Result(artifact(), losses)
+@dataclass
+class _Run:
+    """The stages of :func:`train`, and what they share. Random numbers are drawn in the order of the stages."""
+
+    system: System
+    config: Config
+    folder: Path
+    resume: bool
+    device: torch.device
+    progress: Progress
+    log: Log | None
+    identity: dict[str, Any]
+    losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        system, config = self.system, self.config
+        self.started = time.monotonic()
+        self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
+        torch.manual_seed(config.seed)
+        self.rng = generator(Stream.TRAINING, config.seed)
+        self.spectrum = Spectrum(config.eigenvalues, config.pairs)
+        nu = system.nu if config.pipeline == "input-aware" and config.inputs else 0
+        self.linear = self.spectrum.filter(system.ny, config.dt, nu)
+        self.shares = _shares(config, nu)
+        self.steps = max(1, round(config.duration / config.dt))
+        first = 0
+        if config.pipeline == "spinn":
+            first = truncation_step(system, self.linear, self.steps, config.truncation)
+        self.ages = recording_ages(first, self.steps, config.samples)
+
+    def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
+        """Training trajectories with a filter beside them."""
+        config, report = self.config, self._bar(f"simulating {what}", self.config.trajectories)
+        if config.pipeline == "input-aware":
+            motions = dataclasses.replace(motions, process_noise_share=config.process_noise_share)
+        n, steps = config.trajectories, self.steps
+        return record(
+            self.system, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
+        )
+
+    def transients(self, trajectories: Trajectories, linear: LinearFilter) -> TrajectorySampler:
+        """Batches along trajectories, transients and noise included."""
+        config = self.config
+        return TrajectorySampler(
+            trajectories,
+            linear,
+            measurement_noise_max=config.measurement_noise_max,
+            batch=config.batch,
+            device=self.device,
+            noise_free_share=config.noise_free_share,
+            high_noise_emphasis=config.high_noise_emphasis,
+            process_noise_max=self.system.process_noise if config.process_noise_share else 0.0,
+        )
+
+    def learn_free_inverse(self) -> InverseMap:
+        """T_inv of z_y alone, fitted along motions without input, some of them from beyond X."""
+        unforced = self.spectrum.filter(self.system.ny, self.config.dt)
+        motions = Motions(lead_in_share=LEAD_IN_SHARE, lead_in_input=self.config.lead_in_input)
+        sampler = self.transients(self.simulate(unforced, f"{self.system.name}, free", motions), unforced)
+        return sampler.inverse_map(self.fit_inverse("free", sampler), unforced)
+
+    def learn_forward(self, trajectories: Trajectories) -> tuple[ForwardMap, ForwardMapSampler]:
+        """T, trained or solved for, and the batches z' = T(x') on which it is to be inverted."""
+        system, config, linear, device = self.system, self.config, self.linear, self.device
+        x, z = trajectories.x.reshape(-1, system.nx), trajectories.z.reshape(-1, linear.size)
+        if config.random_features:
+            report = self._bar(f"solving for T with {config.random_features} features", 1)
+            forward = solve_forward(system, linear, config.random_features, config.box_factor, self.rng)
+            report(1)
+            some = np.random.default_rng(0).permutation(len(x))[:100_000]
+            T, error = on_torch(forward, device), z[some] - forward(x[some])
+            points = collocation(system, INVERTED, config.box_factor, self.rng)
+            return forward, ForwardMapSampler(T, error, system.box(), config.batch, device, points)
+        network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
+        problem = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
+        self.minimise("forward", problem, config.forward_steps)
+        return problem.forward_map(), ForwardMapSampler(problem.T, problem.error(), system.box(), config.batch, device)
+
+    def fit_inverse(self, stage: str, sampler: Sampler) -> Network:
+        """A network that gives x on the sampler's batches."""
+        config = self.config
+        inputs = sampler(torch.Generator(self.device).manual_seed(0))[0].shape[1]
+        network = Network(inputs, self.system.nx, config.width, config.depth, config.activation).to(self.device)
+        self.minimise(stage, InverseProblem(network, sampler, self.device), config.inverse_steps)
+        return network
+
+    def close_the_loop(self, sampler: TrajectorySampler, artifact: Artifact, feedback: Controller) -> ClosedLoopSampler:
+        """Batches half from trajectories of a controller that acts on the artifact's estimate."""
+        config = self.config
+        steps = min(self.steps, round(CLOSED_LOOP_SECONDS / config.dt))
+        driven = record_closed_loop(
+            self.system,
+            artifact,
+            feedback,
+            n=config.closed_loop_trajectories,
+            steps=steps,
+            ages=recording_ages(0, steps, config.samples),
+            rng=self.rng,
+            noise_free_share=config.noise_free_share,
+            high_noise_emphasis=config.high_noise_emphasis,
+            process_noise_share=config.process_noise_share,
+            report=self._bar("closing the loop", config.closed_loop_trajectories),
+        )
+        return ClosedLoopSampler(sampler, driven, config.dt, self.device)
+
+    def minimise(self, name: str, problem: Any, steps: int) -> None:
+        """Train a stage's network within its share of the CPU time."""
+        config = self.config
+        seconds = math.inf if config.cpu_seconds is None else config.cpu_seconds * self.shares[name]
+        stage = Stage(
+            name=name,
+            steps=steps,
+            learning_rate=config.learning_rate,
+            folder=self.folder,
+            fingerprint=self.fingerprint,
+            seed=config.seed,
+            cpu_seconds=seconds,
+            optimiser=config.optimiser,
+        )
+        self.losses[name] = optimise(stage, problem, problem.loss, self.progress, log=self.log, resume=self.resume)
+
+    def artifact(self, inverse: InverseMap, forward: ForwardMap | None, free: InverseMap | None) -> Artifact:
+        """The observer, with how it was made."""
+        return Artifact(
+            filter=self.linear,
+            inverse=inverse,
+            system=self.system.name,
+            parameters=self.system.parameters,
+            forward=forward,
+            C=output_matrix(self.system),
+            free_inverse=free,
+            training={
+                **dataclasses.asdict(self.config),
+                "seconds": round(time.monotonic() - self.started),
+                "device": self.device.type,
+                "threads": torch.get_num_threads(),
+                "resumed": self.resume,
+            },
+            versions={
+                "kkl-gym": kkl_gym.__version__,
+                "python": platform.python_version(),
+                "torch": torch.__version__,
+                "numpy": np.__version__,
+            },
+        )
+
+    def _bar(self, description: str, total: int) -> Callable[[int], None]:
+        """A progress bar; returns what tells it how much is done."""
+        task = self.progress.add_task(description, total=total)
+        return lambda done: self.progress.update(task, completed=done)
 
 
 def _shares(config: Config, nu: int) -> dict[str, float]:
-    """The stages of a run that train networks, with their parts in the cap on CPU time."""
-    if config.method == "spinn":
-        return SOLVED_SHARES if config.features else SPINN_SHARES
-    stages = ["inverse", *(["free"] if config.free and nu else []), *(["closed-loop"] if config.closed_loop else [])]
+    """The stages of a run that train networks, with their parts in the CPU time."""
+    if config.pipeline == "spinn":
+        return SOLVED_SHARES if config.random_features else SPINN_SHARES
+    closed_loop = ["closed-loop"] if config.closed_loop_trajectories else []
+    stages = ["inverse", *(["free"] if config.free_inverse and nu else []), *closed_loop]
     return {stage: 1 / len(stages) for stage in stages}
-
-
-def describe(system: System) -> dict[str, Any]:
-    """What identifies a system, its equations included: they are sampled at points of the training box."""
-    x = np.random.default_rng(0).uniform(*system.box(), (20, system.nx))
-    rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *output(system, x).T]
-    equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
-    return {
-        "system": system.name,
-        "parameters": system.parameters,
-        "X": system.X,
-        "bounds": system.bounds,
-        "u_max": system.u_max,
-        "equations": hashlib.sha256(json.dumps(equations.tolist()).encode()).hexdigest()[:16],
-    }
-
-
-def _claim(folder: Path, described: dict[str, Any], resume: bool) -> None:
-    """Write the run's configuration, unless the folder holds a run that this one would spoil."""
-    file = folder / "config.json"
-    described = json.loads(json.dumps(described))
-    if any(folder.glob("*.checkpoint.safetensors")) and file.exists():
-        if not resume:
-            raise ValueError(
-                f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, "
-                "or take another folder (--out)"
-            )
-        before = json.loads(file.read_text())
-        changed = [name for name in sorted({*before, *described}) if before.get(name) != described.get(name)]
-        if changed:
-            differences = ", ".join(
-                f"{name} = {before.get(name)} there, {described.get(name)} here" for name in changed
-            )
-            raise ValueError(f"{folder} holds a run of another configuration: {differences}")
-    write(file, json.dumps(described, indent=2) + "\n")
-
-
-def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:
-    """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
-    x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
-    z0 = float(np.linalg.norm(linear.start(output(system, x0)), axis=-1).max())
-    t = truncation_time(linear, z0, epsilon)
-    if t >= steps * linear.dt:
-        raise ValueError(
-            f"trajectories of {steps * linear.dt:g} s end before the filter has forgotten its start, t* = {t:.3g} s; "
-            "make them longer"
-        )
-    return math.ceil(t / linear.dt)
-
-
-def output_matrix(system: System) -> np.ndarray | None:
-    """C if the output is h(x) = C x, else None."""
-    C = output(system, np.eye(system.nx)).T
-    x = np.random.default_rng(0).uniform(*system.box(), (100, system.nx))
-    return C if np.allclose(output(system, x), x @ C.T, rtol=1e-9, atol=1e-12) else None
-
-
-def make_filter(
-    eigenvalues: tuple[float, ...], ny: int, dt: float, nu: int, pairs: tuple[tuple[float, float], ...] = ()
-) -> LinearFilter:
-    """The filter with these modes for each of ny outputs, A block diagonal and B all ones for each output.
-
-    eigenvalues : real ones; pairs : (a, w) for each pair a +- iw, which becomes the block [[a, w], [-w, a]].
-    """
-    one = block_diag(*eigenvalues, *([[a, w], [-w, a]] for a, w in pairs))
-    return LinearFilter(np.kron(np.eye(ny), one), np.kron(np.eye(ny), np.ones((len(one), 1))), dt, nu)

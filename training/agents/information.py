@@ -12,21 +12,16 @@ from gymnasium.vector.utils import batch_space
 from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.vector import with_mask
-from kkl_gym.vector_wrappers import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
+from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load
-from training.agents.tasks import ControlTask, deviation
-from training.derivatives import linearised
-from training.methods.kalman import NOISE_FLOOR, ExtendedKalmanFilter, unknown_start
+from training.agents.tasks import deviation
+from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter, unknown_start
+from training.systems import ControlTask, profile
+from training.trajectories.derivatives import linearised
 
 Information = Literal["state", "x_hat", "z", "y", "stacked", "ekf"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 STACKED = 8  # outputs, each with the action before it
-OBSERVERS = {  # those fitted in closed loop where they helped
-    "reverse_duffing": "reverse_duffing-closed-loop-v1",
-    "van_der_pol": "van_der_pol-closed-loop-v1",
-    "rossler": "rossler-v1",
-    "lorenz": "lorenz-v1",
-}
 EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second
 
 Infos = dict[str, Any]
@@ -177,7 +172,7 @@ def make(
 
 def observer_of(system: System) -> str:
     """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on."""
-    return OBSERVERS.get(system.name, system.name)
+    return profile(system).agent_observer or system.name
 
 
 def output_deviation(system: System) -> Feature:

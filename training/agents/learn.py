@@ -19,17 +19,17 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
-from kkl_gym.vector_wrappers import VectorEnv, VectorWrapper
+from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from observers import MLP
+from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
-from training.agents.policy import Agent, fingerprint, rules, versioned
-from training.agents.tasks import ControlTask
+from training.seeds import AGENT_TRAINING_SEED
+from training.systems import ControlTask
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
 FEEDFORWARD = ("ppo", "sac")  # whose policies are perceptrons, which ship
-TRAINING_SEED = 10_000  # of the first row, times one more than the agent's seed; evaluation's is far away
 
 
 def learn(
@@ -130,7 +130,7 @@ def _fit(
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
     model.set_logger(configure(str(folder), ["csv"]))
-    vec_env.seed(TRAINING_SEED * (seed + 1))  # only now: the model has just seeded it with ``seed``
+    vec_env.seed(AGENT_TRAINING_SEED * (seed + 1))  # only now: the model has just seeded it with ``seed``
     try:
         model.learn(timesteps, callback=_Bar(progress, f"{description} {seed}", timesteps))
     finally:

@@ -9,7 +9,7 @@ from PIL import Image
 from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from training.agents.play import Episodes
-from training.agents.tasks import ControlTask
+from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
 FRAMES = 150  # of an animation, at most

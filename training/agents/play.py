@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from kkl_gym.vector_wrappers import VectorEnv
+from kkl_gym.wrappers.vector import VectorEnv
 
 Policy = Callable[[np.ndarray], np.ndarray]
 

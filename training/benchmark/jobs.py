@@ -14,11 +14,11 @@ from filelock import FileLock, Timeout
 
 import kkl_gym
 from kkl_gym.systems import get_system
+from observers.storage import write
 from training.benchmark.protocol import Protocol, measure, validate
-from training.files import write
+from training.jobs import describe
+from training.maps.optimise import seconds_spent
 from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
-from training.optimise import seconds_spent
-from training.pipeline import describe
 
 FAILED = 200.0  # the worst SMAPE there is, for a configuration whose training blows up
 

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 
 from kkl_gym.system import System
-from training.data import output
-from training.evaluate import EVALUATION_SEED, TRANSIENT, VALIDATION_SEED, Domain, Runs, starts, unseen_runs
+from training.evaluation.errors import TRANSIENT, Domain, UnseenTrajectories, starts, unseen_trajectories
+from training.evaluation.metrics import component_smape, rmse, settling_time, smape
 from training.methods import CausalObserver, Method
-from training.metrics import component_smape, rmse, settling_time, smape
+from training.seeds import Stream
 
 LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts as lost
 
@@ -44,13 +44,13 @@ def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
     return out
 
 
-def noisy_output(system: System, runs: Runs, noise: float, n: int, seed: tuple[int, ...]) -> np.ndarray:
+def noisy_output(system: System, runs: UnseenTrajectories, noise: float, n: int, seed: tuple[int, ...]) -> np.ndarray:
     """Outputs with noise on every sample, (steps + 1, trajectories, ny).
 
     The noise is drawn for ``n`` trajectories, of which ``runs`` may be the first few: it is the same for every method.
     """
     unit = np.random.default_rng(seed).standard_normal((n, len(runs.x), system.ny))
-    y: np.ndarray = output(system, runs.x) + noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
+    y: np.ndarray = system.output(runs.x) + noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
     return y
 
 
@@ -64,8 +64,8 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     frames = []
     for i, domain in enumerate(protocol.domains):
-        seed = (EVALUATION_SEED, protocol.seed, 1, i)
-        runs = unseen_runs(system, dt, protocol.trajectories, protocol.duration, protocol.seed, domain).first(n)
+        seed = (Stream.EVALUATION, protocol.seed, 1, i)
+        runs = unseen_trajectories(system, dt, protocol.trajectories, protocol.duration, protocol.seed, domain).first(n)
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.noise:
             y = noisy_output(system, runs, noise, protocol.trajectories, seed)
@@ -95,13 +95,13 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
     The geometric mean over the noise levels that it is tuned for of the median SMAPE over all steps, in percent.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
-    everyone = unseen_runs(
-        system, dt, protocol.trajectories, protocol.duration, protocol.seed, "X", first=VALIDATION_SEED
+    everyone = unseen_trajectories(
+        system, dt, protocol.trajectories, protocol.duration, protocol.seed, "X", stream=Stream.VALIDATION
     )
     runs = everyone.first(n)
     if not runs.inside.any():
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
-    seed = (VALIDATION_SEED, protocol.seed, 1)
+    seed = (Stream.VALIDATION, protocol.seed, 1)
     medians = []
     for noise in method.tuned_for or protocol.noise:
         y = noisy_output(system, runs, noise, protocol.trajectories, seed)
@@ -113,7 +113,7 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
 def step_time(method: Method[Any], trained: Any, system: System, dt: float, batch: int, seconds: float = 0.3) -> float:
     """Microseconds of CPU time for one step of a whole batch: the least of five rounds."""
     observer = method.observer(trained, system, dt, 0.5)
-    y = output(system, starts(system, "X", batch, np.random.default_rng(0)))
+    y = system.output(starts(system, "X", batch, np.random.default_rng(0)))
     observer.reset(y)
     best = np.inf
     for _ in range(5):

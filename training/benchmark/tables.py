@@ -9,14 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-# Component-wise SMAPE in % after the first 20 %, without noise, starts in 1.5X \ X: printed by the notebooks that
-# the paper's authors released.
-PRINTED = {
-    "spinn": {"reverse_duffing": 1.96, "van_der_pol": 0.35, "rossler": 4.77, "lorenz": 8.64},
-    "ae": {"reverse_duffing": 55.4, "van_der_pol": 200.0, "rossler": 79.9, "lorenz": 88.1},
-    "dmf": {"reverse_duffing": 46.2, "van_der_pol": 98.2, "rossler": 23.5, "lorenz": 8.76},
-    "node": {"reverse_duffing": 159.8, "van_der_pol": 11.9, "rossler": 24.7, "lorenz": 11.0},
-}
+from training.systems import PROFILES
+
 INTERVAL = "{median} ± {half_iqr} [{low}, {high}]"
 # Column of results.csv, title, form of a cell, explanation.
 MEASURES = (
@@ -145,7 +139,7 @@ def _lost(lost: pd.Series, cases: Sequence[tuple[str, float]], job: tuple[str, s
 def _beside_printed(component: pd.Series, job: tuple[str, str]) -> str:
     ours = " / ".join(_number(component[(*job, starts)]) for starts in DOMAINS if (*job, starts) in component.index)
     system, method = job
-    printed = PRINTED.get(method, {}).get(system)
+    printed = PROFILES[system].printed.get(method) if system in PROFILES else None
     return ours if printed is None else f"{ours} ({printed:g})"
 
 

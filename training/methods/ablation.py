@@ -7,18 +7,24 @@ from typing import Any, ClassVar
 
 from kkl_gym.system import System
 from observers import Artifact
-from training.config import Method as Pipeline
-from training.config import papers_spectrum, preset
+from training.config import Pipeline
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod, within
 from training.pipeline import train
+from training.presets import preset
+from training.spectrum import papers_spectrum
 from training.tuning import Probe, Spectrum
 
 FEATURES = 1500
 NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
 TUNED_FOR = 0.5
 # How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
-TOGETHER: dict[str, Any] = {"free": False, "disturbed": 0.0, "quiet": 0.2, "emphasis": 2.0}
+TOGETHER: dict[str, Any] = {
+    "free_inverse": False,
+    "process_noise_share": 0.0,
+    "noise_free_share": 0.2,
+    "high_noise_emphasis": 2.0,
+}
 EARLIER: dict[str, Any] = {**TOGETHER, "optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
 
 
@@ -55,7 +61,7 @@ class Solved(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """Random features in place of a trained network."""
-        return {"forward_steps": 0, "features": FEATURES, "reach": 2.0, **super().changes(task)}
+        return {"forward_steps": 0, "random_features": FEATURES, "box_factor": 2.0, **super().changes(task)}
 
 
 class Transients(Ablation):
@@ -66,7 +72,7 @@ class Transients(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """No noise."""
-        return {**super().changes(task), **EARLIER, "noise_max": NO_NOISE}
+        return {**super().changes(task), **EARLIER, "measurement_noise_max": NO_NOISE}
 
 
 class NoiseAware(Ablation):
@@ -109,8 +115,8 @@ class OwnFree(Ablation):
     label: ClassVar[str] = "... inverse of free motion"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """No disturbed motions."""
-        return {"disturbed": 0.0}
+        """No process_noise_share motions."""
+        return {"process_noise_share": 0.0}
 
 
 class Tuned(Ablation):

@@ -6,17 +6,16 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from scipy.linalg import solve_continuous_lyapunov
-from scipy.signal import bessel
 from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
-from training.data import run_filter
-from training.forward import on_tensors
+from training.maps.forward import on_tensors
+from training.maps.networks import Network, tensor
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
-from training.networks import Network, tensor
-from training.pipeline import output_matrix
+from training.spectrum import bessel_spectrum
+from training.trajectories.derivatives import output_matrix
 
 BATCH = 512
 LEARNING_RATE = 1e-3  # the authors'; at several times that the PDE residual jumps
@@ -84,14 +83,8 @@ class AE(KKLMethod):
 
 def bessel_filter(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
     """D in real blocks with the poles of a Bessel filter of order nx + 1 at cutoff 1, and F = 1, for each output."""
-    _, poles, _ = bessel(nx + 1, 1.0, analog=True, output="zpk")
-    D, i = np.zeros((nx + 1, nx + 1)), 0
-    for pole in poles[poles.imag >= -1e-9]:
-        if abs(pole.imag) < 1e-9:
-            D[i, i], i = pole.real, i + 1
-        else:
-            D[i : i + 2, i : i + 2], i = [[pole.real, pole.imag], [-pole.imag, pole.real]], i + 2
-    return np.kron(np.eye(ny), D), np.kron(np.eye(ny), np.ones((nx + 1, 1)))
+    D = bessel_spectrum(nx + 1, 1.0, norm="phase").A
+    return np.kron(np.eye(ny), D), np.kron(np.eye(ny), np.ones((len(D), 1)))
 
 
 class _Problem(nn.Module):
@@ -117,7 +110,7 @@ class _Problem(nn.Module):
         y = data.y[:, :200].astype(float)
         linear = LinearFilter(middle * self.D, middle * self.F, budget.dt)
         late = data.ages[data.ages >= data.ages[-1] // 2]
-        z = run_filter(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
+        z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
         self.z_offset, self.z_scale = tensor(z.mean(0), device), tensor(np.maximum(z.std(0), 1e-12), device)
         self._D, self._F = tensor(self.D, device), tensor(self.F, device)
         self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)

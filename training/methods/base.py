@@ -11,16 +11,16 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
-from rich.progress import Progress
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 from torch import nn
-from torch.utils.tensorboard import SummaryWriter
 
 from kkl_gym.system import System
-from training.data import output, recording_ages, trajectories
-from training.optimise import Loss, Stage, optimise
-from training.pipeline import TRAINING_SEED, describe
+from training.jobs import describe
+from training.maps.optimise import Loss, Stage, optimise
+from training.progress import progress_bars
+from training.seeds import Stream, generator
+from training.trajectories.record import recording_ages, trajectories
 
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
@@ -81,13 +81,13 @@ class Data:
 @lru_cache(maxsize=1)
 def simulated(system: System, n: int, duration: float, samples: int, dt: float, seed: int) -> Data:
     """The training data of a system; the same for every method."""
-    rng = np.random.default_rng([TRAINING_SEED, seed])
+    rng = generator(Stream.TRAINING, seed)
     steps = max(1, round(duration / dt))
     ages = recording_ages(0, steps, samples)
     xs, ys = [], []
-    for x, *_ in trajectories(system, n, steps, dt, rng):
+    for x, *_ in trajectories(system, n=n, steps=steps, dt=dt, rng=rng):
         xs.append(x[ages])
-        ys.append(output(system, x).astype(np.float32))
+        ys.append(system.output(x).astype(np.float32))
     return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))
 
 
@@ -110,7 +110,7 @@ class Task:
     @property
     def rng(self) -> np.random.Generator:
         """A fresh generator; the same one at every call."""
-        return np.random.default_rng([TRAINING_SEED, self.seed, 1])
+        return generator(Stream.TRAINING, self.seed, 1)
 
     def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
         """Minimise a loss by Adam within ``share`` of the budget's CPU time; goes on from a checkpoint if there is one.
@@ -118,11 +118,18 @@ class Task:
         Raises FloatingPointError if the loss stops being a number.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        seconds = self.budget.seconds * share
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
-        stage = Stage(name, self.budget.steps, learning_rate, self.folder, identity, self.seed, seconds)
-        with SummaryWriter(self.folder) as writer, Progress(disable=True) as progress:
-            optimise(stage, module, loss, progress, writer, resume=True)
+        stage = Stage(
+            name=name,
+            steps=self.budget.steps,
+            learning_rate=learning_rate,
+            folder=self.folder,
+            fingerprint=identity,
+            seed=self.seed,
+            cpu_seconds=self.budget.seconds * share,
+        )
+        with progress_bars(None) as progress:
+            optimise(stage, module, loss, progress, resume=True)
 
 
 class Method(ABC, Generic[Trained]):

@@ -8,12 +8,11 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, LinearFilter
-from training.data import output
+from training.maps.networks import Network
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 from training.methods.kkl import SPECTRA, spectrum
 from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance, rollout
-from training.networks import Network
-from training.pipeline import make_filter
+from training.spectrum import Spectrum
 
 SHARE = 0.6  # of the transient stage in the CPU time; the asymptotic stage has the rest
 EPSILON = 1e-3  # 1/s, no mode is slower
@@ -48,7 +47,7 @@ class DMF(Method[Arrays]):
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
         fastest, slowest = configuration["spectrum"]
-        linear = make_filter(spectrum(system, fastest, slowest), system.ny, budget.dt, 0)
+        linear = Spectrum(spectrum(system, fastest, slowest)).filter(system.ny, budget.dt)
 
         def stage(inputs: int) -> _Stage:
             network = Network(linear.size, system.nx, budget.width, budget.depth, budget.activation)
@@ -177,7 +176,7 @@ class Switching:
             self._z[i] = self._z[i] @ own["A"].T + self._y @ own["B"].T
         self._y = y
         x_hat = np.stack([self._decode(0), self._decode(1)], axis=1)
-        innovation = np.linalg.norm(y[:, None] - output(self._system, x_hat), axis=-1)
+        innovation = np.linalg.norm(y[:, None] - self._system.output(x_hat), axis=-1)
         self._innovation = FORGET * self._innovation + (1 - FORGET) * innovation
         chosen = self._innovation.argmin(1)
         return np.asarray(x_hat[np.arange(len(y)), chosen])

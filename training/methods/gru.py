@@ -7,8 +7,8 @@ import torch
 from torch import nn
 
 from kkl_gym.system import System
+from training.maps.networks import tensor
 from training.methods.base import Arrays, CausalObserver, Configuration, Data, Method, Task
-from training.networks import tensor
 
 BATCH = 128
 NOISE_MAX = 0.5

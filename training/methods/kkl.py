@@ -5,14 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.artifact import resolve
-from training.config import Config, preset
+from training.config import Config
 from training.methods.base import Budget, CausalObserver, Configuration, Method, Task
 from training.pipeline import train
+from training.presets import preset
+from training.spectrum import evenly_spaced
 
 # Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
 SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
@@ -20,7 +20,7 @@ SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
 
 def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
     """2 nx + 1 eigenvalues for each output, evenly spaced in the logarithm."""
-    return tuple((-np.geomspace(-slowest, -fastest, 2 * system.nx + 1)).tolist())
+    return evenly_spaced(2 * system.nx + 1, slowest, fastest)
 
 
 class KKLMethod(Method[Artifact]):
@@ -28,7 +28,7 @@ class KKLMethod(Method[Artifact]):
 
     def observer(self, trained: Artifact, system: System, dt: float, noise: float) -> CausalObserver:
         """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
-        return KKLObserver(trained, min(noise, trained.inverse.noise_max), process_noise=0.0)
+        return KKLObserver(trained, min(noise, trained.inverse.measurement_noise_max), process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""
@@ -40,7 +40,7 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """A configuration of the package with the benchmark's data, networks and cap."""
+    """A configuration of the package with the benchmark's data, networks and cpu_seconds."""
     return replace(
         config,
         dt=budget.dt,
@@ -52,7 +52,7 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
         activation=budget.activation,  # type: ignore[arg-type]
         forward_steps=budget.steps if config.forward_steps else 0,
         inverse_steps=budget.steps,
-        cap=budget.seconds if math.isfinite(budget.seconds) else None,
+        cpu_seconds=budget.seconds if math.isfinite(budget.seconds) else None,
         seed=seed,
     )
 

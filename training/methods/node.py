@@ -8,11 +8,12 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import Artifact, InverseMap
+from training.maps.networks import Network
 from training.methods.base import Configuration, Task
 from training.methods.kkl import SPECTRA, KKLMethod, spectrum
 from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance, rollout
-from training.networks import Network
-from training.pipeline import make_filter, output_matrix
+from training.spectrum import Spectrum
+from training.trajectories.derivatives import output_matrix
 
 
 class NODE(KKLMethod):
@@ -37,7 +38,7 @@ class NODE(KKLMethod):
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
         fastest, slowest = configuration["spectrum"]
-        linear = make_filter(spectrum(system, fastest, slowest), system.ny, budget.dt, 0)
+        linear = Spectrum(spectrum(system, fastest, slowest)).filter(system.ny, budget.dt)
         network = Network(linear.size, system.nx, budget.width, budget.depth, budget.activation)
         decoder = Decoder(network, linear, task.data, task.device)
         problem = _Problem(decoder, -linear.A.diagonal()[: linear.size // system.ny], system.ny, budget.dt, task.device)
@@ -45,7 +46,7 @@ class NODE(KKLMethod):
         task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=1e-2)
         eigenvalues = tuple(problem.theta().tolist())
         return Artifact(
-            filter=make_filter(eigenvalues, system.ny, budget.dt, 0),
+            filter=Spectrum(eigenvalues).filter(system.ny, budget.dt),
             inverse=InverseMap(
                 mlp=network.export(),
                 features=("z_y",),

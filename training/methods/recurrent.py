@@ -6,9 +6,8 @@ from torch import nn
 from torch.nn.functional import smooth_l1_loss
 
 from observers import LinearFilter
-from training.data import run_filter
+from training.maps.networks import Network, tensor
 from training.methods.base import Data
-from training.networks import Network, tensor
 
 TRAJECTORIES_PER_BATCH = 128
 AGES_PER_BATCH = 32
@@ -78,7 +77,7 @@ class Decoder(nn.Module):
     def __init__(self, network: Network, linear: LinearFilter, data: Data, device: torch.device) -> None:
         super().__init__()
         y = data.y[:, :500].astype(float)
-        z = run_filter(linear, y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
+        z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
         self.z_offset, scale = z.mean(0), np.maximum(z.std(0), 1e-12)
         _, singular, directions = np.linalg.svd((z - self.z_offset) / scale, full_matrices=False)
         gain = np.sqrt(len(z)) / np.hypot(singular, SOFT_FLOOR * singular[0])

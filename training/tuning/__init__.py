@@ -1,5 +1,6 @@
 """Choosing the spectrum of an observer before training it."""
 
-from training.tuning.probe import Choice, Probe, Spectrum
+from training.spectrum import Spectrum
+from training.tuning.probe import Choice, Probe
 
 __all__ = ["Choice", "Probe", "Spectrum"]

@@ -11,10 +11,11 @@ import torch
 from scipy.stats import spearmanr
 
 from kkl_gym.system import System
-from training.config import preset
-from training.evaluate import VALIDATION_SEED, errors, unseen_runs
+from training.evaluation.errors import errors, unseen_trajectories
 from training.pipeline import train
-from training.tuning.probe import Spectrum
+from training.presets import preset
+from training.seeds import Stream
+from training.spectrum import Spectrum
 
 LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
 HEADROOM = 4.0  # of the noise that a map is trained for over the noise that is expected: it does better so
@@ -27,9 +28,9 @@ def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
     return {
         "eigenvalues": spectrum.eigenvalues,
         "pairs": spectrum.pairs,
-        "noise_max": max(HEADROOM * measurement_noise, LEAST_NOISE),
-        "quiet": 0.05 if measurement_noise else 0.9,
-        "emphasis": 4.0,
+        "measurement_noise_max": max(HEADROOM * measurement_noise, LEAST_NOISE),
+        "noise_free_share": 0.05 if measurement_noise else 0.9,
+        "high_noise_emphasis": 4.0,
     }
 
 
@@ -45,11 +46,11 @@ def trained_error(
         dt=dt,
         duration=duration,
         inverse_steps=10**6,
-        cap=seconds,
+        cpu_seconds=seconds,
     )
     with TemporaryDirectory() as folder:
         artifact = train(system, config, Path(folder), device=torch.device("cpu")).artifact
-    runs = unseen_runs(system, dt, RUNS, duration, 0, first=VALIDATION_SEED)
+    runs = unseen_trajectories(system, dt, RUNS, duration, 0, stream=Stream.VALIDATION)
     return float(np.median(errors(artifact, system, runs, measurement_noise, 0).full))
 
 

@@ -5,15 +5,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import besselap, periodogram
+from scipy.signal import periodogram
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.config import typical_rate
-from training.data import output, run_filter
-from training.derivatives import evaluate, jacobian, with_sensitivity
-from training.noise import noise_covariance
-from training.pipeline import make_filter
+from training.filter_noise import noise_covariance
+from training.seeds import Stream, generator
+from training.spectrum import Spectrum, bessel_spectrum, typical_rate
+from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 RESOLUTION = 1e-3  # to which a network reads z, as a part of the signal: what is left where there is no noise
 REAL_MODES = 24  # in the library
@@ -24,28 +23,6 @@ SIGNIFICANT = 1e-13  # what rounding leaves of a matrix of unit diagonal
 FARTHEST = 1e5  # that an error in the start may grow; what is known of it is a matrix of squares
 SHORTEST = 10  # samples that must be followed
 SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no longer taken relative to it
-
-
-@dataclass(frozen=True)
-class Spectrum:
-    """Eigenvalues of A for each output: real ones, and pairs (a, w) of a +- iw."""
-
-    eigenvalues: tuple[float, ...] = ()
-    pairs: tuple[tuple[float, float], ...] = ()
-
-    @property
-    def modes(self) -> int:
-        """Their number."""
-        return len(self.eigenvalues) + 2 * len(self.pairs)
-
-    @property
-    def poles(self) -> np.ndarray:
-        """All of them, complex, (modes,)."""
-        above = [complex(a, w) for a, w in self.pairs]
-        return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
-
-    def __add__(self, other: "Spectrum") -> "Spectrum":
-        return Spectrum(self.eigenvalues + other.eigenvalues, self.pairs + other.pairs)
 
 
 @dataclass(frozen=True)
@@ -86,7 +63,7 @@ class Probe:
     duration: float = 50.0
     motions: int = 40
     seed: int = 0
-    start: Spectrum = Spectrum()
+    start: Spectrum = field(default_factory=Spectrum)
     _of_library: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -97,7 +74,7 @@ class Probe:
             )
         system, nx = self.system, self.system.nx
         low, high = system.box()
-        x0 = np.random.default_rng([self.seed, 7]).uniform(low, high, (2 * self.motions, nx))
+        x0 = generator(Stream.TUNING, self.seed).uniform(low, high, (2 * self.motions, nx))
         steps = round(self.duration / self.dt)
         inside = np.isfinite(simulate(system, x0, steps, self.dt)[-1]).all(-1)
         if 2 * inside.sum() < self.motions:
@@ -114,7 +91,7 @@ class Probe:
                 "a longer one, or a smaller dt"
             )
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
-        self.y = output(system, self.x)
+        self.y = system.output(self.x)
         self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
         self._known = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
@@ -149,11 +126,11 @@ class Probe:
 
         z : (ages, motions, size); of errors : (ages, motions, nx, size); covariance : (ages, size, size).
         """
-        linear = make_filter(spectrum.eigenvalues, self.system.ny, self.dt, 0, spectrum.pairs)
+        linear = spectrum.filter(self.system.ny, self.dt)
         steps, n, ny, nx = self.signal.shape
         signals = np.moveaxis(self.signal, -1, 2).reshape(steps, n * nx, ny)
-        z = run_filter(linear, self.y, np.zeros((steps - 1, n, 0)), self.ages)
-        Z = run_filter(linear, signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
+        z = linear.run(self.y, np.zeros((steps - 1, n, 0)), self.ages)
+        Z = linear.run(signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
 
     def error(self, spectrum: Spectrum, measurement_noise: float) -> float:
@@ -227,12 +204,9 @@ class Probe:
         """For each order, the poles of a Bessel filter at the best of some cutoffs in rad/s."""
         found, cutoffs = [], list(cutoffs)
         for order in orders:
-            _, poles, _ = besselap(order, norm="mag")
             options = []
             for cutoff in cutoffs:
-                real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
-                above = tuple((float(cutoff * pole.real), float(cutoff * pole.imag)) for pole in poles if pole.imag > 0)
-                spectrum = Spectrum(real, above)
+                spectrum = bessel_spectrum(order, cutoff)
                 options.append(Choice(spectrum, self.error(spectrum, measurement_noise), "Bessel"))
             found.append(min(options, key=lambda choice: choice.error))
         return found

@@ -1,0 +1,6 @@
+"""Wrappers: a learned observer inside an environment, and agents that act more slowly than it samples."""
+
+from kkl_gym.wrappers.single import ActionRepeat, KKLObservation
+from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
+
+__all__ = ["ActionRepeat", "KKLObservation", "KKLVectorObservation", "VectorActionRepeat"]

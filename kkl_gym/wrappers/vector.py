@@ -1,0 +1,279 @@
+"""Wrappers for vector environments: a batched learned observer, and agents that act more slowly than they sample."""
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from kkl_gym.plant import Plant
+from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes, with_mask
+from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
+
+VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
+
+
+VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
+
+
+class VectorEstimate(VectorWrapper):
+    """Shows what a batch of observers makes of ``info["y"]`` and ``info["u"]``, in every autoreset mode.
+
+    ``info`` gains what the observers report, a row for each environment; so does ``info["final_info"]``, and
+    ``info["final_obs"]`` holds the last estimates.
+
+    Parameters
+    ----------
+    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    estimator : the observers.
+
+    Raises ValueError if the environment does not say its autoreset mode, and, at a step, if a wrapper inside hides
+    samples from the observers.
+    """
+
+    def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
+        super().__init__(env)
+        self._mode = _autoreset_mode(env)
+        self._estimator = estimator
+        self.single_observation_space: gym.spaces.Box = estimator.space
+        self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+        self._sample = np.zeros(env.num_envs, dtype=int)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
+        options, mask = with_mask(options, self.num_envs)
+        _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if mask.all():
+            self._estimator.reset(info["y"])
+        else:
+            self._estimator.restart(info["y"][mask], mask)
+        self._ended = self._ended & ~mask
+        self._sample = np.where(mask, info["sample"], self._sample)
+        return self._show(info, mask), info
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Step the environments, and the observers with the new samples and the inputs that led to them."""
+        _, reward, terminated, truncated, info = self.env.step(actions)
+        before, ended = self._ended, terminated | truncated
+        if self._mode is not AutoresetMode.SAME_STEP:
+            self._ended = ended
+        elif ended.any():
+            return self._show_and_restart(info, ended), reward, terminated, truncated, info
+        y, u = info["y"], info.get("u")  # no u: every row was reset
+        disabled = self._mode is AutoresetMode.DISABLED
+        expected = self._sample + 1
+        over = bool(before.any())
+        if over:  # rows that this step has reset, or that stay at their end
+            expected[before] = self._sample[before] if disabled else 0
+            u = None if u is None else np.where(before[:, None], 0.0, u)
+        self._check(expected, info["sample"], before)
+        if over and disabled:
+            self._estimator.advance(y, u, ~before)
+        else:
+            self._estimator.advance(y, u)
+            if over:
+                self._estimator.restart(y[before], before)
+        self._sample = expected
+        return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
+
+    def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
+        """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
+        final = info["final_info"]
+        expected = self._sample + 1
+        self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
+        u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
+        self._estimator.advance(np.where(ended[:, None], final["y"], info["y"]), u)
+        shown = self._show(info, np.ones_like(ended))
+        for row in np.flatnonzero(ended):
+            info["final_obs"][row] = shown[row].copy()
+        self._estimator.restart(info["y"][ended], ended)
+        self._sample = np.where(ended, 0, expected)
+        first = self._estimator.report(ended)
+        for key, values in first.items():
+            final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
+            info[key][ended] = values
+        shown[ended] = observation(self._estimator.shown(first), self.single_observation_space)
+        return shown
+
+    def _check(self, expected: np.ndarray, seen: np.ndarray, ended: np.ndarray) -> None:
+        if (seen != expected).any():
+            row = int(np.flatnonzero(seen != expected)[0])
+            if ended[row]:
+                raise ValueError(f"the episode of environment {row} has ended: reset it before the next step")
+            raise ValueError(
+                f"the observer was to see sample {expected[row]} of environment {row} and was shown {seen[row]}: put "
+                "wrappers that skip steps, such as VectorActionRepeat, outside KKLVectorObservation, and reset after "
+                "an error"
+            )
+
+    def _show(self, info: Infos, rows: np.ndarray) -> np.ndarray:
+        """Add the observers' report to ``info``, for ``rows``; returns the observations of all."""
+        report = self._estimator.report()
+        for key, values in report.items():
+            info |= {key: values, f"_{key}": rows.copy()}
+        return observation(self._estimator.shown(report), self.single_observation_space)
+
+
+class KKLVectorObservation(VectorEstimate):
+    """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
+
+    Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
+    in every autoreset mode. ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a
+    row for each environment; so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
+
+    Parameters
+    ----------
+    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    observer, estimate, measurement_noise, ignore_input, monitor : as for :class:`kkl_gym.KKLObservation`; with "z" the
+        network is not evaluated, unless there is a monitor.
+
+    Raises
+    ------
+    ValueError : as :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what
+        the observer must know (process noise only if the map asks for it).
+    """
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        observer: str | os.PathLike[str] | None = None,
+        estimate: Literal["x", "z"] = "x",
+        measurement_noise: float | None = None,
+        ignore_input: bool = False,
+        monitor: bool = False,
+    ) -> None:
+        estimator = KKLEstimator(plant_of(env), observer, estimate, measurement_noise, ignore_input, monitor)
+        if estimator.observer.artifact.process_noise_max is not None:
+            plant_of(env, "process_noise")
+        super().__init__(env, estimator)
+        self.observer = estimator.observer
+        self.estimate = estimate
+
+
+class VectorActionRepeat(VectorWrapper):
+    """:class:`kkl_gym.ActionRepeat` for :class:`kkl_gym.KKLVectorEnv`, bare or under :class:`KKLVectorObservation`.
+
+    Holds each action for ``repeat`` steps and sums the rewards. A row whose episode ends on the way stays at its end
+    for the rest of the repeat, so that its next episode begins with an action of its own. The environment inside must
+    therefore leave resets to this wrapper (``autoreset_mode="Disabled"``), which then offers every mode.
+
+    Parameters
+    ----------
+    env : the vector environment, with ``autoreset_mode`` DISABLED.
+    repeat : a positive integer.
+    autoreset_mode : the mode that this wrapper offers.
+
+    Raises
+    ------
+    ValueError : if ``repeat`` is not a positive integer or the environment resets by itself.
+    """
+
+    def __init__(
+        self, env: VectorEnv, repeat: int, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP
+    ) -> None:
+        super().__init__(env)
+        if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
+            raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
+        inside: VectorEnv = env
+        while isinstance(inside, VectorEstimate | VectorActionRepeat):
+            inside = inside.env
+        if not isinstance(inside, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
+            raise ValueError(
+                'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled" and resets rows itself; '
+                "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment"
+            )
+        self.repeat = repeat
+        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[np.ndarray, Infos]:
+        """Reset the environments, or the rows of ``options["reset_mask"]``."""
+        options, mask = with_mask(options, self.num_envs)
+        obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        self._ended = self._ended & ~mask
+        return obs, info
+
+    def step(self, actions: np.ndarray) -> Step:
+        """Apply ``actions`` for ``repeat`` steps; observations and infos are those of each row's last one."""
+        waiting = self._ended  # since an earlier step; they stay as they are in this one
+        total, info = np.zeros(self.num_envs), Infos()
+        for _ in range(self.repeat):
+            obs, reward, terminated, truncated, new = self.env.step(actions)
+            total += reward
+            info = _merged(info, new)
+            if (terminated | truncated).all():
+                break
+        self._ended = terminated | truncated
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and waiting.any():
+            obs, new = self.reset(options={"reset_mask": waiting})
+            info = _merged(info, new)
+            terminated, truncated = terminated & ~waiting, truncated & ~waiting
+        elif self.autoreset_mode is AutoresetMode.SAME_STEP and self._ended.any():
+            ended = self._ended.copy()
+            final = last_of_episodes(obs, info, ended)
+            obs, new = self.reset(options={"reset_mask": ended})
+            info = _merged(info, new) | final
+            for key in ("u", "escaped"):
+                info[key] = info[key] * column(~ended, info[key])
+                info[f"_{key}"] = info[f"_{key}"] & ~ended
+        return obs, total, terminated, truncated, info
+
+
+def _merged(old: Infos, new: Infos) -> Infos:
+    """What ``new`` reports, and ``old`` where ``new`` reports nothing."""
+    out = dict(old)
+    for key, mask in new.items():
+        if key.startswith("_") and key[1:] in new:
+            values = new[key[1:]]
+            if key in old and not mask.all():
+                values = np.where(column(mask, values), values, old[key[1:]])
+                mask = mask | old[key]
+            out |= {key[1:]: values, key: mask}
+    return out
+
+
+def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A mask over rows, (n,), shaped to go with values, (n, ...)."""
+    return mask.reshape(-1, *(1,) * (values.ndim - 1))
+
+
+def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
+    mode = env.metadata.get("autoreset_mode")
+    if not isinstance(mode, AutoresetMode):
+        raise ValueError(f"{env} does not say its autoreset mode: metadata['autoreset_mode'] is {mode!r}")
+    return mode
+
+
+def plant_of(env: VectorEnv, *also: str) -> Plant:
+    """What the rows of a vector environment have in common; raises ValueError if they are not ours or differ.
+
+    also : attributes of a plant in which they must agree as well.
+    """
+    base: Any = env.unwrapped
+    if isinstance(base, KKLVectorEnv):
+        return base.plant
+    try:
+        plants: tuple[Plant, ...] = base.get_attr("plant")
+    except AttributeError:
+        raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {base}") from None
+    first = plants[0]
+    for plant in plants:
+        for name in ("system", "dt", "measurement_noise", *also):
+            if getattr(plant, name) != getattr(first, name):
+                raise ValueError(f"the environments differ in {name}: one observer cannot serve all")
+    return first
+
+
+__all__ = ["Estimator", "KKLVectorObservation", "VectorActionRepeat", "VectorEstimate"]

@@ -1,0 +1,78 @@
+"""The filter's step for large batches as machine code, where Numba is estimator: a fifth to a half of NumPy's time.
+
+The modes of a filter do not mix, or only in pairs. A matrix product knows nothing of that, and reads and writes the
+batch three times where once is enough.
+"""
+
+import functools
+from collections.abc import Callable
+
+import numpy as np
+
+MANY_ROWS = 128  # fewer gain too little to wait a second for the compiler
+
+
+class SparseUpdate:
+    """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal.
+
+    Parameters
+    ----------
+    transition : (size, size).
+    drive : (m, size).
+
+    Raises ImportError without Numba, ValueError if the transition has too many entries for this to gain anything.
+    """
+
+    def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
+        self._diagonal = transition.diagonal().copy()
+        self._rows, self._columns = np.nonzero(transition - np.diag(self._diagonal))
+        if len(self._rows) > len(transition):
+            raise ValueError(f"{len(self._rows)} entries off the diagonal of {len(transition)} are too many to gain")
+        self._mixing = transition[self._rows, self._columns]
+        self._terms = len(drive)
+        self._drive = np.pad(drive, ((0, -len(drive) % 3), (0, 0)))  # the kernel takes three terms at once
+        _kernel()  # or say now that there is no Numba
+
+    def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
+        """z, (n, size), and the terms, (n, ...) each and m columns together, to the next z, (n, size).
+
+        Raises ValueError on other shapes.
+        """
+        if z.shape[1:] != self._diagonal.shape:
+            raise ValueError(f"expected z of shape (n, {len(self._diagonal)}), got {z.shape}")
+        columns = np.zeros((len(z), len(self._drive)))
+        np.concatenate(terms, axis=1, out=columns[:, : self._terms])  # raises if they do not fit
+        z = np.ascontiguousarray(z, dtype=float)
+        z_next = np.empty(z.shape)
+        _kernel()(z, columns, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
+        return z_next
+
+
+@functools.cache
+def _kernel() -> Callable[..., None]:
+    import numba
+
+    @numba.njit  # type: ignore[untyped-decorator]
+    def update(
+        z: np.ndarray,
+        terms: np.ndarray,
+        diagonal: np.ndarray,
+        drive: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        mixing: np.ndarray,
+        z_next: np.ndarray,
+    ) -> None:
+        n, size = z.shape
+        for row in range(n):
+            a, b, c = terms[row, 0], terms[row, 1], terms[row, 2]  # y, u and the next y, if there is one of each
+            for i in range(size):
+                z_next[row, i] = diagonal[i] * z[row, i] + drive[0, i] * a + drive[1, i] * b + drive[2, i] * c
+            for j in range(3, len(drive), 3):
+                a, b, c = terms[row, j], terms[row, j + 1], terms[row, j + 2]
+                for i in range(size):
+                    z_next[row, i] += drive[j, i] * a + drive[j + 1, i] * b + drive[j + 2, i] * c
+            for k in range(len(rows)):
+                z_next[row, rows[k]] += mixing[k] * z[row, columns[k]]
+
+    return update  # type: ignore[no-any-return]

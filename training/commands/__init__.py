@@ -1,0 +1,1 @@
+"""The commands of ``kkl-gym``, one in each module."""

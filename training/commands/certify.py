@@ -1,0 +1,195 @@
+"""``kkl-gym certify``: a certificate as table, JSON and figure."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from kkl_gym.system import System
+from observers import Artifact
+from observers.artifact import resolve, shipped
+from observers.storage import write
+from training.evaluation.certificates.certificate import (
+    QUANTILES,
+    Certificate,
+    SettledTrajectories,
+    certify,
+    noise_variance,
+    record_settled,
+)
+from training.evaluation.report import draw_residual
+
+SHOWN = 30_000  # states in the figure
+
+
+@dataclass(frozen=True)
+class Certify:
+    """Say how far an observer is to be trusted: learned maps, sensitivities, noise, and the paper's bounds.
+
+    Prints a table and writes table.md, and for each observer NAME.json and NAME.png. docs/certificates.md explains
+    each line.
+    """
+
+    observers: tyro.conf.Positional[tuple[str, ...]]
+    """Shipped maps, or .safetensors files."""
+    system: str | None = None
+    """For files of your own system: its class, as script.py:Class or module:Class."""
+    measurement_noise: float = 0.5
+    """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
+    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    """Bound of the process noise as a multiple of the states' scales."""
+    psi: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the motion's diameter)")] = None
+    """Bound of how far process noise moves the state from where it would have been."""
+    trajectories: int = 200
+    """Number of motions, from starts uniform in X."""
+    delta: float = 0.05
+    """Probability with which each generalisation term may fail."""
+    seed: int = 0
+    """Of everything random."""
+    out: Path = Path("certificates")
+    """Folder for what is written."""
+
+    def run(self, console: Console) -> list[Certificate]:
+        """Certify."""
+        from kkl_gym.systems import system_of
+
+        if not self.observers:
+            raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
+        found = []
+        for given in self.observers:
+            artifact = Artifact.read(resolve(given))
+            system = system_of(artifact, self.system)
+            name = Path(given).stem if given.endswith(".safetensors") else given
+            with console.status(f"certifying {name}"):
+                process_noise = system.process_noise if self.process_noise is None else self.process_noise
+                recording = (self.measurement_noise, process_noise, self.trajectories, self.seed)
+                motion = record_settled(artifact, system, *recording)
+                certificate = certify(
+                    artifact,
+                    system,
+                    self.measurement_noise,
+                    process_noise,
+                    self.psi,
+                    self.trajectories,
+                    self.delta,
+                    self.seed,
+                    name,
+                    motion,
+                )
+                write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
+                levels = (self.measurement_noise, process_noise)
+                draw(self.out / f"{name}.png", artifact, system, levels, name, motion)
+            found.append(certificate)
+        console.print(table(found))
+        write(self.out / "table.md", markdown(found))
+        console.print(f"wrote table.md, JSON and figures in {self.out}")
+        return found
+
+
+def lines(found: Certificate) -> list[dict[str, str]]:
+    """What a certificate says, in sections: label to value, the labels being the same for all."""
+    forward = found.forward
+
+    def number(value: float | None) -> str:
+        return "–" if value is None or np.isnan(value) else "∞" if np.isinf(value) else f"{value:.3g}"
+
+    def of(name: str) -> str:
+        return number(getattr(forward, name, None))
+
+    def ratio(bound: float, error: float) -> str:
+        return number((bound / error) ** 0.5 if error > 0 else None)
+
+    residual = {f"\\|P\\|, {100 * level:g} % of X below": level for level in QUANTILES}
+    return [
+        {
+            "rms error in the long run, no noise": number(found.error**0.5),
+            "the same, v and w bounded": number(found.noisy_error**0.5),
+            "error due to v alone, predicted": number(found.predicted_noise_error),
+            "the same, measured": number(found.measured_noise_error),
+        },
+        {
+            "Lipschitz constant of T_inv, at least": number(found.lipschitz_lower),
+            "the same, at most": number(found.lipschitz_upper),
+            "product of the layers' norms": number(found.norm_product),
+            "largest norm of dh/dx over X": number(found.output_lipschitz),
+            "gain from v to z, the theorem's": number(found.gain_theorem),
+            "H-infinity norm": number(found.gain_h_infinity),
+            "H2 norm": number(found.gain_h2),
+        },
+        {
+            "risk of T on its data": of("data_risk"),
+            "PDE residual P, mean square over X": of("pde_risk"),
+            **{label: number(forward.residual[level] if forward else None) for label, level in residual.items()},
+            "reconstruction x - T_inv(T(x)), mean square": of("reconstruction_risk"),
+            "the same over X": of("reconstruction_risk_over_box"),
+        },
+        {
+            "psi": number(found.psi),
+            "bound of the rms error, no noise": number(forward.bound**0.5 if forward else None),
+            "bound / measured": number(None) if forward is None else ratio(forward.bound, found.error),
+            "what the theorem adds for noise, as rms": number(found.noise_term**0.5),
+            "bound with noise / measured": number(None)
+            if forward is None
+            else ratio(forward.noisy_bound, found.noisy_error),
+        },
+        {
+            "pseudo-dimension of T_inv's losses, at most": number(found.inverse_dimension),
+            "generalisation term C of T_inv": number(found.inverse_term),
+            "generalisation term C of T": of("forward_term"),
+        },
+    ]
+
+
+def table(found: Sequence[Certificate]) -> Table:
+    """Certificates side by side."""
+    out = Table("", *(certificate.observer for certificate in found))
+    for sections in zip(*map(lines, found), strict=True):
+        for label in sections[0]:
+            out.add_row(label.replace("\\", ""), *(section[label] for section in sections))
+        out.add_section()
+    return out
+
+
+def markdown(found: Sequence[Certificate]) -> str:
+    """The same table for a page."""
+    rows = [f"| | {' | '.join(certificate.observer for certificate in found)} |", "|---" * (1 + len(found)) + "|"]
+    for sections in zip(*map(lines, found), strict=True):
+        rows += [f"| {label} | {' | '.join(section[label] for section in sections)} |" for label in sections[0]]
+    first = found[0]
+    head = (
+        f"Measurement noise {first.measurement_noise:g}, cut at {first.noise_bound:g} for the bounds; "
+        f"{first.samples} samples along the motion of the first.\n\n"
+    )
+    return head + "\n".join(rows) + "\n"
+
+
+def draw(
+    path: Path, artifact: Artifact, system: System, levels: tuple[float, float], name: str, motion: SettledTrajectories
+) -> None:
+    """The PDE's residual over X, and along the motion the error that noise will make."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    panels = 1 + (artifact.forward is not None)
+    figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")
+    axes = figure.subplots(1, panels, squeeze=False)[0]
+    first, second = (i % system.nx for i in system.portrait)
+    shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
+    x, size = motion.x[shown], np.sqrt(noise_variance(artifact, motion.z[shown], *levels))
+    order = size.argsort()
+    points: Any = axes[-1].scatter(
+        x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
+    )
+    figure.colorbar(points, ax=axes[-1], label="predicted rms error")
+    axes[-1].set_title(f"error due to noise {levels[0]:g}, along the motion")
+    axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+    if artifact.forward is not None:
+        draw_residual(figure, axes[0], artifact, system)
+    figure.suptitle(name)
+    figure.savefig(path, dpi=110)

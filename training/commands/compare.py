@@ -1,0 +1,171 @@
+"""``kkl-gym agent compare``."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from observers.storage import write
+from training.agents.comparison import KNOWS, Knows, collect, interval, middle, normalised, planned, run_case
+from training.agents.tasks import TASKS
+from training.jobs import run_all
+
+LABELS = {
+    "state": "full state",
+    "ekf": "EKF estimate",
+    "x_hat": "x̂",
+    "z": "ẑ",
+    "stacked": "8 y and actions",
+    "y": "y",
+    "recurrent": "y, recurrent agent",
+    "recurrent-state": "full state, recurrent agent",
+}
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Train agents that know different things, several seeds each, and compare them on the same unseen episodes.
+
+    Writes OUT/results.csv (a row for each agent), OUT/table.md and OUT/scores.png. Each agent is a job with a folder of
+    its own; what is there is not done again, so that a run may be stopped at any time. Missing agents are said to be.
+    """
+
+    systems: tuple[str, ...] = tuple(TASKS)
+    """Systems with a control task."""
+    knows: tuple[Knows, ...] = KNOWS
+    """What agents know."""
+    seeds: int = 5
+    """Agents of each kind; of the recurrent ones, which take longest, 3, and 1 where there is more or less noise."""
+    episodes: int = 100
+    """Evaluation episodes."""
+    timesteps: int | None = None
+    """Actions to learn from; default: the hyperparameters'."""
+    more_noise: bool = True
+    """Also Van der Pol at noise 0.2 and Lorenz at 2."""
+    jobs: int = 2
+    """Worker processes, of one thread each."""
+    out: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: agents/comparison)")] = Path("agents/comparison")
+    """Folder of results."""
+
+    def run(self, console: Console) -> None:
+        """Run what is missing, then report."""
+        if min(self.seeds, self.episodes, self.jobs) < 1:
+            raise ValueError("seeds, episodes and jobs must be positive")
+        for names in (self.systems, self.knows):
+            if not names or len(set(names)) < len(names):
+                raise ValueError(f"give systems and what agents know, each once; got {names}")
+        cases = planned(
+            self.out,
+            systems=self.systems,
+            knows=self.knows,
+            seeds=self.seeds,
+            episodes=self.episodes,
+            timesteps=self.timesteps,
+            more_noise=self.more_noise,
+        )
+        todo = [case for case in cases if not case.done]
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        failures = []
+        try:
+            with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+                bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
+                for case, failure, _ in run_all(run_case, todo, min(self.jobs, max(1, len(todo)))):
+                    if failure:
+                        failures.append(f"{case.name}: {failure}")
+                    progress.console.print(f"[red]failed[/red] {failures[-1]}" if failure else f"finished {case.name}")
+                    progress.advance(bar)
+        finally:  # also after an interruption
+            results = collect(self.out, self.episodes, self.timesteps)
+            if len(results):
+                write(self.out / "results.csv", results.to_csv(index=False))
+                report(self.out)
+                console.print(f"wrote results.csv, table.md and scores.png in {self.out}")
+        if failures:
+            raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
+
+
+def report(out: Path) -> None:
+    """Table and figure from results.csv alone."""
+    results = pd.read_csv(out / "results.csv")
+    kinds = ["system", "noise", "knows", "seed"]
+    plan = {(case.system, case.measurement_noise, case.knows, case.seed) for case in planned(out)}
+    missing = plan - set(results[kinds].itertuples(index=False, name=None))
+    partial = f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
+    tasks = list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
+    lines = [
+        "# Agents",
+        "",
+        "Normalised score: 0 is zero input, 1 the interquartile mean of the agents that know the full state. "
+        "Interquartile mean over agents [bootstrap 95 % interval], success rate in %, number of agents. Observers see "
+        f"every sample of y; agents on y see it once for each action.{partial}",
+        "",
+        "| | " + " | ".join(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks) + " |",
+        "|---" * (1 + len(tasks)) + "|",
+    ]
+    cells = _cells(results, tasks)
+    for knows in KNOWS:
+        row = []
+        for task in tasks:
+            cell = cells.get((*task, knows))
+            if cell is None:
+                row.append("–")
+                continue
+            found, low, high = cell["interval"]
+            spread = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
+            row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
+        lines.append(f"| {LABELS[knows]} | " + " | ".join(row) + " |")
+    minutes = results.groupby("knows").seconds.mean() / 60
+    spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in KNOWS if knows in minutes)
+    lines += ["", f"CPU minutes for one training: {spent}."]
+    write(out / "table.md", "\n".join(lines) + "\n")
+    _draw(out / "scores.png", results, tasks, partial)
+
+
+def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
+    """What table and figure show for each task and kind of agent."""
+    cells = {}
+    for system, noise in tasks:
+        here = results[(results.system == system) & (results.noise == noise)]
+        best = here[here.knows == "state"].score.to_numpy()
+        if not len(best):  # nothing to measure the others by
+            continue
+        idle_score = float(here.idle.iloc[0])
+        for knows, group in here.groupby("knows"):
+            values = best if knows == "state" else group.score.to_numpy()
+            found = interval(values, best, idle_score)
+            if np.isfinite(found[0]):
+                cells[system, noise, str(knows)] = {
+                    "interval": found,
+                    "agents": normalised(values, float(middle(best)), idle_score),
+                    "success": group.success.mean(),
+                }
+    return cells
+
+
+def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], partial: str) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")
+    axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
+    cells = _cells(results, tasks)
+    for ax, task in zip(axes, tasks, strict=True):
+        for place, knows in enumerate(reversed(KNOWS)):
+            cell = cells.get((*task, knows))
+            if cell is not None:
+                found, low, high = cell["interval"]
+                ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color="0.6", markersize=4)
+                ax.plot([low, high], [place, place], color="C0", lw=2)
+                ax.plot(found, place, "o", color="C0")
+        ax.axvline(1.0, color="0.8", lw=0.8)
+        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]:g}", xlabel="normalised score")
+        ax.set_yticks(range(len(KNOWS)), [LABELS[knows] for knows in reversed(KNOWS)])
+    figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
+    temporary = path.with_name(f".{path.name}.new.png")
+    figure.savefig(temporary, dpi=110)
+    os.replace(temporary, path)

@@ -1,0 +1,114 @@
+"""``kkl-gym train``."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import torch
+import tyro
+from rich.console import Console
+
+from kkl_gym.systems import get_system
+from training.config import FORMER_NAMES, Config, Pipeline, override, read_changes, setting_types
+from training.presets import CLOSED_LOOP, Preset, preset
+
+
+def _options() -> type[Any]:
+    """A class of all settings of a configuration, each None unless it is given, with Config's own descriptions."""
+    former = {now: before for before, now in FORMER_NAMES.items()}
+    described = Config.__pydantic_fields__  # type: ignore[attr-defined]
+    entries = []
+    for name, kind in setting_types().items():
+        if name == "pipeline":
+            continue
+        argument = tyro.conf.arg(
+            help=" ".join((described[name].description or "").split()),
+            help_behavior_hint="(default: the preset's)",
+            aliases=[f"--{former[name].replace('_', '-')}"]
+            if name in former and name != "closed_loop_trajectories"
+            else None,
+        )
+        entries.append((name, Annotated[kind | None, argument], None))
+    return dataclasses.make_dataclass("Settings", entries, frozen=True)
+
+
+if TYPE_CHECKING:
+    Settings = Any
+else:
+    Settings = _options()
+
+
+@dataclass(frozen=True)
+class Train:
+    """Learn an observer for a system and write it to one file.
+
+    The run's folder, runs/NAME, receives NAME.safetensors, a report (PNG), checkpoints and, where TensorBoard is
+    installed, its scalars.
+    """
+
+    system: tyro.conf.Positional[str]
+    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    pipeline: Annotated[Pipeline, tyro.conf.arg(aliases=["--method"])] = "input-aware"
+    """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
+    preset: Preset = "fast"
+    """fast: about ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
+    """The run's folder."""
+    config: Path | None = None
+    """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
+    closed_loop: bool = False
+    """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
+    (input-aware); takes half as long again. Writes NAME-closed-loop."""
+    monitor: bool = True
+    """Find limits for the observer's monitor as well, which takes a minute or two; left out where the output is not
+    linear."""
+    resume: bool = False
+    """Go on from the checkpoints in the run's folder, if there are any."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
+    threads: int = 2
+    """CPU threads."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where networks are trained; auto takes a GPU if there is one."""
+    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
+    """What of the preset's configuration is to differ."""
+
+    def run(self, console: Console) -> Path:
+        """Train; returns the artifact's path."""
+        from training.evaluation.calibration import calibrate
+        from training.evaluation.report import write_report
+        from training.pipeline import train
+
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
+        torch.set_num_threads(self.threads)
+        system = get_system(self.system, self.parameters)
+        given = {name: value for name, value in vars(self.settings).items() if value is not None}
+        changes = (read_changes(self.config) if self.config else {}) | given
+        if changes.get("random_features"):
+            changes.setdefault("forward_steps", 0)  # what is solved for is not trained
+        if self.closed_loop:
+            changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
+        config = override(preset(system, self.pipeline, self.preset), changes)
+        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
+        name += "-closed-loop" if config.closed_loop_trajectories else ""
+        folder = self.out or Path("runs") / name
+        device = None if self.device == "auto" else torch.device(self.device)
+        result = train(system, config, folder, resume=self.resume, device=device, console=console)
+        path = folder / f"{name}.safetensors"
+        result.artifact.save(path)  # before anything else may fail
+        if self.monitor and result.artifact.C is None:
+            console.print("[yellow]no monitor:[/yellow] the output is not linear, so there is no C x_hat to compare")
+        elif self.monitor:
+            try:
+                with console.status("finding the monitor's limits"):
+                    calibrate(result.artifact, system, seed=config.seed).save(path)
+            except ValueError as error:
+                console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
+        console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
+        write_report(folder / "report.png", result, system)
+        console.print(f"wrote {folder / 'report.png'}")
+        return path

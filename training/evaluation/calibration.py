@@ -1,0 +1,119 @@
+"""Limits of an observer's residual in sound operation, for :class:`observers.Monitor`."""
+
+import dataclasses
+import math
+
+import numpy as np
+from scipy.signal import lfilter
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver, Limits
+from training.seeds import Stream, generator
+from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.signals import random_inputs
+
+LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
+LARGEST = 1.0  # for maps that are not told the noise
+WINDOW = 0.5  # s
+WARM_UP = 5.0  # s
+TRIES = 8
+MARGIN = 1.05  # on limits found among finitely many runs
+
+
+def calibrate(
+    artifact: Artifact,
+    system: System,
+    trajectories: int | None = None,
+    duration: float = 50.0,
+    false_alarms: float = 0.01,
+    seed: int = 0,
+) -> Artifact:
+    """The same artifact with limits for a monitor.
+
+    Sound runs are simulated from starts in X with the system's process noise, half of them under random inputs if the
+    map knows inputs, at several noise levels. Each limit is the one that a new run exceeds with a sixth of the
+    probability ``false_alarms`` (and of an output's share in it), with a margin for its being found among few runs.
+
+    Parameters
+    ----------
+    artifact : an observer of a linear output.
+    system : what it was made for.
+    trajectories : number of runs; None is as many as it takes to tell such rare events.
+    duration : of each, in seconds.
+    false_alarms : probability that a sound run of this length exceeds a limit.
+    seed : of everything random.
+
+    Raises
+    ------
+    ValueError : if the output is not linear, a number makes no sense, or the runs are too few to tell such rare events;
+        :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
+    """
+    artifact.check(system.name, system.parameters, artifact.filter.dt, system.ny, system.nu)
+    if artifact.C is None:
+        raise ValueError(f"the output of {system.name!r} is not linear: there is no C x_hat to compare it with")
+    if not 0 < false_alarms < 1 or duration <= WARM_UP or seed < 0:
+        raise ValueError(
+            f"need 0 < false_alarms < 1, duration > {WARM_UP} and seed >= 0, got {false_alarms}, {duration}, {seed}"
+        )
+    share = false_alarms / (6 * system.ny)
+    least = math.ceil(1 / share - 1e-9)
+    if trajectories is not None and trajectories < least:
+        raise ValueError(f"{trajectories} runs are too few for {false_alarms:g}: take {least}")
+    rng = generator(Stream.CALIBRATION, seed)
+    x, u = sound_trajectories(artifact, system, trajectories or least, duration, rng)
+    largest = artifact.inverse.measurement_noise_max
+    levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
+    rows = [_limits(artifact, system, x, u, level, share, rng) for level in levels]
+    mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
+    return dataclasses.replace(
+        artifact, limits=Limits(levels, mean, low, high, WINDOW, WARM_UP, false_alarms, duration)
+    )
+
+
+def sound_trajectories(
+    artifact: Artifact, system: System, n: int, duration: float, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (steps + 1, n, nx) and inputs (steps, n, nu) of runs; those that leave the bounds are drawn anew.
+
+    Raises ValueError if most of them do.
+    """
+    dt = artifact.filter.dt
+    steps = round(duration / dt)
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
+        u = np.zeros((steps, missing, system.nu))
+        if artifact.nu:
+            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt, rng)
+        w = draw_process_noise(system, system.process_noise, missing, steps, rng)
+        x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
+        inside = np.isfinite(x[-1]).all(-1)
+        kept.append((x[:, inside], u[:, inside]))
+        if len(kept) == TRIES:
+            raise ValueError(f"most runs of {duration:g} s leave bounds = {system.bounds}")
+    xs, us = zip(*kept, strict=True)
+    return np.concatenate(xs, 1), np.concatenate(us, 1)
+
+
+def _limits(
+    artifact: Artifact,
+    system: System,
+    x: np.ndarray,
+    u: np.ndarray,
+    level: float,
+    share: float,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Limits of mean, low and high at one noise level, each (ny,)."""
+    dt = artifact.filter.dt
+    y = noisy_output(system, x, level, rng)
+    observer = KKLObserver(artifact, level, process_noise=system.process_noise)
+    residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
+    a = -np.expm1(-dt / WINDOW)
+    late = slice(round(WARM_UP / dt) + 1, None)
+    means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]
+    squares = lfilter([a], [1.0, a - 1.0], residual**2, axis=0)[late]
+    mean = np.quantile(means.max(0), 1 - share, axis=0, method="weibull") * MARGIN
+    high = np.quantile(squares.max(0), 1 - share, axis=0, method="weibull") * MARGIN
+    low = np.quantile(squares.min(0), share, axis=0, method="weibull") / MARGIN if level else np.zeros_like(high)
+    return mean, low, high

@@ -1,0 +1,75 @@
+"""Lipschitz constants of networks, from below and from above."""
+
+import numpy as np
+import torch
+
+from training.maps.smooth import Smooth
+
+# Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
+# vanishes, at |x| = 2.39936.
+SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
+
+
+def lipschitz_lower(network: Smooth, x: np.ndarray) -> tuple[float, np.ndarray]:
+    """The largest spectral norm of the Jacobian among the points (n, inputs), and the point where it is.
+
+    No Lipschitz constant over a convex set that holds these points is smaller.
+    """
+    norms = np.linalg.norm(network.jacobian(x), ord=2, axis=(1, 2))
+    worst = int(norms.argmax())
+    return float(norms[worst]), x[worst]
+
+
+def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
+    """A constant that no two inputs anywhere exceed, by a quadratic certificate for each layer.
+
+    Let M be a matrix with |f(h) - f(h')|^2 <= (h - h')^T M (h - h') for everything behind a layer h = phi(W x + b).
+    With activations of slopes between a and b, and any positive diagonal D with D - M > 0, the same holds in
+    front of it for W^T [(a + b)^2/4 D (D - M)^-1 D - a b D] W (the S-procedure on (dh - a dv)^T D (b dv - dh) >= 0,
+    then a Schur complement). Beginning at W^T W of the last layer this leads to the input, where the largest eigenvalue
+    is the square of the constant. Fazlyab et al. (NeurIPS 2019) pose it as one semidefinite program, Xu and Sivaranjani
+    (ECLipsE, NeurIPS 2024) layer by layer; here the diagonals of all layers are found together by gradients, so that no
+    solver of such programs is needed. Every choice of them is sound; a good one is less than the product of norms.
+    """
+    if len(network.weights) == 1 or norm_product(network) == 0.0:
+        return norm_product(network)
+    low, high = SLOPES[network.activation]
+    weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in network.weights]
+    # D is a shape about the diagonal of M, times the least factor with D >= M, times 1 + e^margin: always admissible.
+    # Zeros are a good start: for diagonal M they give D = 2 M, with which nothing is lost.
+    shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
+    margins = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in weights[:-1]]
+
+    def bound() -> torch.Tensor:
+        M = weights[-1].T @ weights[-1]
+        for weight, shape, margin in zip(weights[-2::-1], shapes[::-1], margins[::-1], strict=True):
+            root = torch.exp(shape / 2) * torch.sqrt(M.diagonal() + 1e-6 * M.diagonal().max())
+            factor = torch.linalg.eigvalsh(M / root[:, None] / root)[-1]
+            D = root**2 * factor * (1.0 + torch.exp(margin))
+            inner = torch.linalg.solve(torch.diag(D) - M, torch.diag(D))
+            M = weight.T @ ((low + high) ** 2 / 4 * D[:, None] * inner - low * high * torch.diag(D)) @ weight
+            M = (M + M.T) / 2
+        largest: torch.Tensor = torch.linalg.eigvalsh(M)[-1]
+        return largest
+
+    optimiser = torch.optim.Adam([*shapes, *margins], lr=0.1)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    best = float("inf")
+    for _ in range(steps):
+        optimiser.zero_grad()
+        squared = bound()
+        best = min(best, float(squared.detach()))
+        torch.log(squared).backward()  # type: ignore[no-untyped-call]
+        optimiser.step()
+        schedule.step()
+    best = min(best, float(bound().detach()))
+    certified = float(np.sqrt(best)) * (1.0 + 1e-9)  # for the rounding of the arithmetic above
+    return min(certified, norm_product(network))
+
+
+def norm_product(network: Smooth) -> float:
+    """The product of the layers' spectral norms and the activations' largest slope, what is known without work."""
+    slope = max(abs(value) for value in SLOPES[network.activation])
+    return float(np.prod([np.linalg.norm(weight, 2) for weight in network.weights])) * slope ** (
+        len(network.weights) - 1
+    )

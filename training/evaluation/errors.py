@@ -1,0 +1,128 @@
+"""Estimation errors of an observer on trajectories that its training never saw."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver
+from training.evaluation.metrics import smape
+from training.seeds import Stream, generator
+from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.signals import random_inputs
+
+TRANSIENT = 0.2  # part of a run that is left out of the errors "after the transient"
+
+
+Domain = Literal["X", "1.5X", "2X"]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
+
+    full : over all steps (the paper's), (n,).
+    late : after the transient, (n,): what :func:`errors` was told to skip, else the first 20 % of the steps.
+    escaped : number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+    """
+
+    full: np.ndarray
+    late: np.ndarray
+    escaped: int
+
+
+@dataclass(frozen=True)
+class UnseenTrajectories:
+    """Test trajectories, measured without noise.
+
+    x : states, (steps + 1, n, nx).
+    u : inputs, (steps, n, nu).
+    inside : which of the trajectories drawn stayed within the system's declared bounds; the others are not in x and u.
+    process_noise : its level, as of the environments.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    inside: np.ndarray
+    process_noise: float = 0.0
+
+    @property
+    def escaped(self) -> int:
+        """Number of trajectories that left the bounds."""
+        return int((~self.inside).sum())
+
+    def first(self, n: int) -> "UnseenTrajectories":
+        """The first n of those drawn. (Alone they might differ: rounding depends on the batch, and chaos on it.)"""
+        inside = self.inside[:n]
+        return UnseenTrajectories(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside, self.process_noise)
+
+
+def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Starts (n, nx), uniform in the training box X, or in a multiple of X (as in the paper) without X itself."""
+    if domain == "X":
+        return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
+    low, high = system.box()
+    larger = system.box(float(domain.removesuffix("X")))
+    found: list[np.ndarray] = []
+    while len(found) < n:
+        x = rng.uniform(*larger)
+        if ((x < low) | (x > high)).any():
+            found.append(x)
+    return np.array(found)
+
+
+def unseen_trajectories(
+    system: System,
+    dt: float,
+    n: int,
+    duration: float,
+    seed: int,
+    domain: Domain = "X",
+    driven: bool = False,
+    stream: Stream = Stream.EVALUATION,
+    process_noise: float = 0.0,
+) -> UnseenTrajectories:
+    """Test trajectories; driven ones alternate random bounded steps and sines.
+
+    ``first`` is the first entry of the seed: of evaluation or of validation. ``process_noise`` is its level.
+
+    Raises ValueError on an unknown domain, or unless n, duration, seed and level make sense.
+    """
+    if n < 1 or seed < 0 or not duration >= dt:
+        raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
+    if domain not in get_args(Domain):
+        raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
+    if not 0 <= process_noise < np.inf:
+        raise ValueError(f"process_noise must be finite and not negative, got {process_noise!r}")
+    rng = generator(stream, seed)
+    x0 = starts(system, domain, n, rng)
+    steps = round(duration / dt)
+    u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
+    w = None
+    if process_noise:
+        w = draw_process_noise(system, process_noise, n, steps, generator(stream, seed, 2))
+    x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
+    inside = np.isfinite(x[-1]).all(-1)
+    return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
+
+
+def errors(
+    artifact: Artifact,
+    system: System,
+    runs: UnseenTrajectories,
+    measurement_noise: float,
+    seed: int,
+    skip: float | None = None,
+) -> Errors:
+    """Errors of an observer on test trajectories, told the levels of noise.
+
+    skip : seconds left out of ``late``; None is a fifth of the run.
+    """
+    rng = generator(Stream.EVALUATION, seed, 1)
+    y = noisy_output(system, runs.x, measurement_noise, rng)
+    observer = KKLObserver(artifact, measurement_noise, process_noise=runs.process_noise)
+    x_hat = observer.estimate(y, runs.u if artifact.nu else None)
+    first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
+    return Errors(smape(runs.x, x_hat), smape(runs.x, x_hat, first), runs.escaped)

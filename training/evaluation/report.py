@@ -1,0 +1,88 @@
+"""A training run in one picture."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver
+from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
+from training.maps.smooth import residual
+from training.pipeline import Result
+from training.trajectories.noise import noisy_output
+
+
+def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
+    """Errors in training, PDE residual over the domain, estimate against truth.
+
+    Where no T was learned, the error by noise level takes the place of the residual.
+
+    The trajectories shown are unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    artifact = result.artifact
+    seconds = min(20.0, artifact.training["duration"])
+    runs = unseen_trajectories(system, artifact.filter.dt, 20, seconds, seed)
+    figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
+    grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
+    losses = figure.add_subplot(grid[0, 0])
+    for name, history in result.losses.items():
+        losses.semilogy(*np.array(history).T, label=name)
+    losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {artifact.training['method']}")
+    losses.legend()
+    right = figure.add_subplot(grid[0, 1])
+    if artifact.forward is None:
+        _draw_noise_levels(right, result, system, runs, seed)
+    else:
+        draw_residual(figure, right, artifact, system)
+
+    x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
+    rng = np.random.default_rng(seed)
+    t = np.arange(len(x)) * artifact.filter.dt
+    for column, noise in enumerate((0.0, 0.5)):
+        level = min(noise, artifact.inverse.measurement_noise_max)
+        y = noisy_output(system, x, level, rng)
+        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
+        for i in range(system.nx):
+            ax = figure.add_subplot(grid[1 + i, column])
+            ax.plot(t, x[..., i], "k", lw=1.2, label="true")
+            ax.plot(t, x_hat[..., i], "m--", lw=1.2, label="estimated")
+            ax.set_ylabel(system.state_names[i])
+            if i == 0:
+                ax.set_title(f"measurement noise {level:g}")
+                ax.legend(loc="upper right")
+        ax.set_xlabel("t in s")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _draw_noise_levels(ax: Any, result: Result, system: System, runs: UnseenTrajectories, seed: int) -> None:
+    artifact = result.artifact
+    if not runs.x.shape[1]:
+        ax.set_title("every trajectory left the declared bounds")
+        return
+    levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
+    medians = [np.median(errors(artifact, system, runs, level, seed).late) for level in levels]
+    ax.plot(range(len(levels)), medians, "o-")
+    ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
+    ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
+
+
+def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 150) -> None:
+    """Size of the PDE's residual over the plane of the phase portrait, the other states at the centre of X."""
+    from matplotlib.colors import LogNorm
+
+    first, second = (i % system.nx for i in system.portrait)
+    x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
+    grids = [np.linspace(*system.X[i], n) for i in (first, second)]
+    x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
+    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
+    image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
+    figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
+    ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+    ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

@@ -1,0 +1,48 @@
+"""Coordinates of the filter's state that a network can read."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from observers import LinearFilter
+
+# A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
+SMALLEST_MODE = 1e-7
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Coordinates of z in which the signal has unit covariance and stationary noise a diagonal one.
+
+    The components of z are nearly collinear, with variances that spread over ten orders of magnitude; a network
+    in float32 cannot read them unless they are whitened.
+
+    offset : (size,).
+    whiten : (modes, size), sorted by falling ratio of signal to noise.
+    noise_gain : (modes,), standard deviation of each coordinate's noise at sigma_v = 1.
+    """
+
+    offset: np.ndarray
+    whiten: np.ndarray
+    noise_gain: np.ndarray
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        """Filter states (..., size) to coordinates (..., modes)."""
+        return np.asarray((z - self.offset) @ self.whiten.T)
+
+
+def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
+    """Coordinates from samples of z, (n, size), and the covariance of the noise in z, (size, size)."""
+    offset, scale = z.mean(0), z.std(0)
+    scale = np.where(scale > 0, scale, 1.0)
+    _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)
+    keep = singular > SMALLEST_MODE * singular[0]
+    whiten = directions[keep] / singular[keep, None] * np.sqrt(len(z)) / scale
+    variances, rotation = np.linalg.eigh(whiten @ noise @ whiten.T)
+    return Coordinates(offset, rotation.T @ whiten, np.sqrt(np.maximum(variances, 0.0)))
+
+
+def settling_time(linear: LinearFilter) -> float:
+    """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
+    slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    return float(np.log(1e3) / slowest)

@@ -1,0 +1,117 @@
+"""The forward map T as a physics-informed network (paper, sec. 5)."""
+
+import math
+
+import numpy as np
+import torch
+from torch import nn
+
+from kkl_gym.system import System
+from observers import ForwardMap, LinearFilter
+from training.maps.networks import Network, tensor
+
+
+def on_tensors(function: object, x: torch.Tensor) -> torch.Tensor:
+    """A system's f or h on states (n, nx)."""
+    values = function(x.unbind(-1))  # type: ignore[operator]
+    return torch.stack([torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(len(x)) for value in values], -1)
+
+
+def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
+    """t*, in seconds, after which at most epsilon is left of a start z0.
+
+    t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
+    printed upside down).
+    """
+    poles, V = np.linalg.eig(linear.A)
+    return float(max(0.0, np.log(np.linalg.cond(V) * z0_norm / epsilon)) / np.abs(poles.real).min())
+
+
+class ForwardProblem(nn.Module):
+    """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
+
+    mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points, drawn
+    anew for every batch, uniformly from the training box. States are scaled to [-1, 1] and each z to unit
+    variance, in both terms; the residual at each point is divided by the local speed of the scaled motion plus the
+    filter's slowest rate, so that fast corners of the box do not drown the rest (the authors' released code
+    weights by the speed as well).
+
+    Parameters
+    ----------
+    x, z : pairs, (n, nx) and (n, nz).
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        system: System,
+        linear: LinearFilter,
+        x: np.ndarray,
+        z: np.ndarray,
+        physics_weight: float,
+        batch: int,
+        device: torch.device,
+    ) -> None:
+        super().__init__()
+        low, high = system.box()
+        lowest, highest = np.minimum(low, x.min(0)), np.maximum(high, x.max(0))
+        self.network, self.system, self.linear = network.to(device), system, linear
+        self.x_offset, self.x_scale = (lowest + highest) / 2, (highest - lowest) / 2
+        self.z_offset, self.z_scale = z.mean(0), np.maximum(z.std(0), 1e-12)
+        self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
+        self._zo, self._zs = tensor(self.z_offset, device), tensor(self.z_scale, device)
+        self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)
+        self._x = tensor((x - self.x_offset) / self.x_scale, device)
+        self._z = tensor((z - self.z_offset) / self.z_scale, device)
+        self._low, self._span = tensor(low, device), tensor(high - low, device)
+        self._slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
+        self._physics_weight, self._batch = physics_weight, batch
+
+    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """The risk on a batch of data and as many fresh collocation points."""
+        device = self._x.device
+        rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
+        data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
+        x = self._low + self._span * torch.rand((self._batch, len(self._low)), generator=generator, device=device)
+        residual, speed = self.residual(x)
+        physics = ((residual / self._zs / (speed + self._slowest)[:, None]) ** 2).mean()
+        return {"loss": data + self._physics_weight * physics, "data": data.detach(), "physics": physics.detach()}
+
+    def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
+        f = on_tensors(self.system.f, x) / self._xs
+        scaled = (x - self._xo) / self._xs
+        value, derivative = torch.func.jvp(self.network, (scaled,), (f,))  # type: ignore[misc]
+        T = self._zo + self._zs * value
+        h = on_tensors(self.system.h, x)
+        return self._zs * derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
+
+    @torch.no_grad()
+    def T(self, x: torch.Tensor) -> torch.Tensor:
+        """The learned map at states (n, nx), (n, nz)."""
+        z: torch.Tensor = self._zo + self._zs * self.network((x - self._xo) / self._xs)
+        return z
+
+    @torch.no_grad()
+    def error(self, n: int = 100_000) -> np.ndarray:
+        """z - T(x) on up to n of the data pairs, (n, nz)."""
+        rows = np.random.default_rng(0).permutation(len(self._x))[:n]
+        difference = self._zs * (self._z[rows] - self.network(self._x[rows]))
+        return np.asarray(difference.cpu().numpy(), dtype=float)
+
+    def forward_map(self) -> ForwardMap:
+        """The learned map for NumPy."""
+        return ForwardMap(self.network.export(), self.x_offset, self.x_scale, self.z_offset, self.z_scale)
+
+
+def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:
+    """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
+    x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
+    z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
+    t = truncation_time(linear, z0, epsilon)
+    if t >= steps * linear.dt:
+        raise ValueError(
+            f"trajectories of {steps * linear.dt:g} s end before the filter has forgotten its start, t* = {t:.3g} s; "
+            "make them longer"
+        )
+    return math.ceil(t / linear.dt)

@@ -1,0 +1,186 @@
+"""One optimisation loop for every network: Adam or SOAP, cosine decay, checkpoints, resuming, progress."""
+
+import math
+import pickle
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.progress import Progress
+from torch import nn
+
+from observers.storage import replacing
+from training.config import Optimiser
+
+CHECKPOINT_SECONDS = 20.0
+LOG_EVERY = 100
+WARM_UP = 0.01  # part of a stage in which the learning rate rises
+SUFFIX = ".checkpoint.pt"
+
+# A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
+Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
+Log = Callable[[str, float, int], object]
+"""Takes the name of a scalar, its value and the number of the batch."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stage:
+    """One optimisation within a run.
+
+    name : of its checkpoint and its scalars.
+    steps : number of batches.
+    learning_rate : at its highest; it decays to zero along a cosine after a short linear warm-up.
+    folder : where checkpoints go.
+    fingerprint : identifies the run's configuration; a checkpoint of another one is refused.
+    seed : of the batches.
+    cpu_seconds : after which the stage ends if its steps are not done; the learning rate then follows the clock.
+    optimiser : "adam"; or "soap", Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al., arXiv:2409.11321).
+        For networks as small as these, on batches as large, it takes about as long a step, and far fewer of them.
+    """
+
+    name: str
+    steps: int
+    learning_rate: float
+    folder: Path
+    fingerprint: str
+    seed: int
+    cpu_seconds: float = math.inf
+    optimiser: Optimiser = "adam"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The file that keeps how far it has come."""
+        return self.folder / f"{self.name}{SUFFIX}"
+
+
+@dataclass
+class _Course:
+    """How far a stage has come: batches done, CPU seconds spent, and the error by batch."""
+
+    step: int = 0
+    seconds: float = 0.0
+    history: list[tuple[int, float]] = field(default_factory=list)
+
+
+def optimise(
+    stage: Stage, module: nn.Module, loss: Loss, progress: Progress, *, log: Log | None = None, resume: bool
+) -> list[tuple[int, float]]:
+    """Minimise ``loss()["loss"]`` over the parameters of ``module``; returns its course by step.
+
+    The course is that of ``loss()["error"]`` where there is one, else of the loss, averaged over LOG_EVERY steps.
+
+    Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
+
+    Raises FloatingPointError if the loss stops being a number; the last checkpoint then remains. Raises ValueError if
+    the checkpoint to go on from is damaged or of another configuration.
+    """
+    device = next(module.parameters()).device
+    generator = torch.Generator(device).manual_seed(stage.seed)
+    optimiser = _optimiser(stage, module)
+    parts = {"module": module, "optimiser": optimiser}
+    course = _restore(stage, parts, generator) if resume and stage.checkpoint.exists() else _Course()
+    spent, began = course.seconds, time.process_time()
+
+    def seconds() -> float:
+        return spent + time.process_time() - began
+
+    def rate(step: int) -> float:
+        done = max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
+        return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
+
+    task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
+    total, saved_at = torch.zeros((), device=device), time.monotonic()
+    for step in range(course.step, stage.steps if spent < stage.cpu_seconds else course.step):
+        for group in optimiser.param_groups:
+            group["lr"] = stage.learning_rate * rate(step)
+        terms = loss(generator)
+        optimiser.zero_grad(set_to_none=True)
+        terms["loss"].backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(module.parameters(), 1.0)
+        optimiser.step()
+        total += terms.get("error", terms["loss"]).detach()
+        last = step + 1 == stage.steps or seconds() >= stage.cpu_seconds
+        if (step + 1) % LOG_EVERY == 0 or last:
+            mean = float(total) / ((step % LOG_EVERY) + 1)
+            if mean != mean:
+                raise FloatingPointError(f"the error of stage {stage.name!r} is not a number at step {step + 1}")
+            total.zero_()
+            course.history.append((step + 1, mean))
+            if log is not None:
+                for name, value in terms.items():
+                    log(f"{stage.name}/{name}", float(value.detach()), step + 1)
+            progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
+            if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
+                progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, error {mean:.3g}")
+            if time.monotonic() - saved_at > CHECKPOINT_SECONDS or last:
+                course.step, course.seconds = step + 1, seconds()
+                _save(stage, parts, generator, course)
+                saved_at = time.monotonic()
+        if last:
+            break
+    return course.history
+
+
+def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:
+    if stage.optimiser == "adam":
+        return torch.optim.Adam(module.parameters(), lr=stage.learning_rate)
+    from pytorch_optimizer import SOAP
+
+    return SOAP(module.parameters(), lr=stage.learning_rate, weight_decay=0.0)
+
+
+@contextmanager
+def log_to(folder: Path) -> Iterator[Log | None]:
+    """TensorBoard scalars in a folder, where TensorBoard is installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        yield None
+        return
+    with SummaryWriter(folder) as writer:
+        yield writer.add_scalar
+
+
+def seconds_spent(folder: Path) -> float:
+    """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
+    return float(sum(_load(path)["seconds"] for path in folder.glob(f"*{SUFFIX}")))
+
+
+def _save(stage: Stage, parts: dict[str, Any], generator: torch.Generator, course: _Course) -> None:
+    state = {name: part.state_dict() for name, part in parts.items()}
+    with replacing(stage.checkpoint) as temporary:
+        torch.save(
+            {"fingerprint": stage.fingerprint, "generator": generator.get_state(), **state, **vars(course)}, temporary
+        )
+
+
+def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) -> _Course:
+    path = stage.checkpoint
+    found = _load(path)
+    if found["fingerprint"] != stage.fingerprint:
+        raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
+    try:
+        for name, part in parts.items():
+            part.load_state_dict(found[name])
+        generator.set_state(found["generator"].cpu())
+        return _Course(found["step"], found["seconds"], found["history"])
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _load(path: Path) -> dict[str, Any]:
+    try:
+        found = torch.load(path, weights_only=True)  # tensors and plain values; nothing in the file can run
+        return {"fingerprint": None, "seconds": 0.0, **found}
+    except (pickle.UnpicklingError, OSError, EOFError, RuntimeError, TypeError, ValueError, KeyError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> ValueError:
+    return ValueError(
+        f"the checkpoint {path} is damaged or of an older version, remove it to train that stage anew: {error}"
+    )

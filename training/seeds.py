@@ -1,0 +1,30 @@
+"""Who draws from which stream of random numbers: whatever the seeds, no two purposes ever share one."""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Stream(IntEnum):
+    """First entry of the seeds of each purpose. Entries never change: published results rest on them."""
+
+    TRAINING = 1
+    EVALUATION = 2
+    VALIDATION = 3  # on which the benchmark and ``kkl-gym tune --check`` choose
+    CERTIFICATE = 4
+    CALIBRATION = 5
+    FAULTS = 6
+    TUNING = 7
+
+
+# Of an agent's first episode: in training, times one more than the agent's own seed, and in evaluation.
+AGENT_TRAINING_SEED = 10_000
+AGENT_EVALUATION_SEED = 10**9
+
+
+def generator(stream: Stream, *seed: int) -> np.random.Generator:
+    """The generator of a stream for a seed, and for a part of what is drawn with it: ``generator(stream, seed, part)``.
+
+    Parts count from 1, because NumPy does not tell a seed from the same with zeros behind it.
+    """
+    return np.random.default_rng([stream, *seed])

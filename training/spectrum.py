@@ -1,0 +1,70 @@
+"""The eigenvalues of A: how they are spaced, what others take, and the filter that they make."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.signal import besselap
+
+from kkl_gym.system import System
+from observers import LinearFilter
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """Eigenvalues of A for each output: real ones, and pairs (a, w) of a +- iw."""
+
+    eigenvalues: tuple[float, ...] = ()
+    pairs: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def modes(self) -> int:
+        """Their number."""
+        return len(self.eigenvalues) + 2 * len(self.pairs)
+
+    @property
+    def poles(self) -> np.ndarray:
+        """All of them, complex, (modes,)."""
+        above = [complex(a, w) for a, w in self.pairs]
+        return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
+
+    def __add__(self, other: "Spectrum") -> "Spectrum":
+        return Spectrum(self.eigenvalues + other.eigenvalues, self.pairs + other.pairs)
+
+    @property
+    def A(self) -> np.ndarray:
+        """A for one output, (modes, modes): real eigenvalues on the diagonal, then a block [[a, w], [-w, a]] a pair."""
+        return np.asarray(block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
+
+    def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
+        """The filter with these modes for each of ny outputs, B all ones for each output."""
+        A = self.A
+        return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
+
+
+def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
+    """n real eigenvalues from slowest to fastest, both negative, evenly spaced in the logarithm."""
+    return tuple((-np.geomspace(-slowest, -fastest, n)).tolist())
+
+
+def papers_spectrum(system: System) -> tuple[float, ...]:
+    """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8)."""
+    return tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist())
+
+
+def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "mag") -> Spectrum:
+    """The poles of a Bessel filter of an order at a cutoff in rad/s, which ``norm`` defines as in scipy.signal."""
+    _, poles, _ = besselap(order, norm=norm)
+    real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
+    return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))
+
+
+def typical_rate(system: System) -> float:
+    """Median over X of how fast f changes, in 1/s; raises ValueError if the system does not say."""
+    low, high = system.box()
+    points = np.random.default_rng(0).uniform(low, high, (1000, system.nx)).T
+    rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
+    if not 0 < rate < np.inf:
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+    return rate

@@ -1,0 +1,15 @@
+"""Lorenz: what is chosen for it."""
+
+from training.spectrum import evenly_spaced
+from training.systems.profile import Profile
+from training.systems.task import ControlTask
+
+PROFILE = Profile(
+    eigenvalues=evenly_spaced(13, -1.5, -25.0),
+    settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
+    fault_deadline=2.0,
+    task=ControlTask("lorenz", duration=5.0),  # the input is weak
+    agent_observer="lorenz-v1",
+    second_noise=2.0,
+    printed={"spinn": 8.64, "ae": 88.1, "dmf": 8.76, "node": 11.0},
+)

@@ -1,0 +1,13 @@
+"""Rössler: what is chosen for it."""
+
+from training.spectrum import evenly_spaced
+from training.systems.profile import Profile
+from training.systems.task import ControlTask
+
+PROFILE = Profile(
+    eigenvalues=evenly_spaced(13, -0.4, -8.0),
+    fault_deadline=2.0,
+    task=ControlTask("rossler", period=0.1, duration=30.0),
+    agent_observer="rossler-v1",
+    printed={"spinn": 4.77, "ae": 79.9, "dmf": 23.5, "node": 24.7},
+)

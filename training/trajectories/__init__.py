@@ -1,0 +1,1 @@
+"""Simulated data: inputs, noise, recorded trajectories, closed loops, controllers and derivatives of the equations."""

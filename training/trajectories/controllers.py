@@ -1,0 +1,34 @@
+"""Classical state feedback: what an agent is measured against, and what drives closed-loop training data."""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import solve_continuous_are
+
+from kkl_gym.system import System
+from training.trajectories.derivatives import linearised
+
+Controller = Callable[[np.ndarray], np.ndarray]
+"""States (n, nx) in, actions (n, nu) in [-1, 1] out."""
+
+
+INPUT_WEIGHT = 0.1
+
+
+def linear_quadratic(system: System) -> Controller:
+    """u = -K (x - target), cut at the input bounds: the linear-quadratic regulator of the linearisation at the target.
+
+    Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input.
+
+    Raises numpy.linalg.LinAlgError if the linearisation cannot be stabilised.
+    """
+    target, u_max = np.array(system.target), np.array(system.u_max)
+    A, B, _ = linearised(system, system.target)
+    Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
+    K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
+
+    def act(x: np.ndarray) -> np.ndarray:
+        action: np.ndarray = np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)
+        return action
+
+    return act

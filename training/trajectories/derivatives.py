@@ -1,0 +1,80 @@
+"""Derivatives of a system from its own equations."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from kkl_gym.system import Box, Components, System
+
+
+def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of f or h from its own equations: for each component, those that are not zero by state."""
+    import sympy  # here, because it takes half a second that other commands need not wait for
+
+    x = sympy.symbols(f"x:{nx}", real=True)
+    rows = []
+    try:
+        values = [sympy.sympify(value) for value in equations(list(x))]
+    except TypeError as error:
+        raise ValueError(f"derivatives need equations that take symbols, from kkl_gym.elementary: {error}") from error
+    for value in values:
+        derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
+        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
+    return rows
+
+
+def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
+    """What :func:`jacobian` returned, at states (..., nx), as (..., rows, nx)."""
+    out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
+    for i, row in enumerate(rows):
+        for j, derivative in row.items():
+            out[..., i, j] = derivative(*np.moveaxis(x, -1, 0))
+    return out
+
+
+def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """df/dx, g and dh/dx at a state x: (nx, nx), (nx, nu) and (ny, nx)."""
+    g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
+    at = np.array(x, dtype=float)
+    return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
+
+
+def with_sensitivity(system: System, driven: bool = True) -> System:
+    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi.
+
+    Raises ValueError if it is ``driven`` through an input matrix that depends on the state.
+    """
+    nx, rows = system.nx, jacobian(system.f, system.nx)
+    nu = system.nu if driven else 0
+    if nu and type(system).g is not System.g:
+        raise ValueError(
+            f"{system.name} has an input matrix that depends on the state, which the variational equation would need"
+        )
+
+    class Sensitivity(System):
+        name = f"{system.name}-sensitivity"
+        X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
+        bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+        u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu else ()
+
+        def f(self, x: Components) -> Components:
+            state, Phi = x[:nx], x[nx:]
+            out = list(system.f(state))
+            for row in rows:
+                at = {k: derivative(*state) for k, derivative in row.items()}
+                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
+            return out
+
+        def rate(self, x: Components) -> Any:
+            return system.rate(x[:nx])
+
+    return Sensitivity()
+
+
+def output_matrix(system: System) -> np.ndarray | None:
+    """C if the output is h(x) = C x, else None."""
+    C = system.output(np.eye(system.nx)).T
+    x = np.random.default_rng(0).uniform(*system.box(), (100, system.nx))
+    return C if np.allclose(system.output(x), x @ C.T, rtol=1e-9, atol=1e-12) else None

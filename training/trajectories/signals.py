@@ -1,0 +1,36 @@
+"""Random bounded inputs that excite a system."""
+
+import numpy as np
+
+from kkl_gym.system import System
+
+KINDS = ("zero", "steps", "zero", "sine")
+DRIVEN = ("steps", "sine", "pulses")
+
+
+def random_inputs(
+    system: System, n: int, steps: int, dt: float, rng: np.random.Generator, kinds: tuple[str, ...] = KINDS
+) -> np.ndarray:
+    """Inputs held over each sampling interval, shape (steps, n, nu), each row of one of the ``kinds`` in turn.
+
+    - "zero": none (twice as often as each of the others by default);
+    - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
+    - "pulses": the same up to a time uniform within the record, and none from there on;
+    - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
+    """
+    u = np.zeros((steps, n, system.nu))
+    t = np.arange(steps) * dt
+    for row in range(n):
+        kind = kinds[row % len(kinds)]
+        for j, u_max in enumerate(system.u_max):
+            if kind in ("steps", "pulses"):
+                hold = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
+                changes = rng.random(steps) < min(1.0, dt / hold)
+                levels = rng.uniform(-u_max, u_max, steps + 1)
+                u[:, row, j] = levels[np.cumsum(changes)]
+                if kind == "pulses":
+                    u[rng.integers(steps + 1) :, row, j] = 0.0
+            elif kind == "sine":
+                amplitude, phase = rng.uniform(0, u_max), rng.uniform(0, 2 * np.pi)
+                u[:, row, j] = amplitude * np.sin(np.exp(rng.uniform(np.log(0.2), np.log(20.0))) * t + phase)
+    return u
