@@ -64,6 +64,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     def __init__(
         self,
         system: str | System,
+        *,
         dt: float = 0.01,
         process_noise: float | None = None,
         measurement_noise: float = 0.5,
@@ -72,7 +73,15 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         start_box: Box | None = None,
         render_mode: str | None = None,
     ) -> None:
-        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters, start_box)
+        self.plant = Plant(
+            system,
+            dt,
+            process_noise=process_noise,
+            measurement_noise=measurement_noise,
+            observe=observe,
+            parameters=parameters,
+            start_box=start_box,
+        )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
         self.render_mode = render_mode

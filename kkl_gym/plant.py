@@ -35,6 +35,7 @@ class Plant:
         self,
         system: str | System,
         dt: float,
+        *,
         process_noise: float | None,
         measurement_noise: float,
         observe: str,

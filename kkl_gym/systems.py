@@ -194,5 +194,5 @@ def system_of(artifact: Artifact, given: str | None) -> System:
     base = get_system(given or artifact.system)
     if base.name == artifact.system and set(artifact.parameters) == set(base.parameters):
         base = base.replace(artifact.parameters)
-    artifact.check(base.name, base.parameters, artifact.filter.dt, base.ny, base.nu)
+    artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
     return base

@@ -46,6 +46,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self,
         system: str | System,
         num_envs: int = 1,
+        *,
         dt: float = 0.01,
         process_noise: float | None = None,
         measurement_noise: float = 0.5,
@@ -58,7 +59,15 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
             if count is not None and (not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1):
                 raise ValueError(f"{name} must be a positive integer, got {count!r}")
-        self.plant = Plant(system, dt, process_noise, measurement_noise, observe, parameters, start_box)
+        self.plant = Plant(
+            system,
+            dt,
+            process_noise=process_noise,
+            measurement_noise=measurement_noise,
+            observe=observe,
+            parameters=parameters,
+            start_box=start_box,
+        )
         self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)

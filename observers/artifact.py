@@ -212,7 +212,7 @@ class Artifact:
         found = _process(self.inverse)
         return None if found is None else found[1]
 
-    def check(self, system: str, parameters: Mapping[str, float], dt: float, ny: int, nu: int) -> None:
+    def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
         """Raise ArtifactError, naming both values, unless the observer was made for this system, dt and sizes."""
 
         def differ(what: str, here: Any, there: Any) -> None:
@@ -338,6 +338,9 @@ def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMa
 
 
 def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:
+    unknown = set(described) - {"activation", "features", *_SCALARS.values()}
+    if unknown:
+        raise ArtifactError(f"its map {prefix} has settings that nobody knows: {', '.join(sorted(unknown))}")
     scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
     return InverseMap(
         mlp=_get_mlp(tensors, prefix, described["activation"]),

@@ -40,8 +40,9 @@ class KKLObserver:
         self,
         artifact: Artifact,
         measurement_noise: float = 0.5,
-        monitor: bool = False,
+        *,
         process_noise: float | None = None,
+        monitor: bool = False,
     ) -> None:
         if monitor and artifact.limits is None:
             raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
@@ -328,8 +329,9 @@ def _finite(values: np.ndarray) -> bool:
 def load(
     name_or_path: str | os.PathLike[str],
     measurement_noise: float = 0.5,
-    monitor: bool = False,
+    *,
     process_noise: float | None = None,
+    monitor: bool = False,
 ) -> KKLObserver:
     """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
 
@@ -340,7 +342,9 @@ def load(
     Raises ArtifactError (a ValueError) if there is none or the file is damaged, ValueError on a noise level out
     of range, or if it holds no limits and a monitor is asked for.
     """
-    return KKLObserver(Artifact.read(resolve(name_or_path)), measurement_noise, monitor, process_noise)
+    return KKLObserver(
+        Artifact.read(resolve(name_or_path)), measurement_noise, process_noise=process_noise, monitor=monitor
+    )
 
 
 __all__ = ["ArtifactError", "KKLObserver", "load"]

@@ -29,11 +29,20 @@ class ExtendedKalmanFilter:
     dt : sampling interval in seconds.
     Q : intensity of the process noise, (nx, nx), per second.
     R : covariance of the measurement noise, (ny, ny).
-    x0, P0 : mean (nx,) and covariance (nx, nx) of the start.
+    start : its mean (nx,) and covariance (nx, nx); None is a start uniform in X.
     """
 
-    def __init__(self, system: System, dt: float, Q: np.ndarray, R: np.ndarray, x0: np.ndarray, P0: np.ndarray) -> None:
-        self._system, self._dt, self._Q, self._R, self._start = system, dt, Q, R, (x0, P0)
+    def __init__(
+        self,
+        system: System,
+        dt: float,
+        *,
+        Q: np.ndarray,
+        R: np.ndarray,
+        start: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        self._system, self._dt, self._Q, self._R = system, dt, Q, R
+        self._start = start or unknown_start(system)
         self._joint = with_sensitivity(system)
         self._outputs = jacobian(system.h, system.nx)
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
@@ -90,8 +99,17 @@ class ExtendedKalmanFilter:
 class UnscentedFilters:
     """filterpy's filter for each row of a batch; one that loses positive definiteness or its bounds starts anew."""
 
-    def __init__(self, system: System, dt: float, Q: np.ndarray, R: np.ndarray, x0: np.ndarray, P0: np.ndarray) -> None:
-        self._system, self._dt, self._Q, self._R, self._start = system, dt, Q, R, (x0, P0)
+    def __init__(
+        self,
+        system: System,
+        dt: float,
+        *,
+        Q: np.ndarray,
+        R: np.ndarray,
+        start: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
+        self._system, self._dt, self._Q, self._R = system, dt, Q, R
+        self._start = start or unknown_start(system)
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
 
     def reset(self, y0: np.ndarray) -> np.ndarray:

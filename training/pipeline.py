@@ -171,22 +171,39 @@ class _Run:
         x, z = trajectories.x.reshape(-1, system.nx), trajectories.z.reshape(-1, linear.size)
         if config.random_features:
             report = self._bar(f"solving for T with {config.random_features} features", 1)
-            forward = solve_forward(system, linear, config.random_features, config.box_factor, self.rng)
+            forward = solve_forward(
+                system, linear, features=config.random_features, box_factor=config.box_factor, rng=self.rng
+            )
             report(1)
             some = np.random.default_rng(0).permutation(len(x))[:100_000]
             T, error = on_torch(forward, device), z[some] - forward(x[some])
             points = collocation(system, INVERTED, config.box_factor, self.rng)
-            return forward, ForwardMapSampler(T, error, system.box(), config.batch, device, points)
-        network = Network(system.nx, linear.size, config.width, config.depth, config.activation)
-        problem = ForwardProblem(network, system, linear, x, z, config.physics_weight, config.batch, device)
+            return forward, ForwardMapSampler(
+                T, error, box=system.box(), batch=config.batch, device=device, points=points
+            )
+        network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
+        problem = ForwardProblem(
+            network,
+            system,
+            linear=linear,
+            x=x,
+            z=z,
+            physics_weight=config.physics_weight,
+            batch=config.batch,
+            device=device,
+        )
         self.minimise("forward", problem, config.forward_steps)
-        return problem.forward_map(), ForwardMapSampler(problem.T, problem.error(), system.box(), config.batch, device)
+        return problem.forward_map(), ForwardMapSampler(
+            problem.T, problem.error(), box=system.box(), batch=config.batch, device=device
+        )
 
     def fit_inverse(self, stage: str, sampler: Sampler) -> Network:
         """A network that gives x on the sampler's batches."""
         config = self.config
         inputs = sampler(torch.Generator(self.device).manual_seed(0))[0].shape[1]
-        network = Network(inputs, self.system.nx, config.width, config.depth, config.activation).to(self.device)
+        network = Network(
+            inputs, self.system.nx, width=config.width, depth=config.depth, activation=config.activation
+        ).to(self.device)
         self.minimise(stage, InverseProblem(network, sampler, self.device), config.inverse_steps)
         return network
 
@@ -207,7 +224,7 @@ class _Run:
             process_noise_share=config.process_noise_share,
             report=self._bar("closing the loop", config.closed_loop_trajectories),
         )
-        return ClosedLoopSampler(sampler, driven, config.dt, self.device)
+        return ClosedLoopSampler(sampler, driven, dt=config.dt, device=self.device)
 
     def minimise(self, name: str, problem: Any, steps: int) -> None:
         """Train a stage's network within its share of the CPU time."""

@@ -53,6 +53,7 @@ class KKLEstimator:
         self,
         plant: Plant,
         observer: str | os.PathLike[str] | None,
+        *,
         estimate: str,
         measurement_noise: float | None,
         ignore_input: bool,
@@ -66,11 +67,11 @@ class KKLEstimator:
         self.observer: KKLObserver = load(
             system.name if observer is None else observer,
             plant.measurement_noise if measurement_noise is None else measurement_noise,
-            monitor,
-            plant.process_noise,
+            process_noise=plant.process_noise,
+            monitor=monitor,
         )
         self._monitor = monitor
-        self.observer.artifact.check(system.name, system.parameters, plant.dt, system.ny, system.nu)
+        self.observer.artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self._ignore_input = ignore_input

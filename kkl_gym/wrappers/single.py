@@ -42,6 +42,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self,
         env: gym.Env[np.ndarray, np.ndarray],
         observer: str | os.PathLike[str] | None = None,
+        *,
         estimate: Literal["x", "z"] = "x",
         measurement_noise: float | None = None,
         ignore_input: bool = False,
@@ -60,7 +61,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         base = env.unwrapped
         if not isinstance(base, KKLEnv):
             raise ValueError(f"KKLObservation needs a kkl_gym environment, got {base}")
-        self._estimator = KKLEstimator(base.plant, observer, estimate, measurement_noise, ignore_input, monitor)
+        self._estimator = KKLEstimator(
+            base.plant,
+            observer,
+            estimate=estimate,
+            measurement_noise=measurement_noise,
+            ignore_input=ignore_input,
+            monitor=monitor,
+        )
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._monitor = monitor

@@ -146,12 +146,20 @@ class KKLVectorObservation(VectorEstimate):
         self,
         env: VectorEnv,
         observer: str | os.PathLike[str] | None = None,
+        *,
         estimate: Literal["x", "z"] = "x",
         measurement_noise: float | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
     ) -> None:
-        estimator = KKLEstimator(plant_of(env), observer, estimate, measurement_noise, ignore_input, monitor)
+        estimator = KKLEstimator(
+            plant_of(env),
+            observer,
+            estimate=estimate,
+            measurement_noise=measurement_noise,
+            ignore_input=ignore_input,
+            monitor=monitor,
+        )
         if estimator.observer.artifact.process_noise_max is not None:
             plant_of(env, "process_noise")
         super().__init__(env, estimator)

@@ -111,11 +111,11 @@ def _run(case: Case) -> None:
     policy: Policy
     if case.knows in ("recurrent", "recurrent-state"):
         of: Literal["y", "state"] = "y" if case.knows == "recurrent" else "state"
-        policy = learn_recurrent(task, of, case.folder, case.seed, case.timesteps)()
+        policy = learn_recurrent(task, of, case.folder, seed=case.seed, timesteps=case.timesteps)()
         env = make(task, of, case.episodes, "Disabled", with_action=True)
     else:
         information: Any = case.knows
-        policy = agent = learn(task, information, case.folder, case.seed, case.timesteps)
+        policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
         env = agent.make(case.episodes)
     seconds = time.process_time() - began
     x = play(env, policy, task.steps, AGENT_EVALUATION_SEED).x

@@ -15,7 +15,7 @@ from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load
 from training.agents.tasks import deviation
-from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter, unknown_start
+from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter
 from training.systems import ControlTask, profile
 from training.trajectories.derivatives import linearised
 
@@ -45,6 +45,7 @@ class Features(VectorWrapper):
         self,
         env: VectorEnv,
         keys: Sequence[str],
+        *,
         feature: Feature,
         width: int,
         stacked: int = 1,
@@ -111,7 +112,7 @@ class KalmanFilters:
         system = plant.system
         Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2)
         R = max(plant.measurement_noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
-        self._filters = ExtendedKalmanFilter(system, plant.dt, Q, R, *unknown_start(system))
+        self._filters = ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R)
         self.space = plant.state_space
         self.reset, self.restart, self.advance = self._filters.reset, self._filters.restart, self._filters.advance
 
@@ -153,21 +154,28 @@ def make(
 
     if information == "state":
         env = task.make(num_envs, None, autoreset_mode)
-        return Features(env, ["x"], of("x"), system.nx, with_action=with_action)
+        return Features(env, ["x"], feature=of("x"), width=system.nx, with_action=with_action)
     if information in ("y", "stacked"):
         stacked = STACKED if information == "stacked" else 1
         env = task.make(num_envs, None, autoreset_mode)
-        return Features(env, ["y"], output_deviation(system), system.ny, stacked, with_action or stacked > 1)
+        return Features(
+            env,
+            ["y"],
+            feature=output_deviation(system),
+            width=system.ny,
+            stacked=stacked,
+            with_action=with_action or stacked > 1,
+        )
     if information == "ekf":
         env = task.make(num_envs, lambda env: VectorEstimate(env, KalmanFilters(env)), autoreset_mode)
-        return Features(env, ["x_hat"], of("x_hat"), system.nx)
+        return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
     observer = observer or observer_of(system)
     if information == "x_hat":
         env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
-        return Features(env, ["x_hat"], of("x_hat"), system.nx)
+        return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
     env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, estimate="z"), autoreset_mode)
     feature, width = modes(load(observer, task.measurement_noise), system)
-    return Features(env, ["z", "sample"], feature, width)
+    return Features(env, ["z", "sample"], feature=feature, width=width)
 
 
 def observer_of(system: System) -> str:

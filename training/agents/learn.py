@@ -36,6 +36,7 @@ def learn(
     task: ControlTask,
     information: Information,
     folder: Path,
+    *,
     seed: int = 0,
     timesteps: int | None = None,
     observer: str | None = None,
@@ -60,7 +61,17 @@ def learn(
     named = versioned(observer or observer_of(get_system(task.system))) if information in ("x_hat", "z") else None
     env = make(task, information, settings["n_envs"], observer=named)
     timesteps = settings["n_timesteps"] if timesteps is None else timesteps
-    model = _fit(name, settings, env, task, timesteps, seed, folder, progress, f"{task.system} {information}")
+    model = _fit(
+        name,
+        settings,
+        env=env,
+        task=task,
+        timesteps=timesteps,
+        seed=seed,
+        folder=folder,
+        progress=progress,
+        description=f"{task.system} {information}",
+    )
     agent = Agent(
         network=_policy(model),
         squashed=name == "sac",
@@ -79,6 +90,7 @@ def learn_recurrent(
     task: ControlTask,
     of: Literal["y", "state"],
     folder: Path,
+    *,
     seed: int = 0,
     timesteps: int | None = None,
     progress: Progress | None = None,
@@ -90,7 +102,17 @@ def learn_recurrent(
     name, settings = hyperparameters(task, "ppo_lstm")
     env = make(task, of, settings["n_envs"], with_action=True)
     timesteps = settings["n_timesteps"] if timesteps is None else timesteps
-    model = _fit(name, settings, env, task, timesteps, seed, folder, progress, f"{task.system} recurrent {of}")
+    model = _fit(
+        name,
+        settings,
+        env=env,
+        task=task,
+        timesteps=timesteps,
+        seed=seed,
+        folder=folder,
+        progress=progress,
+        description=f"{task.system} recurrent {of}",
+    )
 
     def policy() -> Policy:
         memory: dict[str, Any] = {"state": None, "episode_start": None}
@@ -111,6 +133,7 @@ def learn_recurrent(
 def _fit(
     algorithm: str,
     settings: dict[str, Any],
+    *,
     env: Features,
     task: ControlTask,
     timesteps: int,

@@ -126,7 +126,7 @@ def _run(job: Job) -> None:
         "trajectories": min(job.protocol.trajectories, method.trajectories or job.protocol.trajectories),
     }
     write(job.folder / "info.json", json.dumps(info, indent=2) + "\n")
-    errors = measure(method, trained, system, job.budget.dt, job.protocol)
+    errors = measure(method, trained, system, dt=job.budget.dt, protocol=job.protocol)
     errors.insert(0, "system", system.name)
     errors.insert(1, "method", method.name)
     write(job.folder / "errors.csv", errors.to_csv(index=False, float_format="%.4g"))
@@ -147,7 +147,7 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
             budget = replace(job.budget, seconds=job.search)
             try:
                 trained, _ = _train(job, method, configuration, budget, f"configuration-{i}")
-                score = validate(method, trained, system, job.budget.dt, job.validation)
+                score = validate(method, trained, system, dt=job.budget.dt, protocol=job.validation)
             except FloatingPointError:  # a training that blows up is no candidate
                 score = FAILED
             write(path, json.dumps({"configuration": dict(configuration), "score": score}) + "\n")

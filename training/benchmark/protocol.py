@@ -44,7 +44,9 @@ def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
     return out
 
 
-def noisy_output(system: System, runs: UnseenTrajectories, noise: float, n: int, seed: tuple[int, ...]) -> np.ndarray:
+def with_shared_noise(
+    system: System, runs: UnseenTrajectories, *, noise: float, n: int, seed: tuple[int, ...]
+) -> np.ndarray:
     """Outputs with noise on every sample, (steps + 1, trajectories, ny).
 
     The noise is drawn for ``n`` trajectories, of which ``runs`` may be the first few: it is the same for every method.
@@ -54,7 +56,7 @@ def noisy_output(system: System, runs: UnseenTrajectories, noise: float, n: int,
     return y
 
 
-def measure(method: Method[Any], trained: Any, system: System, dt: float, protocol: Protocol) -> pd.DataFrame:
+def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
     """One row for each test trajectory, noise level and domain.
 
     Columns: starts, noise, trajectory, escaped, smape (all steps), smape_late, component_late, rmse_late (after the
@@ -65,10 +67,12 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
     frames = []
     for i, domain in enumerate(protocol.domains):
         seed = (Stream.EVALUATION, protocol.seed, 1, i)
-        runs = unseen_trajectories(system, dt, protocol.trajectories, protocol.duration, protocol.seed, domain).first(n)
+        runs = unseen_trajectories(
+            system, dt, n=protocol.trajectories, duration=protocol.duration, seed=protocol.seed, domain=domain
+        ).first(n)
         skip = round(TRANSIENT * len(runs.x))
         for noise in protocol.noise:
-            y = noisy_output(system, runs, noise, protocol.trajectories, seed)
+            y = with_shared_noise(system, runs, noise=noise, n=protocol.trajectories, seed=seed)
             x_hat = run(method.observer(trained, system, dt, noise), y)
             late = smape(runs.x, x_hat, skip)
             errors = pd.DataFrame(
@@ -89,14 +93,20 @@ def measure(method: Method[Any], trained: Any, system: System, dt: float, protoc
     return pd.concat(frames, ignore_index=True)
 
 
-def validate(method: Method[Any], trained: Any, system: System, dt: float, protocol: Protocol) -> float:
+def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
     """How well a configuration does on validation trajectories from X: smaller is better.
 
     The geometric mean over the noise levels that it is tuned for of the median SMAPE over all steps, in percent.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     everyone = unseen_trajectories(
-        system, dt, protocol.trajectories, protocol.duration, protocol.seed, "X", stream=Stream.VALIDATION
+        system,
+        dt,
+        n=protocol.trajectories,
+        duration=protocol.duration,
+        seed=protocol.seed,
+        domain="X",
+        stream=Stream.VALIDATION,
     )
     runs = everyone.first(n)
     if not runs.inside.any():
@@ -104,13 +114,15 @@ def validate(method: Method[Any], trained: Any, system: System, dt: float, proto
     seed = (Stream.VALIDATION, protocol.seed, 1)
     medians = []
     for noise in method.tuned_for or protocol.noise:
-        y = noisy_output(system, runs, noise, protocol.trajectories, seed)
+        y = with_shared_noise(system, runs, noise=noise, n=protocol.trajectories, seed=seed)
         x_hat = run(method.observer(trained, system, dt, noise), y)
         medians.append(np.median(smape(runs.x, x_hat)))
     return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))
 
 
-def step_time(method: Method[Any], trained: Any, system: System, dt: float, batch: int, seconds: float = 0.3) -> float:
+def step_time(
+    method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
+) -> float:
     """Microseconds of CPU time for one step of a whole batch: the least of five rounds."""
     observer = method.observer(trained, system, dt, 0.5)
     y = system.output(starts(system, "X", batch, np.random.default_rng(0)))

@@ -60,7 +60,14 @@ class Train:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as progress:
             agent = learn(
-                task, self.information, folder, self.seed, self.timesteps, self.observer, self.algorithm, progress
+                task,
+                self.information,
+                folder,
+                seed=self.seed,
+                timesteps=self.timesteps,
+                observer=self.observer,
+                algorithm=self.algorithm,
+                progress=progress,
             )
         show(console, agent, 100)
         console.print(f"wrote agent.safetensors and progress.csv in {folder}")

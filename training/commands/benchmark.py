@@ -138,7 +138,8 @@ class Benchmark:
             trained = method.load(job.folder / "trained.safetensors")
             try:
                 times = {
-                    f"us_batch_{batch}": step_time(method, trained, system, job.budget.dt, batch) for batch in (1, 1000)
+                    f"us_batch_{batch}": step_time(method, trained, system=system, dt=job.budget.dt, batch=batch)
+                    for batch in (1, 1000)
                 }
             except Exception as error:  # as in a job: whatever a method does wrong, the others go on
                 failures.append(f"{job.name}, timing: {error}")

@@ -68,22 +68,21 @@ class Certify:
             name = Path(given).stem if given.endswith(".safetensors") else given
             with console.status(f"certifying {name}"):
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
-                recording = (self.measurement_noise, process_noise, self.trajectories, self.seed)
-                motion = record_settled(artifact, system, *recording)
+                levels = (self.measurement_noise, process_noise)
+                motion = record_settled(artifact, system, levels, trajectories=self.trajectories, seed=self.seed)
                 certificate = certify(
                     artifact,
                     system,
-                    self.measurement_noise,
-                    process_noise,
-                    self.psi,
-                    self.trajectories,
-                    self.delta,
-                    self.seed,
-                    name,
-                    motion,
+                    measurement_noise=self.measurement_noise,
+                    process_noise=process_noise,
+                    psi=self.psi,
+                    trajectories=self.trajectories,
+                    delta=self.delta,
+                    seed=self.seed,
+                    name=name,
+                    motion=motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                levels = (self.measurement_noise, process_noise)
                 draw(self.out / f"{name}.png", artifact, system, levels, name, motion)
             found.append(certificate)
         console.print(table(found))

@@ -73,16 +73,21 @@ class Evaluate:
                 runs = unseen_trajectories(
                     system,
                     artifact.filter.dt,
-                    self.trajectories,
-                    self.duration,
-                    self.seed,
-                    domain,
-                    driven,
+                    n=self.trajectories,
+                    duration=self.duration,
+                    seed=self.seed,
+                    domain=domain,
+                    driven=driven,
                     process_noise=self.process_noise,
                 )
                 for level in self.noise:
                     found = errors(
-                        artifact, system, runs, level, self.seed, skip=min(5.0, self.duration / 2) if driven else None
+                        artifact,
+                        system,
+                        runs,
+                        measurement_noise=level,
+                        seed=self.seed,
+                        skip=min(5.0, self.duration / 2) if driven else None,
                     )
                     table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
                     lines += [

@@ -13,7 +13,7 @@ from kkl_gym import SYSTEMS, get_system
 from observers import Artifact
 from observers.artifact import resolve
 from observers.storage import write
-from training.evaluation.faults import FAULTS, play
+from training.evaluation.faults import FAULTS, simulate_faults
 from training.systems import PROFILES
 
 
@@ -50,7 +50,14 @@ class Faults:
             with console.status(f"breaking the sensor of {name}"):
                 artifact = Artifact.read(resolve(name))
                 frames.append(
-                    play(artifact, get_system(name), self.runs, self.duration, self.measurement_noise, self.seed)
+                    simulate_faults(
+                        artifact,
+                        get_system(name),
+                        runs=self.runs,
+                        duration=self.duration,
+                        measurement_noise=self.measurement_noise,
+                        seed=self.seed,
+                    )
                 )
         found = pd.concat(frames, ignore_index=True)
         write(self.out / "faults.csv", found.to_csv(index=False, float_format="%.6g"))

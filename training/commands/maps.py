@@ -7,6 +7,7 @@ from rich.table import Table
 
 from observers import Artifact, shipped
 from observers.artifact import resolve
+from training.config import current_names
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class Maps:
             artifact = Artifact.read(path)
             table.add_row(
                 name,
-                str(artifact.training.get("method")),
+                str(current_names(artifact.training).get("pipeline")),
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
                 f"{artifact.inverse.measurement_noise_max:g}"

@@ -112,7 +112,14 @@ class Tune:
         assert self.check is not None
         torch.set_num_threads(1)
         measured = [
-            trained_error(system, choice.spectrum, self.measurement_noise, self.check, self.dt, self.duration)
+            trained_error(
+                system,
+                choice.spectrum,
+                measurement_noise=self.measurement_noise,
+                seconds=self.check,
+                dt=self.dt,
+                duration=self.duration,
+            )
             for choice in track(choices, f"training observers of {system.name}", console=console)
         ]
         predicted = [choice.error for choice in choices]

@@ -24,6 +24,7 @@ MARGIN = 1.05  # on limits found among finitely many runs
 def calibrate(
     artifact: Artifact,
     system: System,
+    *,
     trajectories: int | None = None,
     duration: float = 50.0,
     false_alarms: float = 0.01,
@@ -49,7 +50,7 @@ def calibrate(
     ValueError : if the output is not linear, a number makes no sense, or the runs are too few to tell such rare events;
         :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
-    artifact.check(system.name, system.parameters, artifact.filter.dt, system.ny, system.nu)
+    artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     if artifact.C is None:
         raise ValueError(f"the output of {system.name!r} is not linear: there is no C x_hat to compare it with")
     if not 0 < false_alarms < 1 or duration <= WARM_UP or seed < 0:
@@ -61,10 +62,10 @@ def calibrate(
     if trajectories is not None and trajectories < least:
         raise ValueError(f"{trajectories} runs are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
-    x, u = sound_trajectories(artifact, system, trajectories or least, duration, rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng)
     largest = artifact.inverse.measurement_noise_max
     levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
-    rows = [_limits(artifact, system, x, u, level, share, rng) for level in levels]
+    rows = [_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng) for level in levels]
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
         artifact, limits=Limits(levels, mean, low, high, WINDOW, WARM_UP, false_alarms, duration)
@@ -72,7 +73,7 @@ def calibrate(
 
 
 def sound_trajectories(
-    artifact: Artifact, system: System, n: int, duration: float, rng: np.random.Generator
+    artifact: Artifact, system: System, *, n: int, duration: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """States (steps + 1, n, nx) and inputs (steps, n, nu) of runs; those that leave the bounds are drawn anew.
 
@@ -98,6 +99,7 @@ def sound_trajectories(
 def _limits(
     artifact: Artifact,
     system: System,
+    *,
     x: np.ndarray,
     u: np.ndarray,
     level: float,

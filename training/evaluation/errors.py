@@ -76,6 +76,7 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
 def unseen_trajectories(
     system: System,
     dt: float,
+    *,
     n: int,
     duration: float,
     seed: int,
@@ -112,6 +113,7 @@ def errors(
     artifact: Artifact,
     system: System,
     runs: UnseenTrajectories,
+    *,
     measurement_noise: float,
     seed: int,
     skip: float | None = None,

@@ -25,8 +25,8 @@ def deadline(system: System, duration: float) -> float:
     return profile(system).fault_deadline or duration / 5
 
 
-def play(
-    artifact: Artifact, system: System, runs: int, duration: float, measurement_noise: float, seed: int
+def simulate_faults(
+    artifact: Artifact, system: System, *, runs: int, duration: float, measurement_noise: float, seed: int
 ) -> pd.DataFrame:
     """One row for each run and fault: amplitude, the highest score, and the delay until it exceeded 1.
 
@@ -35,7 +35,7 @@ def play(
     largest sound |y| after the middle of the run.
     """
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    x, u = sound_trajectories(artifact, system, runs, duration, rng)
+    x, u = sound_trajectories(artifact, system, n=runs, duration=duration, rng=rng)
     clean = system.output(x)
     y = clean + measurement_noise * rng.standard_normal(clean.shape)
     undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]

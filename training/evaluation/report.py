@@ -7,6 +7,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.maps.smooth import residual
 from training.pipeline import Result
@@ -27,13 +28,13 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
 
     artifact = result.artifact
     seconds = min(20.0, artifact.training["duration"])
-    runs = unseen_trajectories(system, artifact.filter.dt, 20, seconds, seed)
+    runs = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
     figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
     for name, history in result.losses.items():
         losses.semilogy(*np.array(history).T, label=name)
-    losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {artifact.training['method']}")
+    losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {current_names(artifact.training)['pipeline']}")
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
     if artifact.forward is None:
@@ -67,7 +68,7 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, runs: UnseenTraj
         ax.set_title("every trajectory left the declared bounds")
         return
     levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
-    medians = [np.median(errors(artifact, system, runs, level, seed).late) for level in levels]
+    medians = [np.median(errors(artifact, system, runs, measurement_noise=level, seed=seed).late) for level in levels]
     ax.plot(range(len(levels)), medians, "o-")
     ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")

@@ -45,6 +45,7 @@ class ForwardProblem(nn.Module):
         self,
         network: Network,
         system: System,
+        *,
         linear: LinearFilter,
         x: np.ndarray,
         z: np.ndarray,

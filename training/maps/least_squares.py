@@ -13,7 +13,7 @@ RIDGE = 1e-5
 
 
 def solve_forward(
-    system: System, linear: LinearFilter, features: int, box_factor: float, rng: np.random.Generator
+    system: System, linear: LinearFilter, *, features: int, box_factor: float, rng: np.random.Generator
 ) -> ForwardMap:
     """T with random features and an output layer that solves the PDE in the mean square.
 

@@ -15,7 +15,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 class Network(nn.Sequential):
     """A multilayer perceptron of ``depth`` hidden layers of ``width``."""
 
-    def __init__(self, inputs: int, outputs: int, width: int, depth: int, activation: str) -> None:
+    def __init__(self, inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
         layers: list[nn.Module] = []
         for before, after in itertools.pairwise(widths):

@@ -165,7 +165,7 @@ class TrajectorySampler:
 class ClosedLoopSampler:
     """Batches half from open-loop trajectories, half from closed-loop ones, with the noise that these already hold."""
 
-    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, dt: float, device: torch.device) -> None:
+    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
         self.open_loop = open_loop
         coordinates, gain = open_loop.coordinates, open_loop.coordinates.noise_gain
         shrink = 1.0 + (data.measurement_noise[:, None] * gain) ** 2
@@ -232,6 +232,7 @@ class ForwardMapSampler:
         self,
         forward: Callable[[torch.Tensor], torch.Tensor],
         error: np.ndarray,
+        *,
         box: tuple[np.ndarray, np.ndarray],
         batch: int,
         device: torch.device,

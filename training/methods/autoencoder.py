@@ -103,9 +103,9 @@ class _Problem(nn.Module):
         states = data.x.reshape(-1, system.nx)
         lowest, highest = np.minimum(low, states.min(0)), np.maximum(high, states.max(0))
         self.x_offset, self.x_scale = (lowest + highest) / 2, (highest - lowest) / 2
-        size = (len(self.D), budget.width, budget.depth, budget.activation)
-        self.encoder = Network(system.nx + 1, *size).to(device)
-        self.decoder = Network(len(self.D) + 1, system.nx, *size[1:]).to(device)
+        size: dict[str, Any] = {"width": budget.width, "depth": budget.depth, "activation": budget.activation}
+        self.encoder = Network(system.nx + 1, len(self.D), **size).to(device)
+        self.decoder = Network(len(self.D) + 1, system.nx, **size).to(device)
         middle = float(np.sqrt(slowest * fastest))
         y = data.y[:, :200].astype(float)
         linear = LinearFilter(middle * self.D, middle * self.F, budget.dt)

@@ -79,7 +79,7 @@ class Data:
 
 
 @lru_cache(maxsize=1)
-def simulated(system: System, n: int, duration: float, samples: int, dt: float, seed: int) -> Data:
+def simulated(system: System, n: int, *, duration: float, samples: int, dt: float, seed: int) -> Data:
     """The training data of a system; the same for every method."""
     rng = generator(Stream.TRAINING, seed)
     steps = max(1, round(duration / dt))
@@ -105,7 +105,14 @@ class Task:
     def data(self) -> Data:
         """Training trajectories, simulated when first asked for."""
         budget = self.budget
-        return simulated(self.system, budget.trajectories, budget.duration, budget.samples, budget.dt, self.seed)
+        return simulated(
+            self.system,
+            budget.trajectories,
+            duration=budget.duration,
+            samples=budget.samples,
+            dt=budget.dt,
+            seed=self.seed,
+        )
 
     @property
     def rng(self) -> np.random.Generator:

@@ -50,9 +50,11 @@ class DMF(Method[Arrays]):
         linear = Spectrum(spectrum(system, fastest, slowest)).filter(system.ny, budget.dt)
 
         def stage(inputs: int) -> _Stage:
-            network = Network(linear.size, system.nx, budget.width, budget.depth, budget.activation)
+            network = Network(
+                linear.size, system.nx, width=budget.width, depth=budget.depth, activation=budget.activation
+            )
             decoder = Decoder(network, linear, task.data, task.device)
-            start = Network(inputs, linear.size, budget.width, 2, budget.activation)
+            start = Network(inputs, linear.size, width=budget.width, depth=2, activation=budget.activation)
             return _Stage(decoder, start, linear, task.device)
 
         transient, asymptotic = stage(system.ny), stage(system.nx)

@@ -34,7 +34,7 @@ class EKF(Method[Arrays]):
         """The filter, told the noise level."""
         Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
         R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
-        return ExtendedKalmanFilter(self.model(system), dt, Q, R, *unknown_start(system))
+        return ExtendedKalmanFilter(self.model(system), dt, Q=Q, R=R)
 
     def model(self, system: System) -> System:
         """The equations that the filter believes in."""
@@ -72,7 +72,7 @@ class UntunedEKF(EKF):
         """The filter."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
-        return ExtendedKalmanFilter(system, dt, eye / dt, np.eye(system.ny), x0, eye)
+        return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))
 
 
 class UKF(EKF):
@@ -86,7 +86,7 @@ class UKF(EKF):
         """One filter for each trajectory."""
         Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
         R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
-        return UnscentedFilters(system, dt, Q, R, *unknown_start(system))
+        return UnscentedFilters(system, dt, Q=Q, R=R)
 
 
 def faster(system: System, factor: float) -> System:

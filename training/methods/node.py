@@ -39,7 +39,7 @@ class NODE(KKLMethod):
         system, budget = task.system, task.budget
         fastest, slowest = configuration["spectrum"]
         linear = Spectrum(spectrum(system, fastest, slowest)).filter(system.ny, budget.dt)
-        network = Network(linear.size, system.nx, budget.width, budget.depth, budget.activation)
+        network = Network(linear.size, system.nx, width=budget.width, depth=budget.depth, activation=budget.activation)
         decoder = Decoder(network, linear, task.data, task.device)
         problem = _Problem(decoder, -linear.A.diagonal()[: linear.size // system.ny], system.ny, budget.dt, task.device)
         batches = Batches(task.data, decoder, self.noise, task.device)

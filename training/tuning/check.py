@@ -35,7 +35,7 @@ def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
 
 
 def trained_error(
-    system: System, spectrum: Spectrum, measurement_noise: float, seconds: float, dt: float, duration: float
+    system: System, spectrum: Spectrum, *, measurement_noise: float, seconds: float, dt: float, duration: float
 ) -> float:
     """Median SMAPE in percent, over all steps, of an observer of free motion trained for so many CPU seconds."""
     config = replace(
@@ -50,8 +50,8 @@ def trained_error(
     )
     with TemporaryDirectory() as folder:
         artifact = train(system, config, Path(folder), device=torch.device("cpu")).artifact
-    runs = unseen_trajectories(system, dt, RUNS, duration, 0, stream=Stream.VALIDATION)
-    return float(np.median(errors(artifact, system, runs, measurement_noise, 0).full))
+    runs = unseen_trajectories(system, dt, n=RUNS, duration=duration, seed=0, stream=Stream.VALIDATION)
+    return float(np.median(errors(artifact, system, runs, measurement_noise=measurement_noise, seed=0).full))
 
 
 def rank_correlation(predicted: Sequence[float], measured: Sequence[float]) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from training.config import current_names
 from training.evaluation.certificates.gains import h2, h_infinity, theorem_gain
 from training.evaluation.certificates.generalisation import generalisation_term, pseudo_dimension_bound
 from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product
@@ -142,6 +143,7 @@ class SettledTrajectories:
 def certify(
     artifact: Artifact,
     system: System,
+    *,
     measurement_noise: float = 0.5,
     process_noise: float | None = None,
     psi: float | None = None,
@@ -174,7 +176,7 @@ def certify(
         leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another
         system.
     """
-    artifact.check(system.name, system.parameters, artifact.filter.dt, system.ny, system.nu)
+    artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     process_noise = system.process_noise if process_noise is None else process_noise
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:
@@ -186,7 +188,7 @@ def certify(
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
     levels = (measurement_noise, process_noise)
     if motion is None:
-        motion = record_settled(artifact, system, *levels, trajectories, seed)
+        motion = record_settled(artifact, system, levels, trajectories=trajectories, seed=seed)
     measured, sample = motion.halves()
     told, quiet = decoder(artifact, *levels), decoder(artifact, 0.0)
     lower, at = lipschitz_lower(told, motion.z)
@@ -203,7 +205,7 @@ def certify(
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
     seen = _training_samples(artifact)
     return Certificate(
-        observer=name or f"{artifact.system} ({artifact.training.get('method', 'unknown')})",
+        observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
         system=system.name,
         measurement_noise=measurement_noise,
         noise_bound=noise_bound,
@@ -232,15 +234,18 @@ def certify(
 def record_settled(
     artifact: Artifact,
     system: System,
-    measurement_noise: float,
-    process_noise: float,
+    levels: tuple[float, float],
+    *,
     trajectories: int,
     seed: int,
 ) -> SettledTrajectories:
-    """Motions from starts uniform in X, from where the filter has forgotten its start.
+    """Trajectories from starts uniform in X, from where the filter has forgotten its start.
 
-    The parameters are those of :func:`certify`. Raises ValueError if more than half of them leave the system's bounds.
+    ``levels`` are of measurement noise and process noise; the other parameters are those of :func:`certify`.
+
+    Raises ValueError if more than half of them leave the system's bounds.
     """
+    measurement_noise, process_noise = levels
     rng = generator(Stream.CERTIFICATE, seed)
     linear = artifact.filter
     dt = linear.dt

@@ -157,7 +157,7 @@ def test_maps_that_are_told_of_process_noise_have_a_format_of_their_own(tmp_path
     with safe_open(path, framework="numpy") as opened:
         text = opened.metadata()["kkl-gym"]
     assert json.loads(text)["format"] == number
-    assert ("process_noise_max" in text) == process
+    assert ("process_max" in text) == process
     assert Artifact.read(path).process_noise_max == (0.2 if process else None)
 
 

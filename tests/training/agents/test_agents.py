@@ -135,9 +135,9 @@ def test_training_never_sees_the_episodes_of_the_evaluation(algorithm, tmp_path,
     task = TASKS["reverse_duffing"]
     for seed in (0, 1):
         if algorithm == "ppo_lstm":
-            learn_recurrent(task, "y", tmp_path / str(seed), seed, 1)
+            learn_recurrent(task, "y", tmp_path / str(seed), seed=seed, timesteps=1)
         else:
-            learn(task, "y", tmp_path / str(seed), seed, 1, algorithm=algorithm)
+            learn(task, "y", tmp_path / str(seed), seed=seed, timesteps=1, algorithm=algorithm)
     first, second = seeds
     evaluation = range(AGENT_EVALUATION_SEED, AGENT_EVALUATION_SEED + 10_000)
     assert not set(first) & set(second)
@@ -225,7 +225,7 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
     own.save("own.safetensors")
     with pytest.raises(SystemExit, match=r"if you trust that, give --system some\.py:Evil"):
         main(["agent", "evaluate", "own.safetensors"])
-    with pytest.raises(SystemExit, match="no control task"):
+    with pytest.raises(SystemExit, match="unknown system"):
         main(["agent", "train", "pendulum"])
 
 

@@ -9,14 +9,14 @@ import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
-import training.benchmark.command as command
 from filelock import FileLock
 from PIL import Image
 from rich.console import Console
 
+import training.commands.benchmark as command
 from kkl_gym import get_system
 from training.benchmark.jobs import Job, run_job
-from training.benchmark.protocol import Protocol, measure, noisy_output, run, step_time, validate
+from training.benchmark.protocol import Protocol, measure, run, step_time, validate, with_shared_noise
 from training.benchmark.tables import _number, summarise
 from training.commands.benchmark import Benchmark
 from training.evaluation.errors import starts, unseen_trajectories
@@ -27,7 +27,7 @@ from training.seeds import Stream
 
 TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
-COMMITTED = Path(__file__).parents[1] / "docs" / "results" / "benchmark"
+COMMITTED = Path(__file__).parents[3] / "docs" / "results" / "benchmark"
 
 TOY = '''
 from pathlib import Path
@@ -105,11 +105,11 @@ def tiny(monkeypatch):
     monkeypatch.setattr(command, "PROTOCOL", SHORT)
     monkeypatch.setattr(command, "QUICK_PROTOCOL", SHORT)
     monkeypatch.setattr(command, "VALIDATION", SHORT)
-    monkeypatch.setattr(command, "step_time", lambda *_: 1.0)
+    monkeypatch.setattr(command, "step_time", lambda *_, **__: 1.0)
 
 
 def noise_free_share():
-    return Console(noise_free_share=True)
+    return Console(quiet=True)
 
 
 def test_metrics_by_hand():
@@ -166,9 +166,9 @@ class Oracle(Method):
 def test_measure_marks_the_lost_and_the_escaped():
     system, dt = get_system("rossler"), 0.01
     protocol = Protocol(domains=("2X",), noise=(0.0,), trajectories=100, duration=20.0)
-    runs = unseen_trajectories(system, dt, 100, 20.0, 0, "2X")
+    runs = unseen_trajectories(system, dt, n=100, duration=20.0, seed=0, domain="2X")
     assert runs.escaped > 0
-    frame = measure(Oracle(runs.x, wrong=((0, np.nan), (1, 1e6))), None, system, dt, protocol)
+    frame = measure(Oracle(runs.x, wrong=((0, np.nan), (1, 1e6))), None, system, dt=dt, protocol=protocol)
     assert len(frame) == 100
     escaped = frame[frame.escaped == 1]
     assert escaped.trajectory.tolist() == np.flatnonzero(~runs.inside).tolist()
@@ -181,15 +181,15 @@ def test_measure_marks_the_lost_and_the_escaped():
 
 def test_methods_that_are_slow_get_the_first_trajectories():
     system, dt = get_system("van_der_pol"), 0.05
-    many = unseen_trajectories(system, dt, 100, 1.0, 0, "X")
+    many = unseen_trajectories(system, dt, n=100, duration=1.0, seed=0, domain="X")
     runs = many.first(2)
     assert runs.inside.tolist() == [True, True]
     method = Oracle(runs.x)
     method.trajectories = 2
-    frame = measure(method, None, system, dt, Protocol(domains=("X",), trajectories=100, duration=1.0))
+    frame = measure(method, None, system, dt=dt, protocol=Protocol(domains=("X",), trajectories=100, duration=1.0))
     assert len(frame) == 2 * 2
     np.testing.assert_array_equal(many.x[:, :2], runs.x)
-    few, all_of_them = (noisy_output(system, one, 0.5, 100, (0,)) for one in (runs, many))
+    few, all_of_them = (with_shared_noise(system, one, noise=0.5, n=100, seed=(0,)) for one in (runs, many))
     np.testing.assert_array_equal(all_of_them[:, :2], few)
 
 
@@ -209,9 +209,9 @@ def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
             seen[-1].append(y)
             return super().step(y)
 
-    runs = unseen_trajectories(system, 0.01, 20, 2.0, 0, "X")
+    runs = unseen_trajectories(system, 0.01, n=20, duration=2.0, seed=0, domain="X")
     method = Spy(runs.x)
-    measure(method, None, system, 0.01, Protocol(domains=("X",), trajectories=20, duration=2.0))
+    measure(method, None, system, dt=0.01, protocol=Protocol(domains=("X",), trajectories=20, duration=2.0))
     quiet_y, noisy_y = (np.array(record) for record in seen)
     np.testing.assert_array_equal(quiet_y, system.output(runs.x))
     assert (noisy_y - quiet_y).std() == pytest.approx(0.5, rel=0.05)
@@ -221,14 +221,14 @@ def test_observers_see_noise_of_the_level_and_one_sample_at_a_time():
 def test_validation_trajectories_are_not_those_of_evaluation():
     system = get_system("lorenz")
     evaluation, validation = (
-        unseen_trajectories(system, 0.01, 5, 0.1, 0, stream=stream).x
+        unseen_trajectories(system, 0.01, n=5, duration=0.1, seed=0, stream=stream).x
         for stream in (Stream.EVALUATION, Stream.VALIDATION)
     )
     assert np.abs(evaluation[0] - validation[0]).min() > 1e-3
-    exact = unseen_trajectories(system, 0.01, 5, 0.1, 0, stream=Stream.VALIDATION).x
+    exact = unseen_trajectories(system, 0.01, n=5, duration=0.1, seed=0, stream=Stream.VALIDATION).x
     protocol = Protocol(noise=(0.0, 0.5), trajectories=5, duration=0.1)
-    assert validate(Oracle(exact), None, system, 0.01, protocol) == pytest.approx(1e-6)
-    double = validate(Oracle(2 * exact), None, system, 0.01, protocol)
+    assert validate(Oracle(exact), None, system, dt=0.01, protocol=protocol) == pytest.approx(1e-6)
+    double = validate(Oracle(2 * exact), None, system, dt=0.01, protocol=protocol)
     assert double == pytest.approx(100 * 2 / 3)
 
 
@@ -243,8 +243,8 @@ def test_methods_made_for_one_noise_level_are_validated_there():
             return self
 
     protocol = Protocol(noise=(0.0, 0.5), trajectories=2, duration=0.1)
-    exact = unseen_trajectories(system, 0.01, 2, 0.1, 0, stream=Stream.VALIDATION).x
-    validate(Particular(exact), None, system, 0.01, protocol)
+    exact = unseen_trajectories(system, 0.01, n=2, duration=0.1, seed=0, stream=Stream.VALIDATION).x
+    validate(Particular(exact), None, system, dt=0.01, protocol=protocol)
     assert asked == [0.25]
 
 
@@ -261,7 +261,7 @@ def test_starts_outside_x_lie_between_the_boxes(domain):
 
 def test_step_time_is_positive():
     x = np.zeros((10**6, 7, 3))
-    assert 0 < step_time(Oracle(x), None, get_system("lorenz"), 0.01, 7, seconds=0.02) < 1e5
+    assert 0 < step_time(Oracle(x), None, system=get_system("lorenz"), dt=0.01, batch=7, seconds=0.02) < 1e5
 
 
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
@@ -270,7 +270,7 @@ def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(noise_free_share())
     results = pd.read_csv(out / "results.csv")
     assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
-    expected = unseen_trajectories(get_system("lorenz"), TINY.dt, 2, 2.0, 0).x
+    expected = unseen_trajectories(get_system("lorenz"), TINY.dt, n=2, duration=2.0, seed=0).x
     info = json.loads((out / "jobs" / "lorenz" / "constant" / "info.json").read_text())
     assert info["configuration"] == {"shift": 0.0}  # the sensible one of the three won on validation
     assert info["validation"][1] == min(info["validation"])

@@ -2,7 +2,6 @@ import copy
 import json
 
 import gymnasium as gym
-import kkl_gym.estimator
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
@@ -11,6 +10,7 @@ from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
+import kkl_gym.wrappers.estimator
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
 from observers import Artifact, ArtifactError, KKLObserver
 
@@ -26,7 +26,7 @@ def actions(steps, nu=1, seed=0):
 def wrapped(saved, name, estimate="x", env=None, **options):
     kept = {key: options.pop(key) for key in ("ignore_input", "measurement_noise") if key in options}
     env = gym.make(ENV_IDS[name], **(env or {}))
-    return KKLObservation(env, saved(system=name, **options), estimate, **kept)
+    return KKLObservation(env, saved(system=name, **options), estimate=estimate, **kept)
 
 
 @everyone
@@ -108,7 +108,7 @@ def test_spec_round_trip(estimate, saved):
     env = KKLObservation(
         gym.make("KKLLorenz-v0", measurement_noise=0.2, max_episode_steps=40),
         saved(system="lorenz"),
-        estimate,
+        estimate=estimate,
         measurement_noise=0.4,
     )
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
@@ -167,7 +167,7 @@ def test_wrong_arguments(saved, tmp_path):
     with pytest.raises(ValueError, match="needs a kkl_gym environment"):
         KKLObservation(gym.make("CartPole-v1"), saved(system="lorenz"))
     with pytest.raises(ValueError, match=r"estimate must be .* 'y'"):
-        KKLObservation(KKLEnv("lorenz"), saved(system="lorenz"), "y")
+        KKLObservation(KKLEnv("lorenz"), saved(system="lorenz"), estimate="y")
     with pytest.raises(ArtifactError, match="unknown observer 'nonsense'"):
         KKLObservation(KKLEnv("lorenz"), "nonsense")
     with pytest.raises(ArtifactError, match=r"there is no file .*none\.safetensors"):
@@ -182,7 +182,7 @@ def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
         assert not monitor
         return KKLObserver(make_artifact(name), noise)
 
-    monkeypatch.setattr(kkl_gym.estimator, "load", load)
+    monkeypatch.setattr(kkl_gym.wrappers.estimator, "load", load)
     KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7, process_noise=0.02))
     assert asked == [("van_der_pol", 0.7, 0.02)]
 

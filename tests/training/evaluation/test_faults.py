@@ -9,12 +9,13 @@ import pytest
 import training.commands.faults
 import training.evaluation.calibration
 import training.evaluation.certificates.certificate
+import training.evaluation.faults
 from kkl_gym import VanDerPol
 from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
 from training.cli import main
 from training.commands.faults import report
-from training.evaluation.faults import FAULTS, play
+from training.evaluation.faults import FAULTS, simulate_faults
 from training.maps.smooth import decoder
 
 
@@ -33,7 +34,9 @@ def with_limits(name):
 def found():
     from kkl_gym import get_system
 
-    return play(with_limits("lorenz"), get_system("lorenz"), 12, 16.0, 0.5, 0)
+    return simulate_faults(
+        with_limits("lorenz"), get_system("lorenz"), runs=12, duration=16.0, measurement_noise=0.5, seed=0
+    )
 
 
 def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact, monkeypatch):
@@ -54,16 +57,16 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
 
     system = Noisy()
     monkeypatch.setattr(training.evaluation.calibration, "KKLObserver", Spy)
-    monkeypatch.setattr(training.commands.faults, "KKLObserver", Spy)
+    monkeypatch.setattr(training.evaluation.faults, "KKLObserver", Spy)
     artifact = dataclasses.replace(make_artifact(process=True, free_inverse=True), C=np.array([[1.0, 0.0]]))
     calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
     assert set(told) == {0.12}
     told.clear()
-    play(calibrated, system, 2, 12.0, 0.5, 0)
+    simulate_faults(calibrated, system, runs=2, duration=12.0, measurement_noise=0.5, seed=0)
     assert set(told) == {0.12}
     told.clear()
     monkeypatch.setattr(training.evaluation.certificates.certificate, "decoder", spy)
-    training.certify(artifact, system, 0.3, trajectories=4)
+    training.certify(artifact, system, measurement_noise=0.3, trajectories=4)
     assert set(told) == {(0.3, 0.12), (0.0, 0.0)}
     assert told.count((0.3, 0.12)) == 2  # for the errors, and for what noise will do
 

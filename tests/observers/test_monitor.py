@@ -183,7 +183,7 @@ def test_calibration_keeps_its_promise():
     assert found.low[0] == 0.0
     assert found.low[-1] < 1.0 < found.high[-1]  # about the variance of the noise
     rng = np.random.default_rng(11)
-    x, _ = sound_trajectories(calibrated, system, 600, 20.0, rng)
+    x, _ = sound_trajectories(calibrated, system, n=600, duration=20.0, rng=rng)
     for level in (0.2, 1.0):
         y = system.output(x) + level * rng.standard_normal((*x.shape[:2], 1))
         observer = KKLObserver(calibrated, level, monitor=True)
@@ -200,7 +200,7 @@ def test_faults_are_seen(fault):
     system = Noiseless()
     calibrated = calibrate(oscillator_observer(), system, duration=20.0)
     rng = np.random.default_rng(12)
-    x, _ = sound_trajectories(calibrated, system, 50, 30.0, rng)
+    x, _ = sound_trajectories(calibrated, system, n=50, duration=30.0, rng=rng)
     x = x[:, np.abs(x[0]).max(-1) > 0.5]
     level, at = 0.1, 300
     y = system.output(x) + level * rng.standard_normal((*x.shape[:2], 1))
@@ -234,13 +234,13 @@ def test_runs_that_leave_are_drawn_anew():
         bounds = ((-1.0, 1.0), (-1.0, 1.0))
 
     rng = np.random.default_rng(0)
-    x, u = sound_trajectories(oscillator_observer(), Tight(), 50, 10.0, rng)
+    x, u = sound_trajectories(oscillator_observer(), Tight(), n=50, duration=10.0, rng=rng)
     assert x.shape[1] == u.shape[1] == 50
     assert np.isfinite(x).all()
 
     Leaving.process_noise = 30.0
     with pytest.raises(ValueError, match="leave bounds"):
-        sound_trajectories(oscillator_observer(), Leaving(), 50, 10.0, rng)
+        sound_trajectories(oscillator_observer(), Leaving(), n=50, duration=10.0, rng=rng)
 
 
 def test_impossible_calibrations():
@@ -262,8 +262,8 @@ def test_wrappers_report_the_score(tmp_path, estimate):
     path = tmp_path / "a.safetensors"
     dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits()).save(path)
     rows = gym.make_vec(ENV_IDS["van_der_pol"], num_envs=2, vectorization_mode="vector_entry_point")
-    many = KKLVectorObservation(rows, str(path), estimate, monitor=True)
-    ones = [KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, estimate, monitor=True) for _ in range(2)]
+    many = KKLVectorObservation(rows, str(path), estimate=estimate, monitor=True)
+    ones = [KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, estimate=estimate, monitor=True) for _ in range(2)]
     _, info = many.reset(seed=5)
     assert (info["score"] == 0).all()
     for i, env in enumerate(ones):

@@ -199,7 +199,7 @@ def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters):
     dt, Q, R = 0.02, np.diag([0.01, 0.02]), np.array([[0.3]])
     x0, P0 = np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])
     y = np.random.default_rng(0).normal(size=(200, 3, 1))
-    found = run(filters(Oscillator(), dt, Q, R, x0, P0), y)
+    found = run(filters(Oscillator(), dt, Q=Q, R=R, start=(x0, P0)), y)
     for i in range(3):
         one = kalman(dt, Q, R, x0, P0)
         one.update(y[0, i])
@@ -218,7 +218,7 @@ def test_ekf_against_filterpy(name):
     Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
     x = simulate(system, np.array([x0 + 0.1 * np.array(system.scale)]), 100, dt)
     y = system.output(x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
-    found = run(ExtendedKalmanFilter(system, dt, Q, R, x0, P0), y)
+    found = run(ExtendedKalmanFilter(system, dt, Q=Q, R=R, start=(x0, P0)), y)
 
     def flow(state):
         return simulate(system, state, 1, dt)[1]
@@ -254,7 +254,7 @@ def test_a_filter_that_leaves_the_bounds_starts_anew():
     system = get_system("van_der_pol")
     x0, P0 = unknown_start(system)
     for filters in (ExtendedKalmanFilter, UnscentedFilters):
-        observer = filters(system, 0.01, np.eye(2), 0.01 * np.eye(1), x0, P0)
+        observer = filters(system, 0.01, Q=np.eye(2), R=0.01 * np.eye(1), start=(x0, P0))
         observer.reset(np.array([[1.0]]))
         for value in (1e9, 1e-9, 1e12, 0.5):
             x_hat = observer.step(np.array([[value]]))

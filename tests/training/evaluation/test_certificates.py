@@ -4,6 +4,7 @@ import dataclasses
 import json
 from itertools import pairwise
 
+import linear_system
 import numpy as np
 import pytest
 from conftest import random_artifact
@@ -47,7 +48,7 @@ def linear_observer(spoiled=1.0, A=A):
 
 @pytest.fixture(scope="module")
 def exact():
-    return certify(linear_observer(), Oscillator(), 0.5, process_noise=0.0, trajectories=50)
+    return certify(linear_observer(), Oscillator(), measurement_noise=0.5, process_noise=0.0, trajectories=50)
 
 
 def test_exact_maps_have_no_risk(exact):
@@ -185,15 +186,19 @@ def test_the_smooth_maps_are_the_observers(name, saved):
 
 def test_a_wrong_filter_violates_the_bound_without_noise(exact):
     """The bound is that of the maps for A; the observer then runs with another one."""
-    spoiled = certify(linear_observer(1.05), Oscillator(), 0.0, process_noise=0.0, trajectories=50)
+    spoiled = certify(linear_observer(1.05), Oscillator(), measurement_noise=0.0, process_noise=0.0, trajectories=50)
     assert 0 < spoiled.error <= spoiled.forward.bound
-    wrong = certify(linear_observer(1.05, A=1.3 * A), Oscillator(), 0.0, process_noise=0.0, trajectories=50)
+    wrong = certify(
+        linear_observer(1.05, A=1.3 * A), Oscillator(), measurement_noise=0.0, process_noise=0.0, trajectories=50
+    )
     assert wrong.error > 5 * spoiled.forward.bound
     assert wrong.forward.data_risk > 1e-3  # which a certificate of that observer says
 
 
 def test_bounds_of_the_paper_are_put_together_as_printed():
-    found = certify(linear_observer(1.1), Oscillator(), 0.2, process_noise=0.1, psi=0.7, trajectories=20)
+    found = certify(
+        linear_observer(1.1), Oscillator(), measurement_noise=0.2, process_noise=0.1, psi=0.7, trajectories=20
+    )
     forward = found.forward
     assert found.noise_bound == pytest.approx(0.6)
     assert found.process_noise == pytest.approx(0.1 * np.sqrt(2))
@@ -213,7 +218,7 @@ def test_bounds_of_the_paper_are_put_together_as_printed():
 ])  # fmt: skip
 def test_shipped_maps(name):
     system = get_system(name.removesuffix("-spinn"))
-    found = certify(Artifact.read(resolve(name)), system, 0.5, trajectories=60)
+    found = certify(Artifact.read(resolve(name)), system, measurement_noise=0.5, trajectories=60)
     assert 0.8 < found.predicted_noise_error / found.measured_noise_error < 1.25
     assert found.lipschitz_lower <= found.lipschitz_upper
     assert found.gain_h2 < found.gain_h_infinity <= found.gain_theorem
@@ -244,15 +249,15 @@ def test_psi_covers_what_noise_does_where_motions_settle():
         inverse=dataclasses.replace(base.inverse, mlp=inverse),
         forward=dataclasses.replace(base.forward, mlp=forward),
     )
-    found = certify(artifact, Damped(), 0.0, process_noise=0.05, trajectories=10)
+    found = certify(artifact, Damped(), measurement_noise=0.0, process_noise=0.05, trajectories=10)
     assert found.error < 1e-8
     assert 1e-6 < found.noisy_error < found.forward.noisy_bound
-    motion = record_settled(artifact, Damped(), 0.0, 0.05, 10, 0)
+    motion = record_settled(artifact, Damped(), (0.0, 0.05), trajectories=10, seed=0)
     assert np.linalg.norm(motion.noisy_x - motion.x, axis=1).max() <= found.psi
 
 
 def test_motions_come_in_two_halves_of_whole_motions():
-    motion = record_settled(linear_observer(), Oscillator(), 0.3, 0.1, 5, 0)
+    motion = record_settled(linear_observer(), Oscillator(), (0.3, 0.1), trajectories=5, seed=0)
     first, second = motion.halves()
     assert (first.motions, second.motions) == (2, 3)
     assert len(first.x) + len(second.x) == len(motion.x)
@@ -267,7 +272,7 @@ def test_each_bound_has_the_map_that_its_observer_uses():
     """A map that is told the noise is another one at each level."""
     artifact = random_artifact("van_der_pol", inputs=False, age=False, forward=True)
     artifact = dataclasses.replace(artifact, training={"physics_weight": 0.1})
-    found = certify(artifact, get_system("van_der_pol"), 0.7, process_noise=0.0, trajectories=4)
+    found = certify(artifact, get_system("van_der_pol"), measurement_noise=0.7, process_noise=0.0, trajectories=4)
     noise_free_share = lipschitz_upper(decoder(artifact, 0.0))
     risk = found.forward.reconstruction_risk
     assert found.forward.bound == pytest.approx(4 * risk + 4 * noise_free_share**2 * found.forward.physics_risk)
@@ -294,7 +299,7 @@ def test_bad_requests():
         with pytest.raises(ValueError, match=r"must|need"):
             certify(linear_observer(), Oscillator(), **wrong)
     with pytest.raises(ValueError, match="beyond"):
-        certify(Artifact.read(resolve("van_der_pol")), get_system("van_der_pol"), 2.0)
+        certify(Artifact.read(resolve("van_der_pol")), get_system("van_der_pol"), measurement_noise=2.0)
     with pytest.raises(ValueError, match="no forward map"):
         residual(Artifact.read(resolve("van_der_pol")), get_system("van_der_pol"), np.zeros((1, 2)))
 
@@ -305,7 +310,7 @@ def test_motions_that_leave_are_an_error():
         bounds = ((-1.01, 1.01), (-1.01, 1.01))
 
     with pytest.raises(ValueError, match="stayed within"):
-        certify(linear_observer(), Leaving(), 0.1, process_noise=5.0, trajectories=10)
+        certify(linear_observer(), Leaving(), measurement_noise=0.1, process_noise=5.0, trajectories=10)
 
 
 def test_output_of_a_nonlinear_h():
@@ -321,7 +326,7 @@ def test_output_of_a_nonlinear_h():
 
 def test_command(tmp_path, capsys):
     linear_observer(1.02).save(tmp_path / "mine.safetensors")
-    script = __file__.replace("test_certificates", "linear_system")
+    script = linear_system.__file__
     main(["certify", str(tmp_path / "mine.safetensors"), "--system", f"{script}:Oscillator", "--trajectories", "10",
           "--measurement-noise", "0.1", "--out", str(tmp_path / "out")])  # fmt: skip
     assert json.loads((tmp_path / "out" / "mine.json").read_text())["observer"] == "mine"

@@ -27,16 +27,16 @@ NAMES = sorted(SYSTEMS)
 def test_default_maps_are_as_accurate_as_promised(name):
     system, artifact = get_system(name), observers.Artifact.read(resolve(name))
     noise_free_share, noisy, driven, beyond = PROMISED[name]
-    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0)
+    runs = unseen_trajectories(system, 0.01, n=100, duration=50.0, seed=0)
     assert runs.escaped == 0
-    assert np.median(errors(artifact, system, runs, 0.0, seed=0).full) <= noise_free_share
-    assert np.median(errors(artifact, system, runs, 0.5, seed=0).full) <= noisy
-    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0, domain="1.5X")
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.0, seed=0).full) <= noise_free_share
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.5, seed=0).full) <= noisy
+    runs = unseen_trajectories(system, 0.01, n=100, duration=50.0, seed=0, domain="1.5X")
     x_hat = observers.KKLObserver(artifact, 0.0, process_noise=0.0).estimate(system.output(runs.x), runs.u)
     assert np.median(component_smape(runs.x, x_hat, skip=1000)) <= beyond
-    runs = unseen_trajectories(system, 0.01, 100, 50.0, seed=0, driven=True)
+    runs = unseen_trajectories(system, 0.01, n=100, duration=50.0, seed=0, driven=True)
     assert runs.escaped <= 5
-    assert np.median(errors(artifact, system, runs, 0.0, seed=0, skip=5.0).late) <= driven
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.0, seed=0, skip=5.0).late) <= driven
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -44,7 +44,7 @@ def test_default_maps_are_as_accurate_as_promised(name):
 def test_shipped_maps_say_what_they_are(name, suffix):
     artifact = observers.load(name + suffix).artifact
     system = get_system(name)
-    artifact.check(name, system.parameters, 0.01, system.ny, system.nu)
+    artifact.check(name, system.parameters, dt=0.01, ny=system.ny, nu=system.nu)
     assert artifact.nx == system.nx
     assert artifact.nu == (0 if suffix else system.nu)
     assert (artifact.forward is not None) == bool(suffix)
@@ -74,7 +74,7 @@ def test_spinn_maps_recover_states_from_their_own_forward_map(name):
 @pytest.mark.parametrize(("name", "seconds", "error"), [("van_der_pol", 1.0, 0.02), ("lorenz", 0.3, 0.02)])
 def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
     system, observer = get_system(name), observers.load(name, 0.0, process_noise=0.0)
-    runs = unseen_trajectories(system, 0.01, 20, 15.0, seed=0)
+    runs = unseen_trajectories(system, 0.01, n=20, duration=15.0, seed=0)
     y = system.output(runs.x)
     lost = round(seconds / 0.01)
     x_hat = observer.reset(y[0])
@@ -99,11 +99,11 @@ def test_every_map_can_be_monitored(name):
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
 def test_maps_fitted_in_closed_loop(name):
-    system, runs = get_system(name), unseen_trajectories(get_system(name), 0.01, 100, 50.0, seed=0)
+    system, runs = get_system(name), unseen_trajectories(get_system(name), 0.01, n=100, duration=50.0, seed=0)
     fitted = observers.Artifact.read(resolve(f"{name}-closed-loop"))
     assert fitted.training["closed_loop"] == 2000
-    assert np.median(errors(fitted, system, runs, 0.0, seed=0).full) <= 1.5
-    assert np.median(errors(fitted, system, runs, 0.5, seed=0).full) <= 5.0
+    assert np.median(errors(fitted, system, runs, measurement_noise=0.0, seed=0).full) <= 1.5
+    assert np.median(errors(fitted, system, runs, measurement_noise=0.5, seed=0).full) <= 5.0
 
 
 def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():

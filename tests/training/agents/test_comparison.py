@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,14 +12,19 @@ from rich.console import Console
 
 import training.agents.comparison
 import training.agents.learn
-from training.agents.comparison import KNOWS, MORE_NOISE, interval, middle, normalised, run_case
-from training.agents.tasks import TASKS
+import training.commands.compare
+from training.agents.comparison import KNOWS, MORE_NOISE, interval, middle, normalised, planned, run_case
 from training.commands.compare import Compare, report
+from training.systems import PROFILES
 
 
 def toy(out, **options):
     settings = {"systems": ("lorenz",), "seeds": 2, "episodes": 3, "timesteps": 1, "more_noise": False, "jobs": 1}
     return Compare(out=out, **{**settings, **options})
+
+
+def toy_cases(out, *knows):
+    return planned(out, systems=("lorenz",), knows=knows, seeds=1, episodes=3, timesteps=1, more_noise=False)
 
 
 def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
@@ -65,11 +71,12 @@ def test_table_and_figure_from_the_results_alone(tmp_path):
 
 
 def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path, monkeypatch):
-    (case,) = toy(tmp_path, knows=("y",), seeds=1).cases()
+    (case,) = toy_cases(tmp_path, "y")
     run_case(case)
     assert case.done
     with monkeypatch.context() as patch:
-        patch.setitem(TASKS, "lorenz", replace(TASKS["lorenz"], tolerance=0.3))
+        other = replace(PROFILES["lorenz"], task=replace(PROFILES["lorenz"].task, tolerance=0.3))
+        patch.setitem(PROFILES, "lorenz", other)
         with pytest.raises(ValueError, match="of another comparison: task"):
             assert not case.done
     with monkeypatch.context() as patch:
@@ -86,7 +93,7 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
         yield jobs[0], None, []
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.agents.comparison, "run_all", interrupted)
+    monkeypatch.setattr(training.commands.compare, "run_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         toy(tmp_path, knows=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1
@@ -94,14 +101,14 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
 
 
 def test_a_recurrent_agent_is_a_case_like_others(tmp_path):
-    (case,) = toy(tmp_path, knows=("recurrent",), seeds=1).cases()
+    (case,) = toy_cases(tmp_path, "recurrent")
     run_case(case)
     assert case.done
     assert len(json.loads((case.folder / "result.json").read_text())["scores"]) == 3
 
 
 def test_cases():
-    cases = Compare().cases()
+    cases = planned(Path())
     assert len(cases) == 6 * 6 * 5 + 4 * 2 * 3 + 2 * 2
     assert len({case.folder for case in cases}) == len(cases)
     assert {(case.system, case.measurement_noise) for case in cases} >= set(MORE_NOISE.items())

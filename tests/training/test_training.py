@@ -7,9 +7,7 @@ import pytest
 import torch
 from linear_system import Oscillator, sylvester
 from rich.console import Console
-from rich.progress import Progress
 from scipy.integrate import solve_ivp
-from torch.utils.tensorboard import SummaryWriter
 
 import training.evaluation.errors
 import training.maps.optimise
@@ -18,7 +16,7 @@ import training.trajectories.record
 from kkl_gym import ReverseDuffing, VanDerPol, get_system
 from kkl_gym.simulate import advance_batch, simulate
 from observers import Artifact, KKLObserver, LinearFilter
-from training import errors, preset, smape, train, unseen_trajectories
+from training import errors, preset, presets, smape, train, unseen_trajectories
 from training.config import Config, override
 from training.evaluation.errors import starts
 from training.filter_noise import noise_covariance, root, stationary_covariance
@@ -27,12 +25,12 @@ from training.maps.forward import ForwardProblem, on_tensors, truncation_time
 from training.maps.least_squares import solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.samplers import AGE_UNIT, MEASUREMENT_NOISE_UNIT, ClosedLoopSampler, TrajectorySampler
-from training.presets import spectrum
-from training.spectrum import make_filter
+from training.progress import progress_bars
+from training.spectrum import Spectrum
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.derivatives import output_matrix
-from training.trajectories.record import record, recording_ages, trajectories
-from training.trajectories.signals import random_inputs
+from training.trajectories.record import Motions, record, recording_ages, trajectories
+from training.trajectories.signals import KINDS, random_inputs
 
 CPU = torch.device("cpu")
 
@@ -91,7 +89,9 @@ def test_pulses_end_and_leave_free_motion_behind():
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     system, n = ReverseDuffing(), 400
-    (x, u, level), *rest = trajectories(system, n, 10, 0.01, np.random.default_rng(0), lead_in_share=0.5)
+    (x, u, level), *rest = trajectories(
+        system, n=n, steps=10, dt=0.01, rng=np.random.default_rng(0), motions=Motions(lead_in_share=0.5)
+    )
     low, high = system.box()
     inside = ((x[0] >= low) & (x[0] <= high)).all(-1)
     assert not rest
@@ -99,7 +99,9 @@ def test_excited_starts_lie_beyond_the_box_and_the_others_within():
     assert u.shape == (10, n, 0)
     assert inside[200:].all()
     assert 5 < (~inside[:200]).sum() < 150
-    (x, *_), *_ = trajectories(Autonomous(), 10, 10, 0.01, np.random.default_rng(0), lead_in_share=0.5)
+    (x, *_), *_ = trajectories(
+        Autonomous(), n=10, steps=10, dt=0.01, rng=np.random.default_rng(0), motions=Motions(lead_in_share=0.5)
+    )
     assert np.isfinite(x).all()
 
 
@@ -112,7 +114,12 @@ def test_a_share_of_the_trajectories_is_disturbed(monkeypatch):
 
     monkeypatch.setattr(training.trajectories.record, "simulate", spy)
     (x, u, level), *_ = trajectories(
-        system, n, 50, 0.01, np.random.default_rng(0), ("steps",), process_noise_share=0.25
+        system,
+        n=n,
+        steps=50,
+        dt=0.01,
+        rng=np.random.default_rng(0),
+        motions=Motions(kinds=("steps",), process_noise_share=0.25),
     )
     (w,) = seen
     assert np.array_equal(x, simulate(system, x[0], 50, 0.01, u=u, w=w))
@@ -135,10 +142,10 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     seen = {}
 
     def note(name):
-        def spy(*arguments, process_noise_share=None, **named):
-            seen[name] = process_noise_share if name == "record" else arguments[2:]
+        def spy(*arguments, **named):
+            seen[name] = named["motions"].process_noise_share if name == "record" else named
             if name == "record":
-                return record(*arguments, process_noise_share=process_noise_share, **named)
+                return record(*arguments, **named)
             raise ReachedError
 
         return spy
@@ -156,10 +163,17 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     config = replace(preset(VanDerPol(), "input-aware", "fast"), **small)
     with pytest.raises(ReachedError):
         train(VanDerPol(), config, tmp_path / "aware", device=CPU)
-    assert seen == {"record": 0.5, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.05)}
+    told = {
+        "measurement_noise_max": 1.0,
+        "batch": 1024,
+        "device": CPU,
+        "noise_free_share": 0.3,
+        "high_noise_emphasis": 3.0,
+    }
+    assert seen == {"record": 0.5, "sampler": {**told, "process_noise_max": 0.05}}
     with pytest.raises(ReachedError):
         train(VanDerPol(), replace(config, process_noise_share=0.0), tmp_path / "undisturbed", device=CPU)
-    assert seen == {"record": 0.0, "sampler": (1.0, 1024, CPU, 0.3, 3.0, 0.0)}
+    assert seen == {"record": 0.0, "sampler": {**told, "process_noise_max": 0.0}}
     spinn = replace(
         preset(VanDerPol(), "spinn", "fast"), process_noise_share=0.5, trajectories=5, duration=20.0, forward_steps=1
     )
@@ -189,7 +203,7 @@ def test_recorded_filter_states_are_those_of_the_observer_at_run_time():
         if k == 6:
             np.testing.assert_allclose(z[1], state)
     np.testing.assert_allclose(z[2], state)
-    data = record(system, linear, 5, 20, np.array([0, 20]), rng)
+    data = record(system, linear, n=5, steps=20, ages=np.array([0, 20]), rng=rng)
     assert data.x.shape == (2, 5, 2)
     assert data.z.shape == (2, 5, 4)
 
@@ -204,7 +218,7 @@ def test_recording_gives_up_on_a_system_that_always_escapes():
 
     linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
     with pytest.raises(ValueError, match="stayed within bounds"):
-        record(Runaway(), linear, 5, 200, np.array([0]), np.random.default_rng(0))
+        record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0))
 
 
 # Noise
@@ -245,8 +259,9 @@ def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
 @pytest.fixture(scope="module")
 def sampler():
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    data = record(VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0))
-    return TrajectorySampler(data, linear, 1.0, 4096, CPU), data, linear
+    ages, rng = recording_ages(0, 500, 40), np.random.default_rng(0)
+    data = record(VanDerPol(), linear, n=50, steps=500, ages=ages, rng=rng)
+    return TrajectorySampler(data, linear, measurement_noise_max=1.0, batch=4096, device=CPU), data, linear
 
 
 def test_batches_cover_quiet_and_loud(sampler):
@@ -267,9 +282,16 @@ def test_batches_cover_quiet_and_loud(sampler):
 )
 def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high_noise_emphasis):
     _, data, linear = sampler
-    inputs, *_ = TrajectorySampler(data, linear, 0.5, 32_768, CPU, noise_free_share, high_noise_emphasis)(
-        torch.Generator().manual_seed(0)
+    batches = TrajectorySampler(
+        data,
+        linear,
+        measurement_noise_max=0.5,
+        batch=32_768,
+        device=CPU,
+        noise_free_share=noise_free_share,
+        high_noise_emphasis=high_noise_emphasis,
     )
+    inputs, *_ = batches(torch.Generator().manual_seed(0))
     assert torch.isfinite(inputs).all()
     level = (MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2].double())).numpy()
     assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
@@ -280,7 +302,7 @@ def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high
 
 def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypatch):
     sampler, data, linear = sampler
-    monkeypatch.setattr(sampler, "_quiet", 0.0)
+    monkeypatch.setattr(sampler, "_noise_free_share", 0.0)
     zeros, generator = torch.zeros_like(sampler._modes), torch.Generator().manual_seed(0)
     monkeypatch.setattr(sampler, "_modes", zeros)  # what is left in the inputs is noise
     gain = sampler.coordinates.noise_gain
@@ -303,9 +325,9 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
 
 def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
     sampler, data, linear = sampler
-    monkeypatch.setattr(sampler, "_quiet", 1.0 - 1e-6)
+    monkeypatch.setattr(sampler, "_noise_free_share", 1.0 - 1e-6)
     inputs, x, _, _ = sampler(torch.Generator().manual_seed(0))
-    network = Network(inputs.shape[1], 2, 8, 1, "tanh")
+    network = Network(inputs.shape[1], 2, width=8, depth=1, activation="tanh")
     artifact = Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
     with torch.no_grad():
         x_hat = network(inputs).numpy() * sampler.x_scale + sampler.x_offset
@@ -320,10 +342,17 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
 @pytest.fixture(scope="module")
 def disturbed_sampler():
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    data = record(
-        VanDerPol(), linear, 50, 500, recording_ages(0, 500, 40), np.random.default_rng(0), process_noise_share=0.5
+    motions, ages, rng = Motions(KINDS, process_noise_share=0.5), recording_ages(0, 500, 40), np.random.default_rng(0)
+    data = record(VanDerPol(), linear, n=50, steps=500, ages=ages, rng=rng, motions=motions)
+    sampler = TrajectorySampler(
+        data,
+        linear,
+        measurement_noise_max=1.0,
+        batch=4096,
+        device=CPU,
+        process_noise_max=VanDerPol.process_noise,
     )
-    return TrajectorySampler(data, linear, 1.0, 4096, CPU, process_noise_max=VanDerPol.process_noise), data, linear
+    return sampler, data, linear
 
 
 def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler):
@@ -331,7 +360,7 @@ def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler
     assert 15 < (data.process_noise > 0).sum() < 35
     inputs, x, _, cell = sampler(torch.Generator().manual_seed(0))
     assert cell.max() < sampler.cells
-    network = Network(inputs.shape[1], 2, 8, 1, "tanh")
+    network = Network(inputs.shape[1], 2, width=8, depth=1, activation="tanh")
     artifact = Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
     assert artifact.inverse.features == ("z_y", "z_u", "measurement_noise", "process_noise", "age")
     with torch.no_grad():
@@ -353,7 +382,13 @@ def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler
 @pytest.fixture(scope="module", params=["sampler", "disturbed_sampler"])
 def closed_loop(request):
     open_loop, _, linear = request.getfixturevalue(request.param)
-    network = Network(len(open_loop.coordinates.noise_gain) + 2 + bool(open_loop.process_noise_max), 2, 8, 1, "tanh")
+    network = Network(
+        len(open_loop.coordinates.noise_gain) + 2 + bool(open_loop.process_noise_max),
+        2,
+        width=8,
+        depth=1,
+        activation="tanh",
+    )
     artifact = Artifact(linear, open_loop.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
     seen = []
 
@@ -362,22 +397,32 @@ def closed_loop(request):
         return np.tanh(x_hat[:, :1])
 
     ages = recording_ages(0, 200, 30)
-    data = record_closed_loop(VanDerPol(), artifact, act, 60, 200, ages, np.random.default_rng(1))
-    return ClosedLoopSampler(open_loop, data, linear.dt, CPU), data, artifact, seen
+    data = record_closed_loop(
+        VanDerPol(),
+        artifact,
+        act,
+        n=60,
+        steps=200,
+        ages=ages,
+        rng=np.random.default_rng(1),
+        process_noise_share=0.5,
+    )
+    return ClosedLoopSampler(open_loop, data, dt=linear.dt, device=CPU), data, artifact, seen
 
 
 def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(closed_loop):
     _, data, artifact, seen = closed_loop
-    assert data.x.shape == (len(data.ages), len(data.level), 2)
-    assert data.z.shape == (len(data.ages), len(data.level), artifact.filter.size)
-    assert 50 <= len(data.level) <= 60
-    assert len(np.unique(data.level)) >= 5
-    assert ((data.level >= 0) & (data.level <= 1.0)).all()
+    assert data.x.shape == (len(data.ages), len(data.measurement_noise), 2)
+    assert data.z.shape == (len(data.ages), len(data.measurement_noise), artifact.filter.size)
+    assert 50 <= len(data.measurement_noise) <= 60
+    assert len(np.unique(data.measurement_noise)) >= 5
+    assert ((data.measurement_noise >= 0) & (data.measurement_noise <= 1.0)).all()
     process_noise_share = (data.process_noise > 0).mean()
     assert 0.2 < process_noise_share < 0.8 if artifact.process_noise_max else process_noise_share == 0
-    noise_free_share = (data.level == 0) & (data.process_noise == 0)
-    start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, noise_free_share, :1])
-    assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen) or not len(start)
+    noise_free = (data.measurement_noise == 0) & (data.process_noise == 0)
+    start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, noise_free, :1])
+    assert noise_free.any()
+    assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen)
     states = {tuple(row) for row in data.x.reshape(-1, 2).round(6).tolist()}
     assert not any(tuple(row) in states for x_hat in seen for row in x_hat.round(6).tolist())
 
@@ -392,7 +437,7 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop
     for row in range(2048, 4096, 200):
         state = x[row].numpy() * inverse.x_scale + inverse.x_offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-        levels = float(data.level[trajectory]), float(data.process_noise[trajectory])
+        levels = float(data.measurement_noise[trajectory]), float(data.process_noise[trajectory])
         observer = KKLObserver(artifact, levels[0], process_noise=levels[1])
         shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
@@ -402,7 +447,7 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(closed_loop
             level = data.process_noise[trajectory]
             assert at_run_time % 3 == int(level > 0) + int(level > 0.025)
             at_run_time = at_run_time // 3
-        assert (at_run_time % 7 == 0) == (data.level[trajectory] == 0)
+        assert (at_run_time % 7 == 0) == (data.measurement_noise[trajectory] == 0)
 
 
 def test_a_run_is_not_resumed_for_another_process_noise(tmp_path):
@@ -418,15 +463,15 @@ def test_a_run_is_not_resumed_for_another_process_noise(tmp_path):
 
 def test_closing_the_loop_is_a_second_stage(tmp_path):
     system = Oscillator()
-    config = toy(system, duration=5.0, closed_loop=20)
+    config = toy(system, duration=5.0, closed_loop_trajectories=20)
     result = train(system, config, tmp_path)
     assert list(result.losses) == ["free", "inverse", "closed-loop"]
-    assert result.artifact.training["closed_loop"] == 20
+    assert result.artifact.training["closed_loop_trajectories"] == 20
     again = train(system, config, tmp_path, resume=True)
     for a, b in zip(result.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="no inputs"):
-        train(Autonomous(), toy(Autonomous(), closed_loop=20, inverse_steps=5), tmp_path / "b")
+        train(Autonomous(), toy(Autonomous(), closed_loop_trajectories=20, inverse_steps=5), tmp_path / "b")
 
 
 @dataclass(frozen=True)
@@ -447,7 +492,16 @@ def test_residual_is_the_pde_by_finite_differences(name):
     low, high = system.box()
     x, z = rng.uniform(low, high, (100, system.nx)), rng.normal(size=(100, 3))
     torch.manual_seed(0)
-    problem = ForwardProblem(Network(system.nx, 3, 16, 2, "tanh"), system, linear, x, z, 1.0, 64, CPU).double()
+    problem = ForwardProblem(
+        Network(system.nx, 3, width=16, depth=2, activation="tanh"),
+        system,
+        linear=linear,
+        x=x,
+        z=z,
+        physics_weight=1.0,
+        batch=64,
+        device=CPU,
+    ).double()
     for attribute in ("_xo", "_xs", "_zo", "_zs", "_A", "_B"):
         setattr(problem, attribute, getattr(problem, attribute).double())
     points = torch.as_tensor(x[:10])
@@ -491,12 +545,12 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
 
 def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
     system = Oscillator()
-    linear = make_filter((-2.0,), 1, 0.01, 0, ((-0.9, 1.7), (-1.5, 0.4)))
+    linear = Spectrum((-2.0,), ((-0.9, 1.7), (-1.5, 0.4))).filter(1, 0.01)
     np.testing.assert_allclose(
         np.sort_complex(np.linalg.eigvals(linear.A)),
         np.sort_complex([-2.0, -0.9 + 1.7j, -0.9 - 1.7j, -1.5 + 0.4j, -1.5 - 0.4j]),
     )
-    data = record(system, linear, 20, 2500, np.array([2400, 2500]), np.random.default_rng(0))
+    data = record(system, linear, n=20, steps=2500, ages=np.array([2400, 2500]), rng=np.random.default_rng(0))
     np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
 
 
@@ -531,8 +585,8 @@ def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
 
 def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
     """One map, in X and beyond."""
-    system, linear = ReverseDuffing(), make_filter((-1.5, -1.875, -2.25, -2.625, -3.0), 1, 0.01, 0)
-    T = solve_forward(system, linear, 800, 2.0, np.random.default_rng(0))
+    system, linear = ReverseDuffing(), Spectrum((-1.5, -1.875, -2.25, -2.625, -3.0)).filter(1, 0.01)
+    T = solve_forward(system, linear, features=800, box_factor=2.0, rng=np.random.default_rng(0))
     rng = np.random.default_rng(1)
     inside = rng.uniform(*system.box(), (40, 2))
     beyond = rng.uniform(*system.box(2), (80, 2))
@@ -545,8 +599,8 @@ def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
 
 
 def test_solved_forward_map_of_a_linear_system():
-    linear = make_filter((-1.0, -2.0, -3.0), 1, 0.01, 0)
-    T = solve_forward(Oscillator(), linear, 100, 1.0, np.random.default_rng(0))
+    linear = Spectrum((-1.0, -2.0, -3.0)).filter(1, 0.01)
+    T = solve_forward(Oscillator(), linear, features=100, box_factor=1.0, rng=np.random.default_rng(0))
     x = np.random.default_rng(1).uniform(-1, 1, (50, 2))
     expected = x @ sylvester(linear.A, linear.B).T
     assert np.abs(T(x) - expected).max() < 1e-2 * np.abs(expected).max()
@@ -555,7 +609,7 @@ def test_solved_forward_map_of_a_linear_system():
 def test_what_cannot_be_solved():
     pair = LinearFilter(np.array([[-1.0, 2.0], [-2.0, -1.0]]), np.ones((2, 1)), 0.01)
     with pytest.raises(ValueError, match="diagonal"):
-        solve_forward(Oscillator(), pair, 10, 1.0, np.random.default_rng(0))
+        solve_forward(Oscillator(), pair, features=10, box_factor=1.0, rng=np.random.default_rng(0))
 
     class Tight(Oscillator):
         name = "oscillator"
@@ -565,17 +619,19 @@ def test_what_cannot_be_solved():
             return 100.0 + x[0], 100.0 + x[1]
 
     with pytest.raises(ValueError, match="too soon"):
-        solve_forward(Tight(), make_filter((-1.0,), 1, 0.01, 0), 1000, 1.0, np.random.default_rng(0))
-    for wrong in ({"box_factor": 0.5}, {"box_factor": 2.0}, {"features": -1}, {"features": 10}):
+        solve_forward(
+            Tight(), Spectrum((-1.0,)).filter(1, 0.01), features=1000, box_factor=1.0, rng=np.random.default_rng(0)
+        )
+    for wrong in ({"box_factor": 0.5}, {"box_factor": 2.0}, {"random_features": -1}, {"random_features": 10}):
         with pytest.raises(ValueError, match=r"features|box_factor"):
             replace(preset(ReverseDuffing(), "spinn", "fast"), **wrong)
     with pytest.raises(ValueError, match="does not go with"):
-        replace(preset(ReverseDuffing(), "input-aware", "fast"), features=10)
+        replace(preset(ReverseDuffing(), "input-aware", "fast"), random_features=10)
 
 
 def test_training_on_a_solved_map(tmp_path):
     sizes = {
-        "features": 200,
+        "random_features": 200,
         "forward_steps": 0,
         "box_factor": 1.5,
         "inverse_steps": 2000,
@@ -586,9 +642,9 @@ def test_training_on_a_solved_map(tmp_path):
     result = train(Oscillator(), config, tmp_path)
     assert list(result.losses) == ["inverse"]
     assert result.artifact.forward.mlp.weights[0].shape == (200, 2)
-    runs = unseen_trajectories(Oscillator(), config.dt, 20, 20.0, seed=0, domain="1.5X")
+    runs = unseen_trajectories(Oscillator(), config.dt, n=20, duration=20.0, seed=0, domain="1.5X")
     # long after the start, whose last traces in z an inverse of exact T(x) magnifies
-    assert np.median(errors(result.artifact, Oscillator(), runs, 0.0, 0, skip=12.0).late) < 5.0
+    assert np.median(errors(result.artifact, Oscillator(), runs, measurement_noise=0.0, seed=0, skip=12.0).late) < 5.0
 
 
 # Whole runs
@@ -597,14 +653,16 @@ def test_training_on_a_solved_map(tmp_path):
 def test_training_makes_the_error_fall(tmp_path):
     system = Oscillator()
     config = toy(system, trajectories=100, duration=20.0, inverse_steps=1500, width=32)
-    runs = unseen_trajectories(system, config.dt, 20, 20.0, seed=0)
+    runs = unseen_trajectories(system, config.dt, n=20, duration=20.0, seed=0)
     before = train(system, replace(config, inverse_steps=1), tmp_path / "a").artifact
     after = train(system, config, tmp_path / "b").artifact
-    errors_before, errors_after = (np.median(errors(a, system, runs, 0.0, 0).late) for a in (before, after))
+    errors_before, errors_after = (
+        np.median(errors(a, system, runs, measurement_noise=0.0, seed=0).late) for a in (before, after)
+    )
     assert errors_after < 0.1 * errors_before
     assert errors_after < 5.0
-    driven = unseen_trajectories(system, config.dt, 20, 20.0, seed=0, driven=True)
-    assert np.median(errors(after, system, driven, 0.0, 0).late) < 10.0
+    driven = unseen_trajectories(system, config.dt, n=20, duration=20.0, seed=0, driven=True)
+    assert np.median(errors(after, system, driven, measurement_noise=0.0, seed=0).late) < 10.0
 
 
 @pytest.mark.parametrize("method", ["input-aware", "spinn"])
@@ -616,10 +674,10 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
     save, saved = training.maps.optimise._save, []
 
-    def save_and_stop(path, stage, module, optimiser, generator, step, *rest):
-        save(path, stage, module, optimiser, generator, step, *rest)
-        saved.append(step)
-        if stage.name == "inverse" and step == 200:
+    def save_and_stop(stage, parts, generator, course):
+        save(stage, parts, generator, course)
+        saved.append(course.step)
+        if stage.name == "inverse" and course.step == 200:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(training.maps.optimise, "_save", save_and_stop)
@@ -638,7 +696,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
         train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
     with pytest.raises(ValueError, match="--resume"):
         train(system, config, tmp_path / "cut")
-    checkpoint = tmp_path / "cut" / "inverse.checkpoint.safetensors"
+    checkpoint = tmp_path / "cut" / "inverse.checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):
         train(system, config, tmp_path / "cut", resume=True)
@@ -673,9 +731,17 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
                 raise KeyboardInterrupt
             return {"loss": ((module.a - 1.0) ** 2).sum()}
 
-        stage = training.maps.optimise.Stage("line", 10**9, 0.1, tmp_path, "same", 0, cpu_seconds=4.0)
-        with SummaryWriter(tmp_path) as writer, Progress(disable=True) as progress:
-            training.maps.optimise.optimise(stage, module, loss, progress, writer, resume=True)
+        stage = training.maps.optimise.Stage(
+            name="line",
+            steps=10**9,
+            learning_rate=0.1,
+            folder=tmp_path,
+            fingerprint="same",
+            seed=0,
+            cpu_seconds=4.0,
+        )
+        with progress_bars(None) as progress:
+            training.maps.optimise.optimise(stage, module, loss, progress, resume=True)
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
@@ -709,7 +775,7 @@ def test_artifact_of_a_run_records_what_made_it(tmp_path):
     artifact = train(system, toy(system, "spinn", duration=20.0), tmp_path).artifact
     artifact.save(tmp_path / "o.safetensors")
     read = Artifact.read(tmp_path / "o.safetensors")
-    assert read.training["method"] == "spinn"
+    assert read.training["pipeline"] == "spinn"
     assert read.training["seed"] == 0
     assert read.versions["torch"] == torch.__version__
     assert read.forward is not None
@@ -759,7 +825,7 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"batch": 2}, "batch"),
         ({"batch": 100}, "batch"),
         ({"samples": 1}, "samples"),
-        ({"method": "bogus"}, "method"),
+        ({"pipeline": "bogus"}, "pipeline"),
         ({"activation": "relu"}, "activation"),
         ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
@@ -767,7 +833,7 @@ def test_two_outputs_train_and_run(tmp_path):
         ({"process_noise_share": 1.5}, "share"),
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
-        ({"closed_loop": 5}, "closed_loop"),
+        ({"closed_loop_trajectories": 5}, "closed_loop"),
     ],
 )
 def test_impossible_configurations(change, message):
@@ -782,7 +848,7 @@ def test_paper_preset_has_the_papers_table():
     assert len(config.eigenvalues) == 5
     assert (max(config.eigenvalues), min(config.eigenvalues)) == (-1.5, -3.0)
     assert isinstance(config, Config)
-    assert all(value < 0 for value in spectrum(Oscillator()))
+    assert all(value < 0 for value in presets.eigenvalues(Oscillator()))
 
 
 # Evaluation
@@ -799,7 +865,7 @@ def test_starts_outside_lie_outside():
 def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifact, monkeypatch):
     system, told = VanDerPol(), []
     noise_free_share, loud = (
-        unseen_trajectories(system, 0.01, 20, 1.0, 0, process_noise=level) for level in (0.0, 0.15)
+        unseen_trajectories(system, 0.01, n=20, duration=1.0, seed=0, process_noise=level) for level in (0.0, 0.15)
     )
     assert np.array_equal(noise_free_share.x[0], loud.x[0])
     x, w, u = loud.x.transpose(0, 2, 1), np.zeros((2, 20)), np.zeros((1, 20))
@@ -814,7 +880,7 @@ def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifa
 
     monkeypatch.setattr(training.evaluation.errors, "KKLObserver", Spy)
     for runs in (noise_free_share, loud, loud.first(5)):
-        errors(make_artifact(), system, runs, 0.5, 0)
+        errors(make_artifact(), system, runs, measurement_noise=0.5, seed=0)
     assert told == [0.0, 0.15, 0.15]
 
 
@@ -828,7 +894,7 @@ def test_impossible_evaluations(wrong):
 
 
 def test_escapes_are_counted():
-    runs = unseen_trajectories(get_system("rossler"), 0.01, 200, 20.0, seed=0, domain="2X")
+    runs = unseen_trajectories(get_system("rossler"), 0.01, n=200, duration=20.0, seed=0, domain="2X")
     assert runs.escaped > 0
     assert runs.x.shape[1] == 200 - runs.escaped
     assert np.isfinite(runs.x).all()

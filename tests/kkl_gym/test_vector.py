@@ -49,7 +49,7 @@ def vector(name, mode, steps=23, n=N, **options):
 def single(name, steps=23, observer=None, repeat=None, estimate="x", **options):
     env = gym.make("kkl_gym:" + ENV_IDS[name], max_episode_steps=steps, **options)
     if observer is not None:
-        env = KKLObservation(env, observer, estimate)
+        env = KKLObservation(env, observer, estimate=estimate)
     return env if repeat is None else ActionRepeat(env, repeat)
 
 
@@ -183,7 +183,7 @@ def test_noise_does_not_repeat_and_blocks_are_refilled_row_by_row():
 @pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
 def test_the_observer_is_reset_row_by_row(name, mode, estimate, saved):
     path = saved(system=name)
-    ours = KKLVectorObservation(vector(name, mode), path, estimate)
+    ours = KKLVectorObservation(vector(name, mode), path, estimate=estimate)
     theirs = sync(name, mode, observer=path, estimate=estimate)
     if estimate == "z":  # the vector does not evaluate the network
         theirs = Without(theirs, "x_hat")

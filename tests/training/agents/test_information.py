@@ -168,4 +168,4 @@ def test_wrong_uses():
     with pytest.raises(ValueError, match="unknown information 'everything'"):
         make(TASK, "everything", N)
     with pytest.raises(ValueError, match="resets in the same step"):
-        Features(TASK.make(N, autoreset_mode="NextStep"), ["x"], lambda info: info["x"], 2)
+        Features(TASK.make(N, autoreset_mode="NextStep"), ["x"], feature=lambda info: info["x"], width=2)

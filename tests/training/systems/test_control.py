@@ -6,7 +6,8 @@ import pytest
 from kkl_gym import SYSTEMS, get_system
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores, successes
-from training.trajectories.controllers import controller, linear_quadratic
+from training.systems import controller
+from training.trajectories.controllers import linear_quadratic
 from training.trajectories.derivatives import linearised
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
@@ -98,7 +99,7 @@ def test_play_refuses_environments_that_reset_by_themselves():
 def test_finding_tasks():
     assert get_task("lorenz", 2.0).measurement_noise == 2.0
     assert get_task("lorenz").measurement_noise == 0.5
-    with pytest.raises(ValueError, match="no control task for 'lorentz'"):
+    with pytest.raises(ValueError, match="unknown system 'lorentz'"):
         get_task("lorentz")
 
 
