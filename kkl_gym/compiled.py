@@ -1,4 +1,4 @@
-"""A batch's Runge–Kutta step and its observations as machine code, where Numba is estimator: several times as fast.
+"""A batch's Runge–Kutta step and its observations as machine code, where Numba is installed: several times as fast.
 
 For the step, the system's own equations are run once on sympy symbols; what comes out is written down as Python, put
 into the same step as single states take, and compiled, which takes a second for each system, set of parameters and

@@ -1,4 +1,4 @@
-"""Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if estimator)."""
+"""Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if installed)."""
 
 from observers.artifact import Artifact, ArtifactError, ForwardMap, InverseMap, shipped
 from observers.filter import LinearFilter

@@ -1,4 +1,4 @@
-"""The filter's step for large batches as machine code, where Numba is estimator: a fifth to a half of NumPy's time.
+"""The filter's step for large batches as machine code, where Numba is installed: a fifth to a half of NumPy's time.
 
 The modes of a filter do not mix, or only in pairs. A matrix product knows nothing of that, and reads and writes the
 batch three times where once is enough.

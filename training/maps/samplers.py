@@ -38,7 +38,7 @@ class TrajectorySampler:
     """
 
     AGES_PER_BATCH = 32
-    LEVELS = 6  # cells of noise level, the noise_free_share one aside
+    LEVELS = 6  # cells of noise level, the one without noise aside
     AGE_CELLS = 8
     PROCESS_CELLS = 3  # no process noise, weak and strong
 

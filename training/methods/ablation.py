@@ -115,7 +115,7 @@ class OwnFree(Ablation):
     label: ClassVar[str] = "... inverse of free motion"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """No process_noise_share motions."""
+        """No process noise in training."""
         return {"process_noise_share": 0.0}
 
 

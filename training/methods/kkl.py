@@ -40,7 +40,7 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """A configuration of the package with the benchmark's data, networks and cpu_seconds."""
+    """A configuration of the package with the benchmark's data, networks and limit of CPU time."""
     return replace(
         config,
         dt=budget.dt,

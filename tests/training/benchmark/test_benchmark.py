@@ -108,7 +108,7 @@ def tiny(monkeypatch):
     monkeypatch.setattr(command, "step_time", lambda *_, **__: 1.0)
 
 
-def noise_free_share():
+def quiet():
     return Console(quiet=True)
 
 
@@ -267,7 +267,7 @@ def test_step_time_is_positive():
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     name, trainings = toy
     out = tmp_path / "out"
-    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(noise_free_share())
+    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(quiet())
     results = pd.read_csv(out / "results.csv")
     assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
     expected = unseen_trajectories(get_system("lorenz"), TINY.dt, n=2, duration=2.0, seed=0).x
@@ -301,15 +301,15 @@ def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path):
     benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, jobs=1)
     stop.touch()
     with pytest.raises(KeyboardInterrupt):
-        benchmark.run(noise_free_share())
+        benchmark.run(quiet())
     begun = trainings.read_text().split()
     assert (begun.count("van_der_pol"), begun.count("lorenz")) == (4, 1)
     stop.unlink()
-    benchmark.run(noise_free_share())
+    benchmark.run(quiet())
     after = trainings.read_text().split()
     assert (after.count("van_der_pol"), after.count("lorenz")) == (4, 5)  # the one interrupted was begun anew
     results = (out / "results.csv").read_bytes()
-    benchmark.run(noise_free_share())
+    benchmark.run(quiet())
     assert trainings.read_text().split() == after
     assert (out / "results.csv").read_bytes() == results
 
@@ -350,7 +350,7 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     script.write_text(script.read_text() + BROKEN)
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="1 of 2 jobs failed; the first: lorenz/broken"):
-        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(noise_free_share())
+        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(quiet())
     assert set(pd.read_csv(out / "methods.csv").method) == {"constant"}
     assert "in train" in (out / "jobs" / "lorenz" / "broken" / "failure.txt").read_text()
 
@@ -358,25 +358,25 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
 def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
     monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(noise_free_share())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
     with pytest.raises(ValueError, match="holds jobs of several benchmarks: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(noise_free_share())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(quiet())
 
 
 def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_path):
     name, _ = toy
     script, out = Path(name.rpartition(":")[0]), tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
     changed = script.with_name("changed.py")
     changed.write_text(
         script.read_text().replace("self.mean, (len(y0)", "2 * self.mean, (len(y0)").replace("x.mean", "x.max")
     )
     with pytest.raises(ValueError, match="another benchmark: code"):
-        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(noise_free_share())
+        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(quiet())
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
 )
 def test_impossible_benchmarks(wrong, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(noise_free_share())
+        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(quiet())
     assert not (tmp_path / "out").exists()
 
 
@@ -416,7 +416,7 @@ def test_worker_processes_do_what_one_process_does(toy, tmp_path):
 
 def test_every_method_at_toy_size(tiny, tmp_path):
     out = tmp_path / "out"
-    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(noise_free_share())
+    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(quiet())
     methods = pd.read_csv(out / "methods.csv")
     assert set(methods.method) == set(METHODS)
     results = pd.read_csv(out / "results.csv")
@@ -448,11 +448,11 @@ def test_infinite_values_have_a_median_and_a_sign():
 def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(noise_free_share())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
     before = {file: (out / file).read_bytes() for file in ("table.md", "heatmap.png")}
     for file in before:
         (out / file).unlink()
-    Benchmark(report=True, out=out).run(noise_free_share())
+    Benchmark(report=True, out=out).run(quiet())
     assert {file: (out / file).read_bytes() for file in before} == before
 
 
@@ -460,7 +460,7 @@ def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
 def test_committed_results_give_the_committed_table_and_figure(tmp_path):
     for file in ("results.csv", "methods.csv"):
         shutil.copy(COMMITTED / file, tmp_path)
-    Benchmark(report=True, out=tmp_path).run(noise_free_share())
+    Benchmark(report=True, out=tmp_path).run(quiet())
     assert (tmp_path / "table.md").read_text() == (COMMITTED / "table.md").read_text()
     with Image.open(COMMITTED / "heatmap.png") as committed, Image.open(tmp_path / "heatmap.png") as drawn:
         if committed.info["Software"] != drawn.info["Software"]:

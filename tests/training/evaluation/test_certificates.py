@@ -338,7 +338,7 @@ def test_command(tmp_path, capsys):
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
     main(["certify", "reverse_duffing-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
-          "--out", str(tmp_path / "noise_free_share")])  # fmt: skip
-    assert (tmp_path / "noise_free_share" / "reverse_duffing-spinn.png").exists()
+          "--out", str(tmp_path / "quiet")])  # fmt: skip
+    assert (tmp_path / "quiet" / "reverse_duffing-spinn.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])
