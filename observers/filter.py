@@ -83,7 +83,7 @@ class LinearFilter:
         """The state one sample later.
 
         z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them. A batch
-        (n, size) of many rows goes through Numba where it is estimator, which rounds a little differently.
+        (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
             return self._compiled(z, y, u, y_next)
