@@ -29,6 +29,15 @@ class Oscillator(System):
         return (x[0],)
 
 
+@dataclass(frozen=True)
+class Autonomous(Oscillator):
+    """The oscillator without its input."""
+
+    name: ClassVar[str] = "autonomous"
+    u_max: ClassVar[tuple[float, ...]] = ()
+    G: ClassVar[tuple[tuple[float, ...], ...]] = ()
+
+
 def sylvester(A, B):
     """M with T(x) = M x: M F = A M + B C."""
     return solve_sylvester(-A, F, B @ C)

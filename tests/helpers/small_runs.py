@@ -1,0 +1,67 @@
+"""Configurations and data of a size for tests."""
+
+from functools import cache
+
+import numpy as np
+import torch
+
+from kkl_gym import VanDerPol
+from observers import Artifact, LinearFilter
+from training import preset
+from training.config import override
+from training.maps.networks import Network
+from training.maps.samplers import ClosedLoopSampler, TrajectorySampler
+from training.trajectories.closed_loop import record_closed_loop
+from training.trajectories.record import Motions, record, recording_ages
+from training.trajectories.signals import KINDS
+
+CPU = torch.device("cpu")
+SIZES = {"trajectories": 20, "duration": 5.0, "samples": 40, "width": 16, "depth": 2, "batch": 128}
+
+
+def toy(system, pipeline="input-aware", **changes):
+    """A configuration that trains within a second."""
+    steps = {"inverse_steps": 200} | ({"forward_steps": 200} if pipeline == "spinn" else {})
+    return override(preset(system, pipeline, "fast"), SIZES | steps | changes)
+
+
+@cache
+def open_loop(process_noise_share=0.0):
+    """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter beside them."""
+    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
+    motions = Motions(KINDS, process_noise_share=process_noise_share)
+    ages, rng = recording_ages(0, 500, 40), np.random.default_rng(0)
+    data = record(VanDerPol(), linear, n=50, steps=500, ages=ages, rng=rng, motions=motions)
+    sampler = TrajectorySampler(
+        data,
+        linear,
+        measurement_noise_max=1.0,
+        batch=4096,
+        device=CPU,
+        process_noise_max=VanDerPol.process_noise if process_noise_share else 0.0,
+    )
+    return sampler, data, linear
+
+
+def untrained(sampler, linear):
+    """A network with weights that nobody trained, and the observer that it makes."""
+    torch.manual_seed(0)
+    inputs = len(sampler.coordinates.noise_gain) + 2 + bool(sampler.process_noise_max)
+    network = Network(inputs, 2, width=8, depth=1, activation="tanh")
+    return network, Artifact(linear, sampler.inverse_map(network, linear), "van_der_pol", {"mu": 3.0})
+
+
+@cache
+def closed_loop(process_noise_share=0.0):
+    """Batches of which half are in closed loop, its trajectories, the observer, and every estimate acted on."""
+    sampler, _, linear = open_loop(process_noise_share)
+    _, artifact = untrained(sampler, linear)
+    seen = []
+
+    def act(x_hat):
+        seen.append(x_hat)
+        return np.tanh(x_hat[:, :1])
+
+    ages, rng = recording_ages(0, 200, 30), np.random.default_rng(1)
+    data = record_closed_loop(VanDerPol(), artifact, act, n=60, steps=200, ages=ages, rng=rng, process_noise_share=0.5)
+    return ClosedLoopSampler(sampler, data, dt=linear.dt, device=CPU), data, artifact, seen

@@ -1,0 +1,29 @@
+"""kkl-gym train, and evaluate on what it wrote."""
+
+import pytest
+
+from training.cli import main
+
+
+def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    toy_sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 50"
+    main(["train", "van_der_pol", *toy_sizes.split(), "--threads", "1", "--no-monitor"])
+    path = tmp_path / "runs" / "van_der_pol" / "van_der_pol.safetensors"
+    assert path.exists()
+    assert (path.parent / "report.png").stat().st_size > 10_000
+    csv = tmp_path / "errors.csv"
+    main(["evaluate", str(path), "--trajectories", "3", "--duration", "8", "--csv", str(csv)])
+    assert "2X" in capsys.readouterr().out
+    assert len(csv.read_text().splitlines()) == 1 + 3 * 3 * 2
+    for wrong in (
+        ["train", "nonsense"],
+        ["evaluate", "nonsense"],
+        ["evaluate"],
+        ["train", "lorenz", "--dt", "0"],
+        ["train", "lorenz", "--parameters", "rh", "30"],
+        ["train", "lorenz", "--threads", "0"],
+        ["train", "lorenz", "--out", "/dev/null/x", *toy_sizes.split()],
+    ):
+        with pytest.raises(SystemExit, match="kkl-gym: "):
+            main(wrong)

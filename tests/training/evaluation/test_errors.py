@@ -1,0 +1,66 @@
+"""Errors on unseen trajectories."""
+
+import numpy as np
+import pytest
+from linear_system import Oscillator
+
+import training.evaluation.errors
+import training.maps.optimise
+import training.pipeline
+import training.trajectories.record
+from kkl_gym import VanDerPol, get_system
+from kkl_gym.simulate import advance_batch
+from observers import KKLObserver
+from training import errors, unseen_trajectories
+from training.evaluation.errors import starts
+
+
+def test_starts_outside_lie_outside():
+    system = VanDerPol()
+    x0 = starts(system, "2X", 50, np.random.default_rng(0))
+    low, high = system.box()
+    assert ((x0 < low) | (x0 > high)).any(-1).all()
+    assert (np.abs(x0) <= 2 * high).all()
+
+
+def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifact, monkeypatch):
+    system, told = VanDerPol(), []
+    calm, disturbed = (
+        unseen_trajectories(system, 0.01, n=20, duration=1.0, seed=0, process_noise=level) for level in (0.0, 0.15)
+    )
+    assert np.array_equal(calm.x[0], disturbed.x[0])
+    x, w, u = disturbed.x.transpose(0, 2, 1), np.zeros((2, 20)), np.zeros((1, 20))
+    for k in (0, 50):
+        drift = (x[k + 1] - advance_batch(system, x[k], u, w, 0.01)) / 0.01 / np.array(system.scale)[:, None]
+        assert 0.05 < np.abs(drift).max() < 0.16
+
+    class Spy(KKLObserver):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            told.append(self.process_noise)
+
+    monkeypatch.setattr(training.evaluation.errors, "KKLObserver", Spy)
+    for runs in (calm, disturbed, disturbed.first(5)):
+        errors(make_artifact(), system, runs, measurement_noise=0.5, seed=0)
+    assert told == [0.0, 0.15, 0.15]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"n": 0}, {"duration": 0.0}, {"domain": "3X"}, {"seed": -1}, {"process_noise": -1.0}, {"process_noise": np.nan}],
+)
+def test_impossible_evaluations(wrong):
+    with pytest.raises(ValueError, match=r"cannot run|domain|process_noise must"):
+        unseen_trajectories(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
+
+
+def test_escapes_are_counted():
+    runs = unseen_trajectories(get_system("rossler"), 0.01, n=200, duration=20.0, seed=0, domain="2X")
+    assert runs.escaped > 0
+    assert runs.x.shape[1] == 200 - runs.escaped
+    assert np.isfinite(runs.x).all()
+
+
+def test_output_of_constant_and_state():
+    x = np.arange(12.0).reshape(2, 3, 2)
+    np.testing.assert_array_equal(Oscillator().output(x), x[..., :1])

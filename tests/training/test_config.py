@@ -1,0 +1,47 @@
+"""Settings that make no sense."""
+
+from dataclasses import replace
+
+import pytest
+from linear_system import Oscillator
+
+from training import preset
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dt": 0.0}, "dt"),
+        ({"eigenvalues": (1.0,)}, "eigenvalues"),
+        ({"eigenvalues": (-1.0, -1.0)}, "distinct"),
+        ({"pairs": ((0.1, 1.0),)}, "pairs"),
+        ({"pairs": ((-0.1, -1.0),)}, "pairs"),
+        ({"pairs": ((-0.1, 1.0), (-0.1, 1.0))}, "distinct"),
+        ({"eigenvalues": ()}, "needs eigenvalues"),
+        ({"forward_steps": 5}, "forward_steps"),
+        ({"width": 0}, "width"),
+        ({"batch": 2}, "batch"),
+        ({"batch": 100}, "batch"),
+        ({"samples": 1}, "samples"),
+        ({"pipeline": "bogus"}, "pipeline"),
+        ({"activation": "relu"}, "activation"),
+        ({"trajectories": 2.5}, "trajectories"),
+        ({"seed": -1}, "seed"),
+        ({"measurement_noise_max": float("nan")}, "measurement_noise_max"),
+        ({"process_noise_share": 1.5}, "share"),
+        ({"noise_free_share": float("nan")}, "share"),
+        ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
+        ({"closed_loop_trajectories": 5}, "closed_loop"),
+    ],
+)
+def test_impossible_configurations(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(preset(Oscillator(), "input-aware", "fast"), **change)
+
+
+def test_settings_that_do_not_go_with_solving_for_the_forward_map():
+    for wrong in ({"box_factor": 0.5}, {"box_factor": 2.0}, {"random_features": -1}, {"random_features": 10}):
+        with pytest.raises(ValueError, match=r"features|box_factor"):
+            replace(preset(Oscillator(), "spinn", "fast"), **wrong)
+    with pytest.raises(ValueError, match="does not go with"):
+        replace(preset(Oscillator(), "input-aware", "fast"), random_features=10)
