@@ -1,42 +1,45 @@
 PYTHON ?= python3
-VENV := .venv
+# Each Python that is named has an environment of its own: .venv, or .venv-3.12 for make test PYTHON=python3.12.
+VERSION := $(filter-out 3,$(patsubst python%,%,$(notdir $(PYTHON))))
+VENV := .venv$(if $(VERSION),-$(VERSION))
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo test test-slow lint format maps results benchmark ablation certificates agents speed clean
+.PHONY: demo install test test-slow lint format maps results benchmark ablation certificates agents speed clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
 
-test: $(VENV)/ready lint  ## everything CI runs
-	$(BIN)/pytest
+install: $(VENV)/ready  ## make the environment .venv with everything in it
+
+# Two processes of one thread each: with more threads they get in each other's way.
+test: $(VENV)/ready $(if $(AREA),,lint)  ## all that CI runs; AREA=training/maps runs tests/training/maps alone
+	$(if $(AREA),$(BIN)/pytest tests/$(AREA),OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --cov --cov-report=html)
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/pytest -m slow
 
-lint: $(VENV)/ready
+lint: $(VENV)/ready  ## style, types and the contract of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-format: $(VENV)/ready
+format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The commands that made the shipped maps, both versions: about three hours on two cores, into runs/; resumable. A new version ships
-# as observers/maps/NAME-vN.safetensors, beside the old ones.
-maps: $(VENV)/ready
-	for system in $(SYSTEMS); do for method in input-aware spinn; do \
-		$(BIN)/kkl-gym train $$system --method $$method --resume || exit 1; done; done
+# Into runs/. A new version ships as observers/maps/NAME-vN.safetensors, beside the old ones.
+maps: $(VENV)/ready  ## train the shipped maps of both versions again, three hours on two cores; resumable
+	for system in $(SYSTEMS); do for pipeline in input-aware spinn; do \
+		$(BIN)/kkl-gym train $$system --pipeline $$pipeline --resume || exit 1; done; done
 	for system in $(CLOSED); do \
 		$(BIN)/kkl-gym train $$system --closed-loop --config training/version1.json --resume || exit 1; done
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --config training/version1.json --out runs/$$system-v1 --resume || exit 1; done
 
-# The figures in the README and in docs/.
-results: $(VENV)/ready
+results: $(VENV)/ready  ## the figures and the accuracy in the README and in docs/
 	$(BIN)/kkl-gym demo --out docs/figures
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
@@ -46,15 +49,15 @@ results: $(VENV)/ready
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark
 	mkdir -p docs/results/benchmark
-	cp $(addprefix benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
+	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
 ABLATION := ablation-spinn ablation-solved ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
 	default ablation-tuned
 
 ablation: $(VENV)/ready  ## what each idea earns, half an hour on two cores; resumable
-	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out benchmark/ablation
+	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
 	mkdir -p docs/results/ablation
-	cp $(addprefix benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
+	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
 
 certificates: $(VENV)/ready  ## the figures in docs/certificates.md
 	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
@@ -63,18 +66,22 @@ certificates: $(VENV)/ready  ## the figures in docs/certificates.md
 agents: $(VENV)/ready  ## every agent in docs/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	mkdir -p docs/results/agents training/agents/shipped
-	cp $(addprefix agents/comparison/,results.csv table.md scores.png) docs/results/agents
-	for system in $(SYSTEMS); do cp agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
+	cp $(addprefix runs/agents/comparison/,results.csv table.md scores.png) docs/results/agents
+	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
 
-clean:
-	rm -rf $(VENV) runs agents certificates tuning demo .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+clean:  ## remove environments and caches; what lies under runs/ stays
+	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*
+	find kkl_gym observers training tests examples -name __pycache__ -type d -prune -exec rm -rf {} +
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
 
 $(VENV)/ready: pyproject.toml
-	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "kkl-gym needs Python 3.11 to 3.13: make PYTHON=...")'
+	@$(PYTHON) -c 'import sys; sys.exit(None if (3, 11) <= sys.version_info < (3, 14) else "kkl-gym needs Python 3.11 to 3.13, this is %d.%d: make PYTHON=python3.12" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install --quiet --editable ".[all]" --group dev
