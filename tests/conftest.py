@@ -1,3 +1,7 @@
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch: more threads than cores get in each other's way
+
 from itertools import pairwise
 
 import numpy as np
