@@ -6,10 +6,10 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -35,42 +35,60 @@ Job = TypeVar("Job", bound=Named)
 def run_all(
     run: Callable[[Job], None], jobs: Sequence[Job], workers: int
 ) -> Iterator[tuple[Job, Exception | None, list[str]]]:
-    """Run jobs in worker processes; yields each with its failure, if any, and the names of those that run now.
+    """Run jobs in worker processes, whatever goes wrong in one of them.
 
-    ``run`` is a function of a module. With one worker, the jobs run in this process. An interruption ends the workers.
+    An interruption ends the workers, and so does the end of this process, even if it is killed.
+
+    Parameters
+    ----------
+    run : callable
+        What to do with a job; a function of a module, so that other processes find it.
+    jobs : sequence of jobs
+        They are begun in this order, each in one process.
+    workers : int
+        Number of processes. With one, the jobs run in this process.
+
+    Yields
+    ------
+    job
+        One that has ended.
+    Exception or None
+        What went wrong in it.
+    list of str
+        Names of the jobs that run now.
     """
     if workers == 1:
         for job in jobs:
             yield job, _failure(lambda job=job: run(job)), []  # type: ignore[misc]
         return
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(os.getpid(),))
+    lifeline, held = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(lifeline,))
     todo, running = list(jobs), dict[Future[None], Job]()
-    try:
-        while todo or running:
-            while todo and len(running) < workers:  # no more, so that none begins after an interruption
-                job = todo.pop(0)
-                running[pool.submit(run, job)] = job
-            finished, _ = wait(running, return_when=FIRST_COMPLETED)
-            for future in finished:
-                job = running.pop(future)
-                yield job, _failure(future.result), [job.name for job in (*running.values(), *todo[: len(finished)])]
-    except BaseException:
-        for process in list((pool._processes or {}).values()):  # its own only, not every child of this process
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+    with lifeline, held, pool:
+        try:
+            while todo or running:
+                while todo and len(running) < workers:  # no more, so that none begins after an interruption
+                    job = todo.pop(0)
+                    running[pool.submit(run, job)] = job
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    job = running.pop(future)
+                    yield job, _failure(future.result), [job.name for job in (*running.values(), *todo[: len(finished)])]
+        except BaseException:
+            held.close()
+            raise
 
 
-def _prepare(parent: int) -> None:
-    """Leave interruptions to the parent, and end when it is gone, even if that was killed."""
+def _prepare(lifeline: Connection) -> None:
+    """Leave interruptions to the parent, and end when it lets go of its end of the pipe, or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(1.0)
-        os._exit(1)
+        try:
+            lifeline.poll(None)  # nothing is ever sent
+        finally:
+            os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
 
@@ -84,7 +102,18 @@ def _failure(call: Callable[[], None]) -> Exception | None:
 
 
 def describe(system: System) -> dict[str, Any]:
-    """What identifies a system, its equations included: they are sampled at points of the training box."""
+    """What identifies a system, its equations included: they are sampled at points of the training box.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+
+    Returns
+    -------
+    dict
+        To be compared with another after a way through JSON, which makes lists of tuples.
+    """
     x = np.random.default_rng(0).uniform(*system.box(), (20, system.nx))
     rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
@@ -99,40 +128,106 @@ def describe(system: System) -> dict[str, Any]:
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
-    """Raise ValueError, naming every difference, if a file says that its folder is of something else than described.
+    """Refuse to work in a folder that holds something else.
 
-    what : the folder holds, for the message.
+    Parameters
+    ----------
+    path : Path
+        JSON file that says what its folder holds; without it, anything may be written there.
+    described : mapping
+        What the folder is wanted for; anything that JSON can hold.
+    what : str
+        It holds otherwise, for the message, such as "results of another benchmark".
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged or says something else; every difference is named.
     """
     if not path.exists():
         return
+    here = _as_json(described)
     try:
-        before = json.loads(path.read_text())
-        changed = [name for name in sorted({*before, *described}) if before.get(name) != described.get(name)]
+        there = json.loads(path.read_text())
+        changed = [name for name in sorted({*there, *here}) if there.get(name) != here.get(name)]
     except (ValueError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged, remove it if nothing in its folder is worth keeping: {error}") from None
     if changed:
-        differences = "; ".join(f"{name} = {before.get(name)} there, {described.get(name)} here" for name in changed)
+        differences = "; ".join(f"{name} = {there.get(name)} there, {here.get(name)} here" for name in changed)
         raise ValueError(f"{path.parent} holds {what}: {differences}. Take another --out, or remove it")
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in a folder, which is made; raises ValueError if one does already."""
+    """Keep other processes from working in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+
+    Raises
+    ------
+    ValueError
+        If another process is at work there already.
+    """
     folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock", timeout=0)
     try:
-        with FileLock(folder / ".lock", timeout=0):
-            yield
+        lock.acquire()
     except Timeout:
         raise ValueError(f"another process is at work in {folder}") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextmanager
+def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterator[None]:
+    """Lock a job's folder and write what identifies the job in job.json.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    described : mapping
+        What makes the job's results what they are; anything that JSON can hold.
+    what : str
+        The folder holds otherwise, for the message, such as "results of another benchmark".
+
+    Raises
+    ------
+    ValueError
+        If the folder holds another job, or another process is at work there.
+    """
+    path = folder / "job.json"
+    with locked(folder):
+        check_identity(path, described, what)
+        write(path, json.dumps(_as_json(described), indent=2) + "\n")
+        yield
 
 
 @contextmanager
 def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Iterator[None]:
-    """Lock a training run's folder and write what identifies the run, unless another run lies there.
+    """Lock a training run's folder and write what identifies the run in config.json.
 
-    Raises ValueError if that run would be spoiled, or another process is at work on it.
+    A folder without checkpoints is free for any run.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    described : mapping
+        The run; anything that JSON can hold.
+    resume : bool
+        Go on with the run whose checkpoints lie there.
+
+    Raises
+    ------
+    ValueError
+        If checkpoints would be spoiled, or another process is at work there.
     """
-    described = json.loads(json.dumps(described))
     with locked(folder):
         if any(folder.glob("*.checkpoint.*")):
             if not resume:
@@ -141,5 +236,10 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
                     "or take another folder (--out)"
                 )
             check_identity(folder / "config.json", described, "a run of another configuration")
-        write(folder / "config.json", json.dumps(described, indent=2) + "\n")
+        write(folder / "config.json", json.dumps(_as_json(described), indent=2) + "\n")
         yield
+
+
+def _as_json(described: Mapping[str, Any]) -> dict[str, Any]:
+    """As it will be read from a file: lists in place of tuples."""
+    return dict(json.loads(json.dumps(described)))

@@ -1,16 +1,28 @@
-"""Jobs in worker processes."""
+"""Jobs in worker processes, and who may work in a folder."""
 
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
-from training.jobs import run_all
+from kkl_gym import get_system
+from training.jobs import check_identity, claimed_job, claimed_run, describe, locked, run_all
+
+WAIT = 120.0  # seconds, for processes that import torch on a busy machine
 
 
 @dataclass(frozen=True)
 class Sleep:
     seconds: float
+    process: Path | None = None
 
     @property
     def name(self):
@@ -20,7 +32,29 @@ class Sleep:
 def sleep(job):
     if job.seconds < 0:
         raise ValueError("nobody sleeps backward")
+    if job.process:
+        job.process.write_text(str(os.getpid()))
     time.sleep(job.seconds)
+
+
+def until(condition):
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < WAIT
+        time.sleep(0.05)
+
+
+def alive(process):
+    """Whether a process, by its number, runs (and not only waits to be buried)."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def begun(path):
+    """Whether a job has written its process's number."""
+    return path.exists() and path.read_text() != ""
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -32,11 +66,133 @@ def test_every_job_is_run_and_failures_are_told(workers):
     assert results[-1][2] == []
 
 
-def test_an_interruption_ends_the_workers():
-    jobs = [Sleep(0.0), Sleep(600.0), Sleep(600.0)]
-    runs = run_all(sleep, jobs, 2)
-    next(runs)
-    began = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        runs.throw(KeyboardInterrupt)
-    assert time.monotonic() - began < 60.0
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
+def test_an_interruption_ends_the_workers_and_nobody_else(tmp_path):
+    unrelated = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))
+    unrelated.start()
+    try:
+        mine = [tmp_path / "first", tmp_path / "second"]
+        runs = run_all(sleep, [Sleep(0.0), *(Sleep(600.0, path) for path in mine)], 2)
+        next(runs)
+        until(lambda: begun(mine[0]))
+        with pytest.raises(KeyboardInterrupt):
+            runs.throw(KeyboardInterrupt)
+        workers = [int(path.read_text()) for path in mine if begun(path)]
+        assert not any(map(alive, workers))
+        assert unrelated.is_alive()
+    finally:
+        unrelated.kill()
+        unrelated.join()
+
+
+PARENT = """
+import sys
+from pathlib import Path
+
+from test_jobs import Sleep, sleep
+from training.jobs import run_all
+
+if __name__ == "__main__":
+    list(run_all(sleep, [Sleep(600.0, Path(path)) for path in sys.argv[1:]], 2))
+"""
+
+
+@pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
+def test_workers_do_not_outlive_a_parent_that_is_killed(tmp_path):
+    script, paths = tmp_path / "parent.py", [tmp_path / "first", tmp_path / "second"]
+    script.write_text(PARENT)
+    found = [str(Path(__file__).parent), *sys.path]
+    parent = subprocess.Popen([sys.executable, script, *paths], env={**os.environ, "PYTHONPATH": os.pathsep.join(found)})
+    try:
+        until(lambda: all(map(begun, paths)))
+    finally:
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+    workers = [int(path.read_text()) for path in paths]
+    until(lambda: not any(map(alive, workers)))
+
+
+HOLDER = """
+import sys
+from pathlib import Path
+
+from training.jobs import claimed_run
+
+with claimed_run(Path(sys.argv[1]), {"width": 8}, resume=False):
+    print("claimed", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def held_by_another_process(folder):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    arguments = [sys.executable, "-c", HOLDER, folder]
+    with subprocess.Popen(
+        arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+    ) as holder:
+        assert holder.stdout.readline() == "claimed\n"
+        yield
+        holder.stdin.close()
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path):
+    other = {"width": 16}
+    with held_by_another_process(tmp_path):
+        for resume in (False, True):
+            with pytest.raises(ValueError, match="another process is at work in"), claimed_run(tmp_path, other, resume):
+                raise AssertionError
+        assert json.loads((tmp_path / "config.json").read_text()) == {"width": 8}
+    with claimed_run(tmp_path, other, resume=False):  # it left no checkpoints
+        assert json.loads((tmp_path / "config.json").read_text()) == other
+
+
+@pytest.mark.parametrize("described", [True, False])
+def test_checkpoints_are_not_overwritten_without_being_told(described, tmp_path):
+    with claimed_run(tmp_path, {"width": 8}, resume=False):
+        (tmp_path / "inverse.checkpoint.pt").touch()
+    if not described:
+        (tmp_path / "config.json").unlink()
+    with pytest.raises(ValueError, match="holds the checkpoints of a run"), claimed_run(tmp_path, {"width": 8}, False):
+        raise AssertionError
+    with claimed_run(tmp_path, {"width": 8}, resume=True):
+        pass
+    with (
+        pytest.raises(ValueError, match="a run of another configuration: width = 8 there, 9 here"),
+        claimed_run(tmp_path, {"width": 9}, resume=True),
+    ):
+        raise AssertionError
+
+
+def test_a_job_keeps_its_folder(tmp_path):
+    described = {"levels": (0.0, 0.5), "seed": 0}
+    for _ in range(2):
+        with claimed_job(tmp_path / "job", described, "another job"):
+            assert json.loads((tmp_path / "job" / "job.json").read_text()) == {"levels": [0.0, 0.5], "seed": 0}
+    with (
+        pytest.raises(ValueError, match=r"holds another job: seed = 0 there, None here; width = None there, 3 here"),
+        claimed_job(tmp_path / "job", {"levels": (0.0, 0.5), "width": 3}, "another job"),
+    ):
+        raise AssertionError
+
+
+def test_a_lock_ends_with_its_work(tmp_path):
+    with pytest.raises(RuntimeError, match="the work"), locked(tmp_path):
+        raise RuntimeError("the work")
+    with locked(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("text", ["{", "3", "[1]"])
+def test_identities_that_are_damaged(text, tmp_path):
+    path = tmp_path / "job.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"job.json is damaged, remove it"):
+        check_identity(path, {"seed": 0}, "another job")
+
+
+def test_a_system_is_told_from_another():
+    lorenz = get_system("lorenz")
+    assert describe(lorenz) == describe(get_system("lorenz"))
+    other = describe(lorenz.replace({"rho": 30.0}))
+    assert {name for name, value in describe(lorenz).items() if value != other[name]} == {"parameters", "equations"}
