@@ -74,7 +74,11 @@ def run_all(
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in finished:
                     job = running.pop(future)
-                    yield job, _failure(future.result), [job.name for job in (*running.values(), *todo[: len(finished)])]
+                    yield (
+                        job,
+                        _failure(future.result),
+                        [job.name for job in (*running.values(), *todo[: len(finished)])],
+                    )
         except BaseException:
             held.close()
             raise

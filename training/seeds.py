@@ -23,8 +23,27 @@ AGENT_EVALUATION_SEED = 10**9
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """The generator of a stream for a seed, and for a part of what is drawn with it: ``generator(stream, seed, part)``.
+    """Make the generator of a stream for a seed, and for a part of what is drawn with it.
 
-    Parts count from 1, because NumPy does not tell a seed from the same with zeros behind it.
+    Parameters
+    ----------
+    stream : Stream
+        Who draws.
+    *seed : int
+        The seed, then the part if there is one, each in [0, 2**32). Parts count from 1, because NumPy does not tell a
+        seed from the same with zeros behind it.
+
+    Returns
+    -------
+    numpy.random.Generator
+        At its beginning.
+
+    Raises
+    ------
+    ValueError
+        If an entry is out of range. NumPy would make two of a larger one, and so the seed of another part.
     """
+    for entry in seed:
+        if not 0 <= entry < 2**32:
+            raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")
     return np.random.default_rng([stream, *seed])

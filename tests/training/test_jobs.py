@@ -101,8 +101,8 @@ if __name__ == "__main__":
 def test_workers_do_not_outlive_a_parent_that_is_killed(tmp_path):
     script, paths = tmp_path / "parent.py", [tmp_path / "first", tmp_path / "second"]
     script.write_text(PARENT)
-    found = [str(Path(__file__).parent), *sys.path]
-    parent = subprocess.Popen([sys.executable, script, *paths], env={**os.environ, "PYTHONPATH": os.pathsep.join(found)})
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    parent = subprocess.Popen([sys.executable, script, *paths], env=environment)
     try:
         until(lambda: all(map(begun, paths)))
     finally:

@@ -10,17 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
 
 import kkl_gym
 from kkl_gym.systems import get_system
 from observers.storage import write
 from training.benchmark.protocol import Protocol, measure, validate
-from training.jobs import describe
+from training.jobs import check_identity, claimed_job, describe
 from training.maps.optimise import seconds_spent
 from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
 
 FAILED = 200.0  # the worst SMAPE there is, for a configuration whose training blows up
+
+OTHER = "results of another benchmark"
 
 REVISION = 4  # rises with every change of the shipped methods: results from before are not reused
 
@@ -29,11 +30,26 @@ REVISION = 4  # rises with every change of the shipped methods: results from bef
 class Job:
     """One method on one system.
 
-    folder : what it makes: trained.safetensors, errors.csv, info.json, and what the search tried.
-    search : seconds of CPU time for each configuration; none if the first is to be taken as it is.
-    validation : trajectories on which configurations are compared; their seeds are those of validation.
-    seed : of the training.
-    device : where networks are trained.
+    Parameters
+    ----------
+    system : str
+        A shipped system, or a class as for :func:`kkl_gym.systems.get_system`.
+    method : str
+        As for :func:`training.methods.get_method`.
+    folder : Path
+        Receives trained.safetensors, errors.csv, info.json, and what the search tried.
+    budget : Budget
+        Of the training.
+    protocol : Protocol
+        What the trained observer is measured on.
+    search : float or None
+        Seconds of CPU time for each configuration; None takes the first as it is.
+    validation : Protocol
+        Trajectories on which configurations are compared, from the stream of validation.
+    seed : int
+        Of the training.
+    device : str
+        Where networks are trained.
     """
 
     system: str
@@ -54,15 +70,11 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether its errors are there; raises ValueError if they are those of another benchmark."""
-        self._check()
+        check_identity(self.folder / "job.json", self.identity, OTHER)
         return (self.folder / "errors.csv").exists()
 
-    def claim(self) -> None:
-        """Make the folder; raises ValueError if it belongs to another benchmark."""
-        self._check()
-        write(self.folder / "job.json", json.dumps(self._identity(), indent=2) + "\n")
-
-    def _identity(self) -> dict[str, Any]:
+    @property
+    def identity(self) -> dict[str, Any]:
         """What makes its results what they are: where they lie and where they were computed do not."""
         system, method = get_system(self.system), get_method(self.method)
         described = {
@@ -77,41 +89,32 @@ class Job:
         del described["folder"], described["device"]
         if type(method) not in (METHODS | ABLATION).values():  # a user's, who may be at work on it
             described["code"] = hashlib.sha256(inspect.getsource(type(method)).encode()).hexdigest()[:16]
-        found: dict[str, Any] = json.loads(json.dumps(described))
-        return found
-
-    def _check(self) -> None:
-        path = self.folder / "job.json"
-        if not path.exists():
-            return
-        before, here = json.loads(path.read_text()), self._identity()
-        changed = [name for name in sorted({*before, *here}) if before.get(name) != here.get(name)]
-        if changed:
-            differences = "; ".join(f"{name} = {before.get(name)} there, {here.get(name)} here" for name in changed)
-            raise ValueError(
-                f"{self.folder} holds results of another benchmark: {differences}. Take another --out, or remove it"
-            )
+        return described
 
 
 def run_job(job: Job) -> None:
     """Choose, train, measure; steps that were done before are not done again.
 
-    Raises ValueError if the folder is another benchmark's, RuntimeError if another process is at work there, and
-    whatever the method raises, with the traceback in failure.txt.
+    Parameters
+    ----------
+    job : Job
+        If the method fails, its folder receives the traceback in failure.txt.
+
+    Raises
+    ------
+    ValueError
+        If the folder is another benchmark's, or another process is at work there.
+    Exception
+        Whatever the method raises.
     """
     torch.set_num_threads(1)
-    job.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(job.folder / ".lock", timeout=0):
-            if not job.done:
-                job.claim()
-                try:
-                    _run(job)
-                except Exception:
-                    write(job.folder / "failure.txt", traceback.format_exc())
-                    raise
-    except Timeout:
-        raise RuntimeError(f"another process is at work in {job.folder}") from None
+    with claimed_job(job.folder, job.identity, OTHER):
+        if not job.done:
+            try:
+                _run(job)
+            except Exception:
+                write(job.folder / "failure.txt", traceback.format_exc())
+                raise
 
 
 def _run(job: Job) -> None:
@@ -144,7 +147,7 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
     for i, configuration in enumerate(configurations):
         path = job.folder / f"configuration-{i}.json"
         if not path.exists():
-            budget = replace(job.budget, seconds=job.search)
+            budget = replace(job.budget, cpu_seconds=job.search)
             try:
                 trained, _ = _train(job, method, configuration, budget, f"configuration-{i}")
                 score = validate(method, trained, system, dt=job.budget.dt, protocol=job.validation)
@@ -155,7 +158,7 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
     best = scores.index(min(scores))
     if min(scores) == FAILED:
         return configurations[best], scores
-    budget = replace(job.budget, seconds=job.search)
+    budget = replace(job.budget, cpu_seconds=job.search)
     trained, _ = _train(job, method, configurations[best], budget, f"configuration-{best}")  # loads what is there
     return method.settled(configurations[best], trained), scores
 

@@ -11,7 +11,7 @@ from kkl_gym.system import System
 from training.evaluation.errors import TRANSIENT, Domain, UnseenTrajectories, starts, unseen_trajectories
 from training.evaluation.metrics import component_smape, rmse, settling_time, smape
 from training.methods import CausalObserver, Method
-from training.seeds import Stream
+from training.seeds import Stream, generator
 
 LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts as lost
 
@@ -20,22 +20,42 @@ LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts a
 class Protocol:
     """Trajectories to test on.
 
-    domains : where they start: in X, or in a multiple of X without X.
-    noise : standard deviations of the measurement noise.
-    trajectories : number for each domain; each is taken at every noise level.
-    duration : their length in seconds.
-    seed : of starts and noise.
+    Parameters
+    ----------
+    domains : tuple of {"X", "1.5X", "2X"}
+        Where they start: in X, or in a multiple of X without X.
+    measurement_noise : tuple of float
+        Standard deviations of the noise on each sample of y.
+    trajectories : int
+        Number for each domain; each is taken at every noise level.
+    duration : float
+        Their length in seconds.
+    seed : int
+        Of starts and noise.
     """
 
     domains: tuple[Domain, ...] = ("X", "1.5X", "2X")
-    noise: tuple[float, ...] = (0.0, 0.5)
+    measurement_noise: tuple[float, ...] = (0.0, 0.5)
     trajectories: int = 100
     duration: float = 50.0
     seed: int = 0
 
 
 def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
-    """Estimates (steps + 1, n, nx) of a causal observer that is given one sample at a time of y, (steps + 1, n, ny)."""
+    """Give an observer one sample of y after the other.
+
+    Parameters
+    ----------
+    observer : CausalObserver
+        It is reset.
+    y : ndarray, shape (steps + 1, n, ny)
+        Outputs.
+
+    Returns
+    -------
+    ndarray, shape (steps + 1, n, nx)
+        Estimates.
+    """
     first = observer.reset(y[0])
     out = np.empty((len(y), *first.shape))
     out[0] = first
@@ -45,23 +65,55 @@ def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
 
 
 def with_shared_noise(
-    system: System, runs: UnseenTrajectories, *, noise: float, n: int, seed: tuple[int, ...]
+    system: System, runs: UnseenTrajectories, *, measurement_noise: float, n: int, seed: tuple[Stream, *tuple[int, ...]]
 ) -> np.ndarray:
-    """Outputs with noise on every sample, (steps + 1, trajectories, ny).
+    """Outputs with noise on every sample, the same for every method.
 
-    The noise is drawn for ``n`` trajectories, of which ``runs`` may be the first few: it is the same for every method.
+    Parameters
+    ----------
+    system : System
+        Of the trajectories.
+    runs : UnseenTrajectories
+        All ``n``, or the first few.
+    measurement_noise : float
+        Standard deviation.
+    n : int
+        Trajectories for which noise is drawn.
+    seed : tuple
+        As for :func:`training.seeds.generator`.
+
+    Returns
+    -------
+    ndarray, shape (steps + 1, trajectories inside bounds, ny)
+        y = h(x) + v.
     """
-    unit = np.random.default_rng(seed).standard_normal((n, len(runs.x), system.ny))
-    y: np.ndarray = system.output(runs.x) + noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
-    return y
+    unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
+    v = measurement_noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
+    return system.output(runs.x) + v
 
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
-    """One row for each test trajectory, noise level and domain.
+    """Measure an observer on test trajectories.
 
-    Columns: starts, noise, trajectory, escaped, smape (all steps), smape_late, component_late, rmse_late (after the
-    first fifth), rmse, settling (seconds), lost. A trajectory that leaves the system's declared bounds is marked as
-    escaped and has no errors.
+    Parameters
+    ----------
+    method : Method
+        Makes the observer.
+    trained : object
+        What the method's ``train`` returned.
+    system : System
+        To be observed.
+    dt : float
+        Sampling interval in seconds.
+    protocol : Protocol
+        The trajectories; a slow method is given the first few of each domain.
+
+    Returns
+    -------
+    DataFrame
+        A row for each trajectory, noise level and domain. Columns: starts, noise, trajectory, escaped, smape (all
+        steps), smape_late, component_late, rmse_late (after the first fifth), rmse, settling (seconds), lost. A
+        trajectory that leaves the system's declared bounds is marked as escaped and has no errors.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     frames = []
@@ -71,8 +123,8 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
             system, dt, n=protocol.trajectories, duration=protocol.duration, seed=protocol.seed, domain=domain
         ).first(n)
         skip = round(TRANSIENT * len(runs.x))
-        for noise in protocol.noise:
-            y = with_shared_noise(system, runs, noise=noise, n=protocol.trajectories, seed=seed)
+        for noise in protocol.measurement_noise:
+            y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
             x_hat = run(method.observer(trained, system, dt, noise), y)
             late = smape(runs.x, x_hat, skip)
             errors = pd.DataFrame(
@@ -94,9 +146,25 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """How well a configuration does on validation trajectories from X: smaller is better.
+    """Score a configuration on validation trajectories from X: smaller is better.
 
-    The geometric mean over the noise levels that it is tuned for of the median SMAPE over all steps, in percent.
+    Parameters
+    ----------
+    method, trained, system, dt
+        As for :func:`measure`.
+    protocol : Protocol
+        The trajectories, apart from where they start.
+
+    Returns
+    -------
+    float
+        Geometric mean, over the noise levels that the method is tuned for, of the median SMAPE over all steps, in
+        percent.
+
+    Raises
+    ------
+    ValueError
+        If no trajectory stays within the system's bounds.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     everyone = unseen_trajectories(
@@ -113,8 +181,8 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
     seed = (Stream.VALIDATION, protocol.seed, 1)
     medians = []
-    for noise in method.tuned_for or protocol.noise:
-        y = with_shared_noise(system, runs, noise=noise, n=protocol.trajectories, seed=seed)
+    for noise in method.tuned_for or protocol.measurement_noise:
+        y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
         x_hat = run(method.observer(trained, system, dt, noise), y)
         medians.append(np.median(smape(runs.x, x_hat)))
     return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))
@@ -123,7 +191,22 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """Microseconds of CPU time for one step of a whole batch: the least of five rounds."""
+    """Time one step of a whole batch.
+
+    Parameters
+    ----------
+    method, trained, system, dt
+        As for :func:`measure`.
+    batch : int
+        Number of rows.
+    seconds : float
+        CPU time to spend on it.
+
+    Returns
+    -------
+    float
+        Microseconds of CPU time, the least of five rounds.
+    """
     observer = method.observer(trained, system, dt, 0.5)
     y = system.output(starts(system, "X", batch, np.random.default_rng(0)))
     observer.reset(y)

@@ -4,12 +4,17 @@ import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from observers.storage import replacing, write
+from training.markdown import table
 from training.systems import PROFILES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 INTERVAL = "{median} ± {half_iqr} [{low}, {high}]"
 # Column of results.csv, title, form of a cell, explanation.
@@ -46,7 +51,18 @@ DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2
 def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
     """Median, half the interquartile range and a bootstrap 95 % interval of the median, for each cell.
 
-    Cells are system, method, starts and noise; trajectories that escaped are not among the values.
+    Parameters
+    ----------
+    results : DataFrame
+        A row for each trajectory. Those that escaped are not among the values.
+    column : str
+        Of the values, infinite ones included.
+
+    Returns
+    -------
+    DataFrame
+        A row for each cell, which is a system, method, starts and noise, in the order of the results. Columns: these
+        four, n (number of values), median, half_iqr, low and high (of the interval).
     """
     from scipy.stats import bootstrap  # here, because it takes half a second that other commands need not wait for
 
@@ -64,8 +80,20 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=names)
 
 
-def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) -> None:
-    """All measures as Markdown, a table for each measure and case with a row for each method."""
+def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
+    """Write all measures as Markdown, a table for each measure and case with a row for each method.
+
+    Parameters
+    ----------
+    path : Path
+        File to write, whole or not at all.
+    results : DataFrame
+        A row for each trajectory: results.csv.
+    methods : DataFrame
+        A row for each method on each system: methods.csv.
+    note : str
+        What the page begins with.
+    """
     cases = sorted(
         results[["starts", "noise"]].drop_duplicates().itertuples(index=False, name=None),
         key=lambda case: (list(DOMAINS).index(case[0]), case[1]),
@@ -75,11 +103,11 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: 
         summary = summarise(results, column).set_index(["starts", "noise", "system", "method"])
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]:g}", "", explanation, ""]
-            lines += _table(methods, partial(_spread, summary, form, case))
+            lines += _by_method(methods, partial(_spread, summary, form, case))
     lines += ["## Lost trajectories in %", "", "Above 50 % after the first 20 %, or not finite. In this order: "]
     lines[-1] += ", ".join(f"{starts} at noise {noise:g}" for starts, noise in cases) + "."
     lost = results[results.escaped == 0].groupby(["system", "method", "starts", "noise"]).lost.mean() * 100
-    lines += ["", *_table(methods, partial(_lost, lost, cases))]
+    lines += ["", *_by_method(methods, partial(_lost, lost, cases))]
     if (results.noise == 0).any():
         component = summarise(results[results.noise == 0], "component_late").set_index(["system", "method", "starts"])
         lines += [
@@ -88,7 +116,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: 
             "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper "
             "print for 1.5X \\ X, from other networks, budgets and data.",
             "",
-            *_table(methods, partial(_beside_printed, component["median"])),
+            *_by_method(methods, partial(_beside_printed, component["median"])),
         ]
     costs = methods.set_index(["system", "method"])
     lines += [
@@ -97,25 +125,22 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: 
         "CPU seconds of training; CPU time of one step, for one trajectory and for 1,000 at once.",
         "",
     ]
-    lines += _table(methods, partial(_cost, costs))
+    lines += _by_method(methods, partial(_cost, costs))
     lines += ["## Configuration", "", "Chosen on validation trajectories, or the first where there was no search.", ""]
-    lines += _table(methods, partial(_configuration, costs))
+    lines += _by_method(methods, partial(_configuration, costs))
     lines += ["## Starts that escape", "", *_escaped(results)]
-    path.write_text("\n".join(lines) + "\n")
+    write(path, "\n".join(lines) + "\n")
 
 
-def _table(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) -> list[str]:
+def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) -> list[str]:
     """Lines of a Markdown table with a cell for each (system, method)."""
     systems = list(dict.fromkeys(methods.system))
-    lines = [
-        "| | " + " | ".join(system.replace("_", " ") for system in systems) + " |",
-        "|---" * (1 + len(systems)) + "|",
-    ]
     there = set(zip(methods.system, methods.method, strict=True))
-    for name, label in _labels(methods).items():
-        cells = (cell((system, name)) if (system, name) in there else "–" for system in systems)
-        lines.append(f"| {label} | " + " | ".join(cells) + " |")
-    return [*lines, ""]
+    rows = [
+        [label, *(cell((system, name)) if (system, name) in there else "–" for system in systems)]
+        for name, label in _labels(methods).items()
+    ]
+    return [*table(["", *(system.replace("_", " ") for system in systems)], rows), ""]
 
 
 def _spread(summary: pd.DataFrame, form: str, case: tuple[str, float], job: tuple[str, str]) -> str:
@@ -164,22 +189,47 @@ def _escaped(results: pd.DataFrame) -> list[str]:
     return lines or ["None."]
 
 
-def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) -> None:
-    """The paper's heatmap: median ± half the interquartile range of the SMAPE over all steps."""
-    import matplotlib
+def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
+    """Write :func:`heatmap` as a picture.
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    Parameters
+    ----------
+    path : Path
+        File to write, whole or not at all; its ending says the format.
+    results, methods : DataFrame
+        As for :func:`write_table`.
+    note : str
+        The figure's title.
+    """
+    with replacing(path) as temporary:
+        heatmap(results, methods, note=note).savefig(temporary, dpi=130)
+
+
+def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figure":
+    """Draw the paper's heatmap: median ± half the interquartile range of the SMAPE over all steps.
+
+    Parameters
+    ----------
+    results, methods : DataFrame
+        As for :func:`write_table`.
+    note : str
+        Title.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Columns are where trajectories start, rows the levels of measurement noise.
+    """
     from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
 
     labels, systems = _labels(methods), list(dict.fromkeys(methods.system))
     summary = summarise(results, "smape").set_index(["system", "method", "starts", "noise"])
     domains = [domain for domain in DOMAINS if domain in set(results.starts)]
     levels = sorted(set(results.noise))
     size = (2.2 + (0.8 + 0.95 * len(systems)) * len(domains), 1.0 + (0.6 + 0.36 * len(labels)) * len(levels))
-    figure, axes = plt.subplots(
-        len(levels), len(domains), figsize=size, squeeze=False, sharex=True, sharey=True, layout="constrained"
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    axes: Any = figure.subplots(len(levels), len(domains), squeeze=False, sharex=True, sharey=True)
     image: Any = None
     for row, noise in zip(axes, levels, strict=True):
         for ax, domain in zip(row, domains, strict=True):
@@ -187,20 +237,9 @@ def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) ->
             for i, name in enumerate(labels):
                 for j, system in enumerate(systems):
                     key = (system, name, domain, noise)
-                    if key not in summary.index:
-                        continue
-                    cell = summary.loc[key]
-                    values[i, j] = cell["median"]
-                    light = 0.5 < cell["median"] < 80.0
-                    ax.text(
-                        j,
-                        i,
-                        f"{_short(cell['median'])}\n± {_short(cell['half_iqr'])}",
-                        ha="center",
-                        va="center",
-                        fontsize=6.5,
-                        color="black" if light else "white",
-                    )
+                    if key in summary.index:
+                        values[i, j] = summary.loc[key]["median"]
+                        _write_cell(ax, (j, i), values[i, j], summary.loc[key]["half_iqr"])
             image = ax.imshow(values, cmap="RdYlBu_r", norm=LogNorm(0.1, 200, clip=True), aspect="auto")
             ax.set_xticks(range(len(systems)), [system.replace("_", "\n") for system in systems], fontsize=7)
             ax.set_yticks(range(len(labels)), list(labels.values()), fontsize=8)
@@ -208,8 +247,13 @@ def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, note: str) ->
             ax.tick_params(length=0)
     figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", shrink=0.6)
     figure.suptitle(note, fontsize=9)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
+    return figure
+
+
+def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) -> None:
+    light = 0.5 < median < 80.0
+    text = f"{_short(median)}\n± {_short(half_iqr)}"
+    ax.text(*at, text, ha="center", va="center", fontsize=6.5, color="black" if light else "white")
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:

@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress
 
 from kkl_gym.systems import SYSTEMS, get_system
 from observers.storage import write
@@ -20,22 +20,31 @@ from training.benchmark.protocol import Protocol, step_time
 from training.benchmark.tables import draw, write_table
 from training.jobs import run_all
 from training.methods import ABLATION, METHODS, Budget, get_method
+from training.progress import progress_bars
+from training.seeds import Stream, generator
 
 BUDGETS = {
-    "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, seconds=300.0),
-    "quick": Budget("quick", trajectories=200, duration=20.0, samples=50, seconds=5.0, width=64, depth=2),
-    "short": Budget("short", trajectories=1000, duration=50.0, samples=200, seconds=40.0),
+    "cpu": Budget("cpu", trajectories=2000, duration=50.0, samples=200, cpu_seconds=300.0),
+    "quick": Budget("quick", trajectories=200, duration=20.0, samples=50, cpu_seconds=5.0, width=64, depth=2),
+    "short": Budget("short", trajectories=1000, duration=50.0, samples=200, cpu_seconds=40.0),
     # 8 million points, as in the paper
     "paper": Budget(
-        "paper", trajectories=1600, duration=50.0, samples=5000, seconds=3600.0, width=512, depth=4, activation="silu"
+        "paper",
+        trajectories=1600,
+        duration=50.0,
+        samples=5000,
+        cpu_seconds=3600.0,
+        width=512,
+        depth=4,
+        activation="silu",
     ),
 }
-
 
 PROTOCOL = Protocol()
 QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
 VALIDATION = Protocol(trajectories=20, duration=20.0)
-SEARCH = 0.2  # of the budget's seconds, for each configuration that is compared
+NAMED = 4  # methods that are missing
+SEARCH = 0.2  # of the budget's CPU seconds, for each configuration that is compared
 
 
 @dataclass(frozen=True)
@@ -57,21 +66,21 @@ class Benchmark:
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: tuple[str, ...] = tuple(METHODS)
     """Names, or classes of yours as script.py:Class or module:Class."""
-    noise: tuple[float, ...] = (0.0, 0.5)
-    """Standard deviations of the measurement noise."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: benchmark/BUDGET)")] = None
+    measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)
+    """Standard deviations of the noise on each sample of y."""
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
     jobs: int = 2
     """Worker processes, of one thread each."""
     seed: int = 0
-    """Of the test trajectories; training's is always 0."""
+    """Seed of the test trajectories; training's is always 0."""
     report: bool = False
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
         """Run what is missing; returns the folder."""
         name = "quick" if self.quick else self.budget
-        out = self.out or Path("benchmark") / name
+        out = self.out or Path("runs") / "benchmark" / name
         if self.report:
             _report(out, console)
             return out
@@ -79,7 +88,7 @@ class Benchmark:
         jobs = self._jobs(name, out)
         todo = [job for job in jobs if not job.done]
         failures = []
-        with _progress(console) as progress:
+        with progress_bars(console) as progress:
             task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
             for job, failure, running in run_all(run_job, todo, min(self.jobs, max(1, len(todo)))):
                 if failure:
@@ -98,20 +107,22 @@ class Benchmark:
         return out
 
     def _check(self) -> None:
-        if self.jobs < 1 or not self.systems or not self.methods or not self.noise:
+        if self.jobs < 1 or not self.systems or not self.methods or not self.measurement_noise:
             raise ValueError("give at least one system, method, noise level and worker process")
-        if any(not 0 <= level < math.inf for level in self.noise) or self.seed < 0:
-            raise ValueError(f"noise = {self.noise} must be finite, and it and seed = {self.seed} not negative")
+        if any(not 0 <= level < math.inf for level in self.measurement_noise):
+            raise ValueError(f"measurement_noise = {self.measurement_noise} must be finite and not negative")
+        generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
         systems = [get_system(name).name for name in self.systems]
         methods = [get_method(name).name for name in self.methods]
-        for names in (systems, methods, list(self.noise)):
+        for names in (systems, methods, list(self.measurement_noise)):
             if len(set(names)) < len(names):
                 raise ValueError(f"{names} has one of them twice")
 
     def _jobs(self, name: str, out: Path) -> list[Job]:
-        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, noise=self.noise, seed=self.seed)
+        levels = self.measurement_noise
+        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, measurement_noise=levels, seed=self.seed)
         budget = BUDGETS[name]
-        search = None if self.quick else SEARCH * budget.seconds
+        search = None if self.quick else SEARCH * budget.cpu_seconds
         device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
         return [
             Job(
@@ -121,7 +132,7 @@ class Benchmark:
                 budget=budget,
                 protocol=protocol,
                 search=search,
-                validation=replace(VALIDATION, noise=self.noise),
+                validation=replace(VALIDATION, measurement_noise=levels),
                 device=device,
             )
             for system in self.systems
@@ -146,11 +157,6 @@ class Benchmark:
                 continue
             write(job.folder / "speed.json", json.dumps(times) + "\n")
         return failures
-
-
-def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, TimeRemainingColumn(), console=console)
 
 
 def _full_set(found: Iterable[str]) -> list[str]:
@@ -213,14 +219,34 @@ def _report(out: Path, console: Console) -> None:
         if not (out / name).exists():
             raise ValueError(f"{out / name} does not exist; run the benchmark first")
     results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
-    systems, names = set(methods.system) | set(SYSTEMS), set(methods.method) | set(_full_set(methods.method))
-    whole = len(systems) * len(names)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
-    if len(methods) < whole:
-        note += f" Partial: {len(methods)} of {whole} observers."
-    write_table(out / "table.md", results, methods, note)
-    draw(out / "heatmap.png", results, methods, note)
-    console.print(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}")
+    whole, missing = _missing(methods)
+    named = ""
+    if missing:
+        note += f" Partial: {whole - len(missing)} of {whole} observers."
+        named = f" Missing: {_in_short(missing)}."
+    write_table(out / "table.md", results, methods, note=note + named)
+    draw(out / "heatmap.png", results, methods, note=note)
+    console.print(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}{named}")
+
+
+def _missing(methods: pd.DataFrame) -> tuple[int, list[tuple[str, str]]]:
+    """Number of observers in a full set, the user's included, and each (system, method) of it that is not there."""
+    systems = dict.fromkeys([*SYSTEMS, *methods.system])
+    names = dict.fromkeys([*_full_set(methods.method), *methods.method])
+    whole = [(system, name) for name in names for system in systems]
+    there = set(zip(methods.system, methods.method, strict=True))
+    return len(whole), [observer for observer in whole if observer not in there]
+
+
+def _in_short(missing: list[tuple[str, str]]) -> str:
+    """A few observers by name, and how many more; several of one method are one."""
+    systems: dict[str, list[str]] = {}
+    for system, name in missing:
+        systems.setdefault(name, []).append(system)
+    few = [f"{name} ({', '.join(those)})" for name, those in systems.items()]
+    more = len(few) - NAMED
+    return ", ".join(few[:NAMED]) + (f" and {more} more methods" if more > 0 else "")
 
 
 __all__ = ["Benchmark"]

@@ -23,9 +23,22 @@ ABLATION: dict[str, type[Method[Any]]] = {
 
 
 def get_method(name: str) -> Method[Any]:
-    """The method of this name, or of a class of the user's as ``"module:Class"`` or ``"path/to/script.py:Class"``.
+    """Find a method of the benchmark.
 
-    Raises ValueError if there is none.
+    Parameters
+    ----------
+    name : str
+        Of a shipped one, or a class of the user's as ``"module:Class"`` or ``"path/to/script.py:Class"``.
+
+    Returns
+    -------
+    Method
+        The class is given no arguments.
+
+    Raises
+    ------
+    ValueError
+        If there is none, or the class lacks something or takes a shipped method's name.
     """
     shipped = METHODS | ABLATION
     if name in shipped:

@@ -1,7 +1,6 @@
 """What a method of the benchmark is: trained from a system and a budget, it makes observers that step causally."""
 
 import json
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
@@ -16,6 +15,7 @@ from safetensors.numpy import save_file
 from torch import nn
 
 from kkl_gym.system import System
+from observers.storage import replacing
 from training.jobs import describe
 from training.maps.optimise import Loss, Stage, optimise
 from training.progress import progress_bars
@@ -43,20 +43,33 @@ class CausalObserver(Protocol):
 class Budget:
     """What every method is given for a training.
 
-    name : identifies it.
-    trajectories, duration, samples : data: noise-free trajectories of this length in seconds from starts in X, and the
-        points along each at which the state is recorded. The output is recorded at every step.
-    seconds : CPU time of the optimisation.
-    width, depth, activation : hidden layers of every multilayer perceptron.
-    dt : sampling interval in seconds.
-    steps : batches after which a training ends in any case.
+    Parameters
+    ----------
+    name : str
+        Identifies it.
+    trajectories : int
+        Number of noise-free trajectories from starts in X.
+    duration : float
+        Their length in seconds.
+    samples : int
+        Points along each at which the state is recorded. The output is recorded at every step.
+    cpu_seconds : float
+        CPU time of the optimisation.
+    width, depth : int
+        Hidden layers of every multilayer perceptron.
+    activation : {"tanh", "silu"}
+        Their activation.
+    dt : float
+        Sampling interval in seconds.
+    steps : int
+        Batches after which a training ends in any case.
     """
 
     name: str
     trajectories: int
     duration: float
     samples: int
-    seconds: float
+    cpu_seconds: float
     width: int = 128
     depth: int = 3
     activation: str = "tanh"
@@ -68,9 +81,14 @@ class Budget:
 class Data:
     """Noise-free training trajectories.
 
-    ages : samples since the start at which x is recorded, sorted, (m,).
-    x : states at ``ages``, (m, n, nx).
-    y : outputs at every step, (steps + 1, n, ny), float32.
+    Parameters
+    ----------
+    ages : ndarray of int, shape (m,)
+        Samples since the start at which x is recorded, sorted.
+    x : ndarray, shape (m, n, nx)
+        States at ``ages``.
+    y : ndarray of float32, shape (steps + 1, n, ny)
+        Outputs at every step.
     """
 
     ages: np.ndarray
@@ -80,7 +98,28 @@ class Data:
 
 @lru_cache(maxsize=1)
 def simulated(system: System, n: int, *, duration: float, samples: int, dt: float, seed: int) -> Data:
-    """The training data of a system; the same for every method."""
+    """Simulate the training data of a system; the same for every method.
+
+    Parameters
+    ----------
+    system : System
+        Any system; its input is zero.
+    n : int
+        Number of trajectories.
+    duration : float
+        Their length in seconds.
+    samples : int
+        Points along each at which the state is recorded.
+    dt : float
+        Sampling interval in seconds.
+    seed : int
+        Of the starts.
+
+    Returns
+    -------
+    Data
+        The last one is kept, so that methods on one system share it.
+    """
     rng = generator(Stream.TRAINING, seed)
     steps = max(1, round(duration / dt))
     ages = recording_ages(0, steps, samples)
@@ -93,7 +132,21 @@ def simulated(system: System, n: int, *, duration: float, samples: int, dt: floa
 
 @dataclass(frozen=True)
 class Task:
-    """One training: the system, the budget, the seed, and a folder for checkpoints and scalars."""
+    """One training.
+
+    Parameters
+    ----------
+    system : System
+        To be observed.
+    budget : Budget
+        What may be spent.
+    folder : Path
+        Receives checkpoints.
+    seed : int
+        Of everything random.
+    device : torch.device
+        Where networks are trained.
+    """
 
     system: System
     budget: Budget
@@ -120,9 +173,25 @@ class Task:
         return generator(Stream.TRAINING, self.seed, 1)
 
     def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
-        """Minimise a loss by Adam within ``share`` of the budget's CPU time; goes on from a checkpoint if there is one.
+        """Minimise a loss by Adam; goes on from a checkpoint if there is one.
 
-        Raises FloatingPointError if the loss stops being a number.
+        Parameters
+        ----------
+        name : str
+            Of this stage of the training, for its checkpoint.
+        module : torch.nn.Module
+            What is trained, in place.
+        loss : callable
+            Draws a batch with the torch.Generator it is given, and returns a scalar tensor.
+        learning_rate : float
+            The highest.
+        share : float
+            Of the budget's CPU time.
+
+        Raises
+        ------
+        FloatingPointError
+            If the loss stops being a number.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
@@ -133,21 +202,25 @@ class Task:
             folder=self.folder,
             fingerprint=identity,
             seed=self.seed,
-            cpu_seconds=self.budget.seconds * share,
+            cpu_seconds=self.budget.cpu_seconds * share,
         )
         with progress_bars(None) as progress:
             optimise(stage, module, loss, progress, resume=True)
 
 
 class Method(ABC, Generic[Trained]):
-    """A way to make observers; see docs/benchmark.md for how to add one.
+    """A contender of the benchmark: a way to make observers. docs/benchmark.md says how to add one.
 
-    Class variables
-    ---------------
-    name : identifies the method in commands, folders and tables.
-    label : how tables and figures call it.
-    trajectories : the largest number of test trajectories, for methods too slow for all of them.
-    tuned_for : noise levels at which its configurations are compared, if not all those of the test.
+    Attributes
+    ----------
+    name : str
+        Identifies the method in commands, folders and tables.
+    label : str
+        How tables and figures call it.
+    trajectories : int or None
+        The largest number of test trajectories, for methods too slow for all of them.
+    tuned_for : tuple of float or None
+        Noise levels at which its configurations are compared; None for all those of the test.
     """
 
     name: ClassVar[str]
@@ -156,32 +229,119 @@ class Method(ABC, Generic[Trained]):
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """At most three; the benchmark takes the one that does best on validation trajectories."""
+        """Propose at most three; the benchmark takes the one that does best on validation trajectories.
+
+        Parameters
+        ----------
+        system : System
+            To be observed.
+
+        Returns
+        -------
+        tuple of mappings
+            Each of settings by name, as JSON can hold them.
+        """
         return ({},)
 
     def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
-        """What the full training is given, after a short one with this configuration did best."""
+        """Say what the full training is given, after a short one did best.
+
+        Parameters
+        ----------
+        configuration : mapping
+            Of the short training.
+        trained : object
+            What it made.
+
+        Returns
+        -------
+        mapping
+            A configuration.
+        """
         return configuration
 
     @abstractmethod
     def train(self, task: Task, configuration: Configuration) -> Trained:
-        """Learn what the observer needs; may raise FloatingPointError if training fails."""
+        """Learn what the observer needs.
+
+        Parameters
+        ----------
+        task : Task
+            The system, its data, and what may be spent.
+        configuration : mapping
+            One of :meth:`configurations`.
+
+        Returns
+        -------
+        object
+            What :meth:`observer` and :meth:`save` take; a dictionary of arrays is saved and loaded by itself.
+
+        Raises
+        ------
+        FloatingPointError
+            If training fails. The configuration is then no candidate.
+        """
 
     @abstractmethod
-    def observer(self, trained: Trained, system: System, dt: float, noise: float) -> CausalObserver:
-        """An observer for outputs with this standard deviation of measurement noise (many need not be told)."""
+    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: float, /) -> CausalObserver:
+        """Make an observer. The arguments are given by position, so that a class may name them as it likes.
+
+        Parameters
+        ----------
+        trained : object
+            What :meth:`train` returned.
+        system : System
+            To be observed.
+        dt : float
+            Sampling interval in seconds.
+        measurement_noise : float
+            Standard deviation of the noise on each sample of y; many methods need not know it.
+
+        Returns
+        -------
+        CausalObserver
+            Of any number of trajectories at once.
+        """
 
     def save(self, trained: Trained, path: Path) -> None:
-        """Write what was trained, whole or not at all; by default a dictionary of arrays."""
+        """Write what was trained, whole or not at all; by default a dictionary of arrays.
+
+        Parameters
+        ----------
+        trained : object
+            What :meth:`train` returned.
+        path : Path
+            File to write.
+
+        Raises
+        ------
+        TypeError
+            If it is no dictionary, and the method does not override this.
+        """
         if not isinstance(trained, dict):
             raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.new")
         arrays = {name: np.ascontiguousarray(value) for name, value in trained.items()}
-        save_file(arrays, temporary, metadata={"kkl-gym-method": self.name})
-        os.replace(temporary, path)
+        with replacing(path) as temporary:
+            save_file(arrays, temporary, metadata={"kkl-gym-method": self.name})
 
     def load(self, path: Path) -> Trained:
-        """Read what :meth:`save` wrote; raises ValueError if the file is damaged or of another method."""
+        """Read what :meth:`save` wrote.
+
+        Parameters
+        ----------
+        path : Path
+            The file.
+
+        Returns
+        -------
+        object
+            As :meth:`train` returned it.
+
+        Raises
+        ------
+        ValueError
+            If the file is damaged, or of another method.
+        """
         try:
             with safe_open(path, framework="numpy") as opened:
                 name = (opened.metadata() or {}).get("kkl-gym-method")

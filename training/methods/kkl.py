@@ -19,16 +19,30 @@ SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
 
 
 def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
-    """2 nx + 1 eigenvalues for each output, evenly spaced in the logarithm."""
+    """Space 2 nx + 1 eigenvalues for each output evenly in the logarithm.
+
+    Parameters
+    ----------
+    system : System
+        With nx states.
+    fastest, slowest : float
+        The ends, in 1/s and negative.
+
+    Returns
+    -------
+    tuple of float
+        From the slowest on.
+    """
     return evenly_spaced(2 * system.nx + 1, slowest, fastest)
 
 
 class KKLMethod(Method[Artifact]):
     """Whatever trains an artifact."""
 
-    def observer(self, trained: Artifact, system: System, dt: float, noise: float) -> CausalObserver:
+    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: float, /) -> CausalObserver:
         """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
-        return KKLObserver(trained, min(noise, trained.inverse.measurement_noise_max), process_noise=0.0)
+        level = min(measurement_noise, trained.inverse.measurement_noise_max)
+        return KKLObserver(trained, level, process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""
@@ -40,7 +54,22 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """A configuration of the package with the benchmark's data, networks and limit of CPU time."""
+    """Give a configuration of the package the benchmark's data, networks and limit of CPU time.
+
+    Parameters
+    ----------
+    config : Config
+        Any.
+    budget : Budget
+        Of the benchmark.
+    seed : int
+        Of the training.
+
+    Returns
+    -------
+    Config
+        The rest is as it was.
+    """
     return replace(
         config,
         dt=budget.dt,
@@ -52,7 +81,7 @@ def within(config: Config, budget: Budget, seed: int) -> Config:
         activation=budget.activation,  # type: ignore[arg-type]
         forward_steps=budget.steps if config.forward_steps else 0,
         inverse_steps=budget.steps,
-        cpu_seconds=budget.seconds if math.isfinite(budget.seconds) else None,
+        cpu_seconds=budget.cpu_seconds if math.isfinite(budget.cpu_seconds) else None,
         seed=seed,
     )
 
@@ -87,7 +116,7 @@ class Shipped(KKLMethod):
 
 
 class SPINN(KKLMethod):
-    """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --method spinn``)."""
+    """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``)."""
 
     name: ClassVar[str] = "spinn"
     label: ClassVar[str] = "SPINN"
