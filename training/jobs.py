@@ -74,11 +74,8 @@ def run_all(
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in finished:
                     job = running.pop(future)
-                    yield (
-                        job,
-                        _failure(future.result),
-                        [job.name for job in (*running.values(), *todo[: len(finished)])],
-                    )
+                    active = [*running.values(), *todo[: len(finished)]]
+                    yield job, _failure(future.result), [job.name for job in active]
         except BaseException:
             held.close()
             raise

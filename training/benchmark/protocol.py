@@ -89,7 +89,8 @@ def with_shared_noise(
     """
     unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
     v = measurement_noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
-    return system.output(runs.x) + v
+    y: np.ndarray = system.output(runs.x) + v
+    return y
 
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:

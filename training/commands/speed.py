@@ -35,7 +35,18 @@ class Speed:
     """Steps of each vector environment in a turn, from starts in the training box on."""
 
     def run(self, console: Console) -> dict[str, float]:
-        """Measure; returns the steps per second of each environment as multiples of its reference's."""
+        """Measure and print.
+
+        Parameters
+        ----------
+        console : rich.console.Console
+            For people.
+
+        Returns
+        -------
+        dict of str to float
+            Steps per second of each environment, as a multiple of its reference's.
+        """
         ratios = self._single(console)
         return ratios | self._vector(console)
 
@@ -93,7 +104,20 @@ class Speed:
 
 
 def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
-    """Seconds that the actions take, resets of ended episodes included."""
+    """Time an environment.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        It is reset first, which does not count.
+    actions : list of ndarray
+        One for each step.
+
+    Returns
+    -------
+    float
+        Seconds, resets of ended episodes included.
+    """
     env.reset(seed=0)
     started = time.perf_counter()
     for action in actions:
@@ -104,7 +128,20 @@ def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
 
 
 def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
-    """Seconds that the actions take in an environment that resets by itself, once it has been reset."""
+    """Time a vector environment that resets by itself.
+
+    Parameters
+    ----------
+    env : gymnasium.vector.VectorEnv
+        It is reset first, which does not count.
+    actions : list of ndarray
+        One of all rows for each step.
+
+    Returns
+    -------
+    float
+        Seconds.
+    """
     env.reset(seed=0)
     started = time.perf_counter()
     for action in actions:

@@ -24,7 +24,20 @@ RUNS = 50  # on which its observer is measured
 
 
 def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
-    """Those of a :class:`training.config.Config` that make an observer with this spectrum for this noise."""
+    """Find the settings of a :class:`training.config.Config` that make an observer for some noise.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Of its filter.
+    measurement_noise : float
+        Standard deviation that is expected on each sample of y.
+
+    Returns
+    -------
+    dict
+        Settings by name; the others are the preset's.
+    """
     return {
         "eigenvalues": spectrum.eigenvalues,
         "pairs": spectrum.pairs,
@@ -37,7 +50,28 @@ def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
 def trained_error(
     system: System, spectrum: Spectrum, *, measurement_noise: float, seconds: float, dt: float, duration: float
 ) -> float:
-    """Median SMAPE in percent, over all steps, of an observer of free motion trained for so many CPU seconds."""
+    """Train an observer of free motion and measure what it leaves.
+
+    Parameters
+    ----------
+    system : System
+        To be observed.
+    spectrum : Spectrum
+        Of the filter.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    seconds : float
+        CPU time of the training.
+    dt : float
+        Sampling interval in seconds.
+    duration : float
+        Length of each run in seconds.
+
+    Returns
+    -------
+    float
+        Median SMAPE in percent, over all steps of runs that nobody trained on.
+    """
     config = replace(
         preset(system, "input-aware", "fast"),
         **settings(spectrum, measurement_noise),
@@ -55,5 +89,16 @@ def trained_error(
 
 
 def rank_correlation(predicted: Sequence[float], measured: Sequence[float]) -> float:
-    """Spearman's; NaN for fewer than three pairs, which tell nothing."""
+    """Spearman's rank correlation.
+
+    Parameters
+    ----------
+    predicted, measured : sequences of float
+        As many of each.
+
+    Returns
+    -------
+    float
+        NaN for fewer than three pairs, which tell nothing.
+    """
     return float(spearmanr(predicted, measured).statistic) if len(predicted) > 2 else np.nan

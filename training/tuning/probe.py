@@ -27,7 +27,17 @@ SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no 
 
 @dataclass(frozen=True)
 class Choice:
-    """A spectrum with the error that is predicted for it, in percent."""
+    """A spectrum with the error that is predicted for it.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Modes for each output.
+    error : float
+        In percent.
+    kind : str
+        How it was found, for tables.
+    """
 
     spectrum: Spectrum
     error: float
@@ -48,14 +58,23 @@ class Probe:
 
     Parameters
     ----------
-    system : any system; its input is zero here.
-    dt, duration : in seconds; duration is that of the runs over which the error is averaged.
-    motions, seed : number and seed of their starts.
-    start : modes to choose more to, beside the library.
+    system : System
+        Any system; its input is zero here.
+    dt : float
+        Sampling interval in seconds.
+    duration : float
+        Length in seconds of the runs over which the error is averaged.
+    motions : int
+        Number of motions that are followed.
+    seed : int
+        Of their starts.
+    start : Spectrum
+        Modes to choose more to, beside the library.
 
     Raises
     ------
-    ValueError : if hardly any motion stays within the system's bounds, or none can be followed for long.
+    ValueError
+        If hardly any motion stays within the system's bounds, or none can be followed for long.
     """
 
     system: System
@@ -122,9 +141,21 @@ class Probe:
         return np.unique([_rounded(w) for w in at if w > 0])
 
     def response(self, spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the filter with this spectrum makes of motions, of errors in their starts, and of noise, at all ages.
+        """Run the filter with some spectrum along the motions.
 
-        z : (ages, motions, size); of errors : (ages, motions, nx, size); covariance : (ages, size, size).
+        Parameters
+        ----------
+        spectrum : Spectrum
+            Modes for each output.
+
+        Returns
+        -------
+        ndarray, shape (ages, motions, size)
+            What it makes of the outputs: z.
+        ndarray, shape (ages, motions, nx, size)
+            Of errors in the starts, to first order.
+        ndarray, shape (ages, size, size)
+            Of noise on the outputs: its covariance in z for a standard deviation of 1.
         """
         linear = spectrum.filter(self.system.ny, self.dt)
         steps, n, ny, nx = self.signal.shape
@@ -134,11 +165,45 @@ class Probe:
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
 
     def error(self, spectrum: Spectrum, measurement_noise: float) -> float:
-        """Predicted error of the best decoder, |x_hat - x|/|x| in percent: root mean square, mean over runs."""
+        """Predict the error of the best decoder.
+
+        Parameters
+        ----------
+        spectrum : Spectrum
+            Modes for each output.
+        measurement_noise : float
+            Standard deviation of the noise on each sample of y.
+
+        Returns
+        -------
+        float
+            |x_hat - x|/|x| in percent: root mean square, mean over runs.
+
+        Raises
+        ------
+        FloatingPointError
+            If it is no number.
+        """
         return self._error(*self.response(spectrum), measurement_noise)
 
     def least(self, measurement_noise: float) -> float:
-        """The same of whoever knows the equations and remembers every sample of y; raises ValueError without noise."""
+        """Predict the error of whoever knows the equations and remembers every sample of y.
+
+        Parameters
+        ----------
+        measurement_noise : float
+            Standard deviation of the noise on each sample of y.
+
+        Returns
+        -------
+        float
+            As of :meth:`error`.
+
+        Raises
+        ------
+        ValueError
+            Without noise.
+        """
         if not measurement_noise > 0:
             raise ValueError("without noise, all of y tells the state exactly")
         square = np.einsum("tnij,tnik->tnjk", self.signal, self.signal).cumsum(0)
@@ -161,10 +226,21 @@ class Probe:
         return found
 
     def choose(self, measurement_noise: float, most: int = 21, anew: bool = False) -> list[Choice]:
-        """Spectra of more and more modes, each the one before and the mode, or pair, of the library that helps most.
+        """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
 
-        The first is ``start``, unless there is none or ``anew``. It ends at ``most`` modes, or where none lowers the
-        error by LEAST_GAIN; there is at least one. With several outputs, each has all.
+        Parameters
+        ----------
+        measurement_noise : float
+            Standard deviation of the noise on each sample of y.
+        most : int
+            Modes for each output at which it ends. It also ends where none lowers the error by LEAST_GAIN.
+        anew : bool
+            Begin with a mode of the library. Otherwise the first spectrum is ``start``, if there is one.
+
+        Returns
+        -------
+        list of Choice
+            At least one. With several outputs, each has all modes.
         """
         z, Z, P = self._of_library
         ny, everything = self.system.ny, self.start + self.library
@@ -201,7 +277,22 @@ class Probe:
             found.append(Choice(chosen, error))
 
     def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
-        """For each order, the poles of a Bessel filter at the best of some cutoffs in rad/s."""
+        """Find Bessel filters to compare with.
+
+        Parameters
+        ----------
+        measurement_noise : float
+            Standard deviation of the noise on each sample of y.
+        orders : sequence of int
+            Of the filters: their numbers of modes.
+        cutoffs : iterable of float
+            In rad/s, to choose the best from.
+
+        Returns
+        -------
+        list of Choice
+            One for each order.
+        """
         found, cutoffs = [], list(cutoffs)
         for order in orders:
             options = []

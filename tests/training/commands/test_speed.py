@@ -1,14 +1,85 @@
 """kkl-gym speed."""
 
+import numpy as np
+import pytest
 from rich.console import Console
 
-from training.commands.speed import Speed
+import kkl_gym
+from training.commands import speed
+from training.commands.speed import Speed, timed, timed_vector
+
+
+class Clock:
+    """Time that passes only where it is told to."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def perf_counter(self):
+        return self.now
+
+
+class Env:
+    """A reset takes a second, a step a quarter; episodes have three steps."""
+
+    def __init__(self, clock):
+        self.clock, self.taken = clock, []
+
+    def reset(self, seed=None):
+        self.clock.now += 1.0
+
+    def step(self, action):
+        self.clock.now += 0.25
+        self.taken.append(action)
+        return None, 0.0, len(self.taken) == 3, len(self.taken) == 6, {}
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(speed, "time", clock)
+    return clock
+
+
+def test_steps_and_resets_of_ended_episodes_are_timed_but_not_the_first_reset(clock):
+    env, actions = Env(clock), list(range(7))
+    assert timed(env, actions) == 7 * 0.25 + 2 * 1.0
+    assert env.taken == actions
+
+
+def test_vector_environments_reset_by_themselves(clock):
+    assert timed_vector(Env(clock), list(range(7))) == 7 * 0.25
+
+
+def test_environments_take_turns_and_the_first_turn_does_not_count():
+    order = []
+
+    def task(name, seconds):
+        return lambda: (order.append(name), next(seconds))[1]
+
+    seconds = Speed(turns=2)._in_turns({"a": task("a", iter([9.0, 1.0, 2.0])), "b": task("b", iter([8.0, 4.0, 4.0]))})
+    assert order == ["a", "b"] * 3
+    assert seconds == {"a": [1.0, 2.0], "b": [4.0, 4.0]}
+    # On a machine that slows down, the ratio in each turn counts: 1/4, 2/4.
+    assert speed._ratios(seconds, "a") == {"a": 1.0, "b": np.median([0.25, 0.5])}
 
 
 def test_speed_measures_every_environment(capsys):
+    """The printed times, of a single turn, are those that the ratios are made of."""
     ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
-    assert len(ratios) == 9 + 13
-    printed = capsys.readouterr().out
-    assert "simulation" in printed
-    assert "KKLLorenz-v0, z" in printed
-    assert all(ratio > 0 for ratio in ratios.values())
+    single = {"Pendulum-v1"} | {f"{env}{what}" for env in kkl_gym.ENV_IDS.values() for what in ("", ", x_hat")}
+    batched = {"CartPole-v1"} | {f"{env}{what}" for env in kkl_gym.ENV_IDS.values() for what in ("", ", z", ", x_hat")}
+    assert set(ratios) == single | {f"{name}, 8 rows" for name in batched}
+    assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 8 rows"]) == (1.0, 1.0)
+    lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
+    for length, reference, rows in ((3, "Pendulum-v1", ""), (5, "CartPole-v1", ", 8 rows")):
+        table = {cells[0].strip(): [cell.strip() for cell in cells[1:]] for cells in lines if len(cells) == length}
+        assert {name + rows for name in table} <= set(ratios)
+        own = float(table[reference][0])
+        for name, (us, *parts, printed) in table.items():
+            assert float(printed) == pytest.approx(ratios[name + rows], abs=0.006)
+            assert own == pytest.approx(ratios[name + rows] * float(us), rel=0.05, abs=1.0)
+            if rows:
+                simulated, network = ("%" in part for part in parts)
+                assert simulated == (name != reference)
+                assert network == name.endswith("x_hat")
