@@ -43,7 +43,7 @@ BUDGETS = {
 PROTOCOL = Protocol()
 QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
 VALIDATION = Protocol(trajectories=20, duration=20.0)
-NAMED = 4  # methods that are missing
+NAMED = 4  # of the methods that are missing, by their names
 SEARCH = 0.2  # of the budget's CPU seconds, for each configuration that is compared
 
 
@@ -220,33 +220,26 @@ def _report(out: Path, console: Console) -> None:
             raise ValueError(f"{out / name} does not exist; run the benchmark first")
     results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
-    whole, missing = _missing(methods)
-    named = ""
-    if missing:
-        note += f" Partial: {whole - len(missing)} of {whole} observers."
-        named = f" Missing: {_in_short(missing)}."
-    write_table(out / "table.md", results, methods, note=note + named)
-    draw(out / "heatmap.png", results, methods, note=note)
-    console.print(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}{named}")
+    partial, missing = _missing(methods)
+    write_table(out / "table.md", results, methods, note=note + partial + missing)
+    draw(out / "heatmap.png", results, methods, note=note + partial)
+    console.print(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}{partial}{missing}")
 
 
-def _missing(methods: pd.DataFrame) -> tuple[int, list[tuple[str, str]]]:
-    """Number of observers in a full set, the user's included, and each (system, method) of it that is not there."""
+def _missing(methods: pd.DataFrame) -> tuple[str, str]:
+    """How many observers there are of a full set, the user's included, and which are not; empty if all are there."""
     systems = dict.fromkeys([*SYSTEMS, *methods.system])
     names = dict.fromkeys([*_full_set(methods.method), *methods.method])
-    whole = [(system, name) for name in names for system in systems]
     there = set(zip(methods.system, methods.method, strict=True))
-    return len(whole), [observer for observer in whole if observer not in there]
-
-
-def _in_short(missing: list[tuple[str, str]]) -> str:
-    """A few observers by name, and how many more; several of one method are one."""
-    systems: dict[str, list[str]] = {}
-    for system, name in missing:
-        systems.setdefault(name, []).append(system)
-    few = [f"{name} ({', '.join(those)})" for name, those in systems.items()]
-    more = len(few) - NAMED
-    return ", ".join(few[:NAMED]) + (f" and {more} more methods" if more > 0 else "")
+    missing = {name: [system for system in systems if (system, name) not in there] for name in names}
+    few = [name if len(on) == len(systems) else f"{name} on {', '.join(on)}" for name, on in missing.items() if on]
+    if not few:
+        return "", ""
+    more = f" and {len(few) - NAMED} more methods" if len(few) > NAMED else ""
+    return (
+        f" Partial: {len(there)} of {len(systems) * len(names)} observers.",
+        f" Missing: {'; '.join(few[:NAMED])}{more}.",
+    )
 
 
 __all__ = ["Benchmark"]

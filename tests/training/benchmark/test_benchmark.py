@@ -5,29 +5,31 @@ import math
 import shutil
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
 from filelock import FileLock
-from PIL import Image
+from matplotlib.image import imread
+from matplotlib.text import Text
 from rich.console import Console
 
 import training.commands.benchmark as command
 from kkl_gym import get_system
-from training.benchmark.jobs import Job, run_job
+from training.benchmark import protocol as protocol_module
+from training.benchmark.jobs import OTHER, Job, run_job
 from training.benchmark.protocol import Protocol, measure, run, step_time, validate, with_shared_noise
-from training.benchmark.tables import _number, summarise
+from training.benchmark.tables import _number, heatmap, summarise
+from training.cli import main
 from training.commands.benchmark import Benchmark
 from training.evaluation.errors import starts, unseen_trajectories
 from training.evaluation.metrics import component_smape, rmse, settling_time, smape
-from training.jobs import run_all
+from training.jobs import claimed_job, run_all
 from training.methods import METHODS, Budget, Method, get_method
 from training.seeds import Stream
 
-TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
+TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, cpu_seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
-COMMITTED = Path(__file__).parents[3] / "docs" / "results" / "benchmark"
+RESULTS = Path(__file__).parents[3] / "docs" / "results"
 
 TOY = '''
 from pathlib import Path
@@ -165,7 +167,7 @@ class Oracle(Method):
 
 def test_measure_marks_the_lost_and_the_escaped():
     system, dt = get_system("rossler"), 0.01
-    protocol = Protocol(domains=("2X",), noise=(0.0,), trajectories=100, duration=20.0)
+    protocol = Protocol(domains=("2X",), measurement_noise=(0.0,), trajectories=100, duration=20.0)
     runs = unseen_trajectories(system, dt, n=100, duration=20.0, seed=0, domain="2X")
     assert runs.escaped > 0
     frame = measure(Oracle(runs.x, wrong=((0, np.nan), (1, 1e6))), None, system, dt=dt, protocol=protocol)
@@ -189,7 +191,10 @@ def test_methods_that_are_slow_get_the_first_trajectories():
     frame = measure(method, None, system, dt=dt, protocol=Protocol(domains=("X",), trajectories=100, duration=1.0))
     assert len(frame) == 2 * 2
     np.testing.assert_array_equal(many.x[:, :2], runs.x)
-    few, all_of_them = (with_shared_noise(system, one, noise=0.5, n=100, seed=(0,)) for one in (runs, many))
+    few, all_of_them = (
+        with_shared_noise(system, one, measurement_noise=0.5, n=100, seed=(Stream.EVALUATION, 0))
+        for one in (runs, many)
+    )
     np.testing.assert_array_equal(all_of_them[:, :2], few)
 
 
@@ -226,7 +231,7 @@ def test_validation_trajectories_are_not_those_of_evaluation():
     )
     assert np.abs(evaluation[0] - validation[0]).min() > 1e-3
     exact = unseen_trajectories(system, 0.01, n=5, duration=0.1, seed=0, stream=Stream.VALIDATION).x
-    protocol = Protocol(noise=(0.0, 0.5), trajectories=5, duration=0.1)
+    protocol = Protocol(measurement_noise=(0.0, 0.5), trajectories=5, duration=0.1)
     assert validate(Oracle(exact), None, system, dt=0.01, protocol=protocol) == pytest.approx(1e-6)
     double = validate(Oracle(2 * exact), None, system, dt=0.01, protocol=protocol)
     assert double == pytest.approx(100 * 2 / 3)
@@ -242,7 +247,7 @@ def test_methods_made_for_one_noise_level_are_validated_there():
             asked.append(noise)
             return self
 
-    protocol = Protocol(noise=(0.0, 0.5), trajectories=2, duration=0.1)
+    protocol = Protocol(measurement_noise=(0.0, 0.5), trajectories=2, duration=0.1)
     exact = unseen_trajectories(system, 0.01, n=2, duration=0.1, seed=0, stream=Stream.VALIDATION).x
     validate(Particular(exact), None, system, dt=0.01, protocol=protocol)
     assert asked == [0.25]
@@ -259,9 +264,28 @@ def test_starts_outside_x_lie_between_the_boxes(domain):
     assert (x0.max(0) > 0.9 * high).all()
 
 
-def test_step_time_is_positive():
-    x = np.zeros((10**6, 7, 3))
-    assert 0 < step_time(Oracle(x), None, system=get_system("lorenz"), dt=0.01, batch=7, seconds=0.02) < 1e5
+def test_step_time_is_that_of_the_fastest_round_and_of_whole_batches(monkeypatch):
+    class Slow(Oracle):
+        """Of an imagined clock steps take 1/64 s, then 1/256 s; resetting takes a second."""
+
+        now, batches = 0.0, []
+
+        def process_time(self):
+            return self.now
+
+        def reset(self, y0):
+            self.now += 1.0
+
+        def step(self, y):
+            self.batches.append(y.shape)
+            self.now += 1 / 64 if len(self.batches) <= 4 else 1 / 256
+
+    method = Slow(None)
+    monkeypatch.setattr(protocol_module, "time", method)
+    found = step_time(method, None, system=get_system("lorenz"), dt=0.01, batch=7, seconds=5 / 16)
+    assert found == 1e6 / 256
+    assert set(method.batches) == {(7, 1)}
+    assert len(method.batches) == 4 + 4 * 16  # a fifth of the time in each round
 
 
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
@@ -280,9 +304,8 @@ def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     np.testing.assert_allclose(found, smape(expected, np.broadcast_to(mean, expected.shape)), rtol=1e-3)
     table = (out / "table.md").read_text()
     assert "| constant mean |" in table
-    assert "Partial: 4 of 52 observers." in table
-    with Image.open(out / "heatmap.png") as figure:
-        assert figure.size[0] > 300
+    assert "Partial: 4 of 52 observers. Missing: default; spinn; ae; dmf and 9 more methods." in table
+    assert imread(out / "heatmap.png").shape[1] > 300
     assert len(trainings.read_text().splitlines()) == 2 * 4  # three configurations and the final one
 
 
@@ -337,7 +360,8 @@ def test_a_training_that_blows_up_leaves_no_checkpoint(toy, tmp_path):
 def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     name, trainings = toy
     job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    job.claim()
+    with claimed_job(job.folder, job.identity, OTHER):
+        pass
     (job.folder / "configuration-0.json").write_text('{"configuration": {"shift": 1.0}, "score": 1e-9}')
     assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
     # The others, what was settled in a short training of the best (its file is missing), and the full training.
@@ -387,8 +411,10 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
         ({"methods": ()}, "at least one"),
         ({"jobs": 0}, "at least one"),
         ({"report": True}, "does not exist; run the benchmark first"),
-        ({"noise": (-0.1,)}, "noise"),
-        ({"seed": -1}, "seed"),
+        ({"measurement_noise": (-0.1,)}, r"measurement_noise = \(-0.1,\) must be finite and not negative"),
+        ({"measurement_noise": (math.inf,)}, "measurement_noise"),
+        ({"seed": -1}, "seed = -1 must be a whole number from 0"),
+        ({"seed": 2**32}, "seed = 4294967296 must be"),
         ({"methods": ("ekf", "ekf")}, "twice"),
         ({"methods": ("ekf", "training.methods.kalman:EKF")}, "twice"),
     ],
@@ -456,16 +482,70 @@ def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
     assert {file: (out / file).read_bytes() for file in before} == before
 
 
-@pytest.mark.skipif(not COMMITTED.exists(), reason="no results are committed yet")
-def test_committed_results_give_the_committed_table_and_figure(tmp_path):
+def rows_of(page, title):
+    """The first table under a title of a Markdown page: the header, then rows of cells by their first one."""
+    lines = page.split(f"\n## {title}\n")[1].split("\n## ")[0].splitlines()
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines if line.startswith("|")]
+    return cells[0][1:], {first: rest for first, *rest in cells[2:]}
+
+
+@pytest.mark.parametrize("name", ["benchmark", "ablation"])
+def test_committed_results_give_the_committed_table_and_figure(name, tmp_path):
     for file in ("results.csv", "methods.csv"):
-        shutil.copy(COMMITTED / file, tmp_path)
+        shutil.copy(RESULTS / name / file, tmp_path)
     Benchmark(report=True, out=tmp_path).run(quiet())
-    assert (tmp_path / "table.md").read_text() == (COMMITTED / "table.md").read_text()
-    with Image.open(COMMITTED / "heatmap.png") as committed, Image.open(tmp_path / "heatmap.png") as drawn:
-        if committed.info["Software"] != drawn.info["Software"]:
-            pytest.skip(f"the committed figure was drawn by another version than {matplotlib.__version__}")
-        np.testing.assert_array_equal(np.asarray(committed), np.asarray(drawn))
+    page = (tmp_path / "table.md").read_text()
+    assert page == (RESULTS / name / "table.md").read_text()
+    drawn, committed = (imread(folder / "heatmap.png") for folder in (tmp_path, RESULTS / name))
+    assert drawn.shape == committed.shape
+
+    figure = heatmap(*(pd.read_csv(tmp_path / file) for file in ("results.csv", "methods.csv")), note="What it is")
+    assert (figure.get_size_inches() * 130).astype(int).tolist() == [drawn.shape[1], drawn.shape[0]]
+    *panels, colorbar = figure.axes
+    titles = [
+        f"starts in {starts}, noise {noise}" for noise in ("0", "0.5") for starts in ("X", "1.5X \\ X", "2X \\ X")
+    ]
+    assert [ax.get_title() for ax in panels] == titles
+    for ax in panels:
+        systems, rows = rows_of(page, f"SMAPE in %, all steps, {ax.get_title()}")
+        assert [text.get_text() for text in panels[0].get_yticklabels()] == list(rows)
+        assert [text.get_text().replace("\n", " ") for text in panels[-1].get_xticklabels()] == systems
+        written = {text.get_position(): text.get_text() for text in ax.texts}
+        assert len(written) == len(rows) * len(systems)
+        (image,) = ax.images
+        for i, row in enumerate(rows.values()):
+            for j, cell in enumerate(row):
+                expected = [float(number.strip("<")) for number in cell.split(" [")[0].split(" ± ")]
+                numbers = [float(number) for number in written[j, i].split("\n± ")]
+                np.testing.assert_allclose(numbers, expected, rtol=0.06, atol=0.0051)  # of two and of three digits
+                assert image.get_array()[i, j] == pytest.approx(expected[0], rel=0.01, abs=0.001)
+    words = {text.get_text() for text in figure.findobj(Text)}
+    assert {"What it is", "SMAPE in %, all steps"} <= words
+    assert colorbar.get_ylabel() == "SMAPE in %, all steps"
+
+
+def test_a_report_says_which_observers_are_missing(tmp_path):
+    methods = pd.read_csv(RESULTS / "benchmark" / "methods.csv")
+    missing = (methods.method.isin(["gru", "node"]) & (methods.system == "lorenz")) | (methods.method == "dmf")
+    methods[~missing].to_csv(tmp_path / "methods.csv", index=False)
+    shutil.copy(RESULTS / "benchmark" / "results.csv", tmp_path)
+    Benchmark(report=True, out=tmp_path).run(quiet())
+    page = (tmp_path / "table.md").read_text()
+    assert "Partial: 46 of 52 observers. Missing: dmf; node on lorenz; gru on lorenz.\n" in page
+
+
+def test_levels_of_noise_by_both_names(toy, tiny, tmp_path):
+    name, _ = toy
+    for option in ("--measurement-noise", "--noise"):
+        out = str(tmp_path / option)
+        main(["benchmark", "--systems", "lorenz", "--methods", name, option, "0.25", "1", "--jobs", "1", "--out", out])
+        assert set(pd.read_csv(tmp_path / option / "results.csv").noise) == {0.25, 1.0}
+
+
+def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert Benchmark(systems=("lorenz",), methods=(toy[0],), jobs=1).run(quiet()) == Path("runs/benchmark/cpu")
+    assert (tmp_path / "runs" / "benchmark" / "cpu" / "table.md").exists()
 
 
 def test_run_is_causal():

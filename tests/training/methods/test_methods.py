@@ -29,7 +29,7 @@ from training.methods.recurrent import rollout
 from training.trajectories.derivatives import jacobian, with_sensitivity
 
 SMALL = Budget(
-    "small", trajectories=100, duration=25.0, samples=60, seconds=math.inf, width=32, depth=2, dt=0.05, steps=600
+    "small", trajectories=100, duration=25.0, samples=60, cpu_seconds=math.inf, width=32, depth=2, dt=0.05, steps=600
 )
 
 
@@ -361,7 +361,7 @@ def test_methods_that_lack_something(body, message, tmp_path):
 def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path):
     system = Oscillator()
     data = Task(system, SMALL, tmp_path).data
-    assert data is Task(Oscillator(), replace(SMALL, seconds=1.0), tmp_path).data
+    assert data is Task(Oscillator(), replace(SMALL, cpu_seconds=1.0), tmp_path).data
     assert data.x.shape == (len(data.ages), 100, 2)
     assert data.y.shape == (501, 100, 1)
     np.testing.assert_allclose(data.y[data.ages], system.output(data.x), atol=1e-6)
@@ -372,7 +372,7 @@ def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
     monkeypatch.setattr(training.methods.ablation, "FEATURES", 30)
     method, system = get_method(name), Oscillator()
     budget = Budget(
-        "tiny", trajectories=10, duration=25.0, samples=20, seconds=math.inf, width=8, depth=1, dt=0.02, steps=2
+        "tiny", trajectories=10, duration=25.0, samples=20, cpu_seconds=math.inf, width=8, depth=1, dt=0.02, steps=2
     )
     trained = method.train(Task(system, budget, tmp_path / "train"), method.configurations(system)[-1])
     assert 1 <= len(method.configurations(system)) <= 3

@@ -22,6 +22,7 @@ from training.cli import main
 from training.config import Config, current_names, override, read_changes
 from training.kalman import ExtendedKalmanFilter
 from training.presets import preset
+from training.seeds import Stream, generator
 from training.trajectories.derivatives import with_sensitivity
 from training.tuning import Probe, Spectrum
 from training.tuning.check import rank_correlation
@@ -32,6 +33,13 @@ SPECTRUM = Spectrum((-2.0, -0.7), ((-0.3, 1.0),))
 @pytest.fixture(scope="module")
 def probe():
     return Probe(Oscillator(), duration=6.0, motions=8)
+
+
+def test_motions_start_where_no_other_stream_of_random_numbers_does():
+    drawn = generator(Stream.TUNING, 3).uniform(*Oscillator().box(), (16, 2))
+    np.testing.assert_array_equal(Probe(Oscillator(), duration=6.0, motions=8, seed=3).x[0], drawn[:8])
+    with pytest.raises(ValueError, match="seed = -1"):
+        Probe(Oscillator(), seed=-1)
 
 
 def relative(probe, covariance):
@@ -210,6 +218,15 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
     described = json.loads((tmp_path / "run" / "config.json").read_text())
     assert described["pairs"] == [list(pair) for pair in chosen["0.5"]["pairs"]]
     assert described["width"] == 8
+
+
+def test_results_lie_under_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    system = str(Path(linear_system.__file__)) + ":Oscillator"
+    main(["tune", system, "--measurement-noise", "0.25", "--duration", "4", "--modes", "2"])
+    front = pd.read_csv(tmp_path / "runs" / "tuning" / "oscillator-0.25" / "front.csv")
+    assert list(front) == ["noise", "kind", "modes", "error"]
+    assert set(front.noise) == {0.0, 0.05, 0.25, 0.5}
 
 
 def test_choices_begin_with_given_modes(probe):

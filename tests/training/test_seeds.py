@@ -1,0 +1,21 @@
+"""Streams of random numbers."""
+
+from itertools import product
+
+import pytest
+
+from training.seeds import Stream, generator
+
+
+def test_no_two_streams_meet():
+    purposes = [(stream, seed, *part) for stream, seed in product(Stream, range(10)) for part in ((), (1,), (2,), (3,))]
+    drawn = {generator(*purpose).bytes(16) for purpose in purposes}
+    assert len(drawn) == len(purposes) == len(Stream) * 10 * 4
+    assert generator(Stream.TUNING, 3).bytes(16) in drawn
+
+
+@pytest.mark.parametrize("seed", [(-1,), (2**32,), (2**32 + 5,), (0, -1), (0, 2**32)])
+def test_seeds_that_would_meet_others_are_refused(seed):
+    """Of [1, 2**32 + 5] NumPy makes the words of [1, 5, 1], part 1 of seed 5."""
+    with pytest.raises(ValueError, match=rf"seed = {seed[-1]} must be a whole number from 0 to 2\*\*32 - 1"):
+        generator(Stream.TRAINING, *seed)
