@@ -4,14 +4,14 @@ from collections.abc import Iterable, Sequence
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Lay out a table.
+    r"""Lay out a table.
 
     Parameters
     ----------
     header : sequence of str
         Titles of the columns; empty ones may be.
     rows : iterable of sequences of str
-        Cells, as many in each row as there are titles. A vertical bar in a cell must be written ``\\|``.
+        Cells, as many in each row as there are titles. A vertical bar in a cell must be written ``\|``.
 
     Returns
     -------

@@ -78,7 +78,23 @@ class Benchmark:
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
-        """Run what is missing; returns the folder."""
+        """Run what is missing, then report.
+
+        Parameters
+        ----------
+        console : rich.console.Console
+            For people.
+
+        Returns
+        -------
+        Path
+            The folder of results.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, the folder holds another benchmark, or jobs failed.
+        """
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
         if self.report:

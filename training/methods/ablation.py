@@ -34,7 +34,18 @@ class Ablation(KKLMethod):
     pipeline: ClassVar[Pipeline] = "input-aware"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """Settings that differ from the preset's; the paper's spectrum, unless another is the point."""
+        """Say which settings differ from the preset's: the spectrum, which is the paper's unless another is the point.
+
+        Parameters
+        ----------
+        task : Task
+            The training.
+
+        Returns
+        -------
+        mapping
+            Settings of a :class:`training.config.Config` by name.
+        """
         return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -133,5 +144,20 @@ class Tuned(Ablation):
 
 @cache
 def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """The one chosen for noise of 0.5."""
+    """Choose modes for noise of 0.5; systems are tuned once.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    dt : float
+        Sampling interval in seconds.
+    duration : float
+        Length of the runs in seconds.
+
+    Returns
+    -------
+    Spectrum
+        The last one of the choice, which is made anew.
+    """
     return Probe(system, dt, duration).choose(TUNED_FOR)[-1].spectrum

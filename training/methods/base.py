@@ -31,11 +31,33 @@ class CausalObserver(Protocol):
     """x_hat_0 = reset(y_0), x_hat_k+1 = step(y_k+1); outputs (n, ny) in, estimates (n, nx) out."""
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget the past, take in the first sample, return the first estimate."""
+        """Forget the past and take in the first sample.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (n, ny)
+            Outputs at the start.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            The first estimate.
+        """
         ...
 
     def step(self, y: np.ndarray) -> np.ndarray:
-        """Take in the next sample, return the next estimate."""
+        """Take in the next sample.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n, ny)
+            Outputs dt later.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            The next estimate.
+        """
         ...
 
 

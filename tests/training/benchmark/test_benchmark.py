@@ -3,8 +3,10 @@
 import json
 import math
 import shutil
+import sys
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 import pandas as pd
 import pytest
@@ -522,6 +524,18 @@ def test_committed_results_give_the_committed_table_and_figure(name, tmp_path):
     words = {text.get_text() for text in figure.findobj(Text)}
     assert {"What it is", "SMAPE in %, all steps"} <= words
     assert colorbar.get_ylabel() == "SMAPE in %, all steps"
+
+
+def test_drawing_leaves_the_users_matplotlib_alone(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)  # to import it is an error
+
+    def use(*_, **__):
+        raise AssertionError("a backend was chosen")
+
+    monkeypatch.setattr(matplotlib, "use", use)
+    results, methods = (pd.read_csv(RESULTS / "ablation" / file) for file in ("results.csv", "methods.csv"))
+    few = results.groupby(["system", "method", "starts", "noise"]).head(2)
+    assert len(heatmap(few, methods, note="").axes) == 7
 
 
 def test_a_report_says_which_observers_are_missing(tmp_path):
