@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from training.systems import Profile
 
 ROOT = Path(__file__).parent.parent
@@ -38,10 +36,9 @@ def edit(text, where, line, new):
     return "".join(lines)
 
 
-@pytest.fixture(scope="module")
-def followed(tmp_path_factory):
-    """A copy of the packages in which everything on the page was done, but for the commands in full."""
-    root = tmp_path_factory.mktemp("checkout")
+def test_following_the_page_adds_a_system(tmp_path):
+    """Everything is done but the commands in full. One test, so that it is done once."""
+    root = tmp_path
     for package in ("kkl_gym", "observers", "training"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", root)
@@ -71,11 +68,9 @@ def followed(tmp_path_factory):
         else:
             assert label.startswith(FULL), f"nothing says what to do with\n{text}"
             assert language == "sh"
-    return root, do, sorted(written)
+    for check in (("check",), ("format", "--check")):
+        do(sys.executable, "-m", "ruff", *check, *sorted(written))
 
-
-def test_all_that_the_page_promises_is_there(followed):
-    root, do, _ = followed
     look = root / "runs" / "first-look"
     assert {path.name for path in look.iterdir() if path.is_file()} >= {"fitzhugh_nagumo.safetensors", "report.png"}
     assert {path.name for path in (look / "tuning").iterdir()} >= {"config.json", "front.csv", "front.png"}
@@ -95,18 +90,13 @@ from training.systems import PROFILES, controller
 assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
 system = get_system("fitzhugh_nagumo")
 assert np.allclose(system.f(system.target), 0.0, atol=1e-12)
+assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
 assert agent.observer == "fitzhugh_nagumo-v1" and agent.task == PROFILES["fitzhugh_nagumo"].task
 """
     do(sys.executable, "-c", checks)
-
-
-def test_the_pages_code_is_as_it_should_be(followed):
-    _, do, written = followed
-    do(sys.executable, "-m", "ruff", "check", *written)
-    do(sys.executable, "-m", "ruff", "format", "--check", *written)
 
 
 def test_a_first_look_is_the_command_in_full_made_small():
