@@ -1,4 +1,4 @@
-"""The four benchmark systems, and finding a system by its name."""
+"""Equations of the four benchmark systems, and finding a system by its name."""
 
 # ruff: noqa: D102 - what each system overrides is documented on System
 

@@ -1,4 +1,7 @@
-"""One file that holds a whole observer: filter, maps, scaling, and what they were made for."""
+"""One file that holds a whole observer: filter, maps, scaling, and what they were made for.
+
+:meth:`Artifact.save` writes it, at the end of ``kkl-gym train``; :meth:`Artifact.read` reads it.
+"""
 
 import json
 import math

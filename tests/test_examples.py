@@ -1,9 +1,19 @@
+"""The examples, and what docs/systems.md says of a system of one's own."""
+
+import re
 import runpy
+import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+from training.cli import main
+from training.evaluation import calibration
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
+OWN_SYSTEM = (ROOT / "docs" / "systems.md").read_text().partition("## Your own system")[2]
 
 
 def example(name):
@@ -19,17 +29,45 @@ def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=500, trajectories=100, out=tmp_path) < 20.0
 
 
-def test_own_system_from_the_command_line(tmp_path, capsys):
-    from training.cli import main
+# What makes each of the commands for a system of one's own a matter of seconds.
+SMALL = {
+    "tune": "--modes 2 --duration 5",
+    "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --threads 1",
+    "evaluate": "--trajectories 3 --duration 8",
+    "certify": "--trajectories 2",
+    "faults": "--trajectories 4 --duration 6",
+    "agent": "--timesteps 1",
+}
 
-    system = f"{EXAMPLES / 'own_system.py'}:Pendulum"
-    sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128 --inverse-steps 50"
-    main(["train", system, *sizes.split(), "--threads", "1", "--no-monitor", "--out", str(tmp_path)])
-    path = str(tmp_path / "pendulum.safetensors")
-    main(["evaluate", path, "--system", system, "--trajectories", "3", "--duration", "8"])
-    assert "2X" in capsys.readouterr().out
+
+def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
+    shutil.copytree(EXAMPLES, tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
+    commands, script = re.findall(r"```(?:sh|python)\n(.*?)```", OWN_SYSTEM, re.DOTALL)
+    done = []
+    for line in commands.splitlines():
+        kkl_gym, command, *rest = line.split()
+        assert kkl_gym == "kkl-gym"
+        main([command, *rest, *SMALL[command].split()])
+        done.append(command)
+    assert done == list(SMALL)
+    printed = capsys.readouterr().out
+    for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors"):
+        assert written in printed
+    path = "runs/pendulum/pendulum.safetensors"
     with pytest.raises(SystemExit, match="--system"):
         main(["evaluate", path])
+
+    made = {}
+    exec(script, made)
+    env, envs = made["env"], made["envs"]
+    x_hat, info = env.reset(seed=0)
+    assert env.spec.id == "HiddenPendulum-v0"
+    assert env.unwrapped.system.name == "pendulum"
+    assert x_hat.shape == info["x"].shape == (2,)
+    assert envs.reset(seed=0)[0].shape == (8, 2)
+    assert [make.close() for make in (env, envs)] == [None, None]
 
 
 def test_sb3_agent():

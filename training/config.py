@@ -147,19 +147,45 @@ class Config:
 
 
 def setting_types() -> dict[str, Any]:
-    """Type of each setting, its limits included, by name."""
+    """Type of each setting, by name, with its limits."""
     return {entry.name: entry.type for entry in dataclasses.fields(Config)}
 
 
 def current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings under the names that they have now."""
+    """Settings under the names that they have now.
+
+    Parameters
+    ----------
+    settings : mapping of str to object
+        By names of now or of before.
+
+    Returns
+    -------
+    dict of str to object
+        The same values.
+    """
     return {FORMER_NAMES.get(name, name): value for name, value in settings.items()}
 
 
 def read_changes(path: Path) -> dict[str, Any]:
     """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`.
 
-    Raises ValueError if it is no object of a configuration's settings.
+    Parameters
+    ----------
+    path : Path
+        The file; an object of settings, by names of now or of before.
+
+    Returns
+    -------
+    dict of str to object
+        The settings, by names of now, each of its type and within its limits.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, no object of a configuration's settings, or a value makes no sense.
+    OSError
+        If it cannot be read.
     """
     try:
         found = json.loads(path.read_text())
@@ -181,5 +207,23 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The configuration with every change that is not None."""
+    """The configuration with some settings changed.
+
+    Parameters
+    ----------
+    config : Config
+        What is to be changed; it stays as it is.
+    changes : mapping of str to object
+        Settings by name; those that are None are left out.
+
+    Returns
+    -------
+    Config
+        The changed configuration.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        A ValueError, if the settings make no sense together.
+    """
     return replace(config, **{name: value for name, value in changes.items() if value is not None})

@@ -1,4 +1,4 @@
-"""From a system and a configuration to an artifact."""
+"""From a system and a configuration to an artifact: the stages of ``kkl-gym train``, in order, in :func:`train`."""
 
 import dataclasses
 import hashlib
@@ -49,7 +49,15 @@ CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
 @dataclass(frozen=True)
 class Result:
-    """What a run leaves behind: the artifact, and the course of the error in each stage, by batch."""
+    """What a run leaves behind.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer; nothing has written it to a file.
+    losses : dict of str to list of (int, float)
+        For each stage that trained a network, its error after so many batches.
+    """
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
@@ -66,20 +74,48 @@ def train(
 ) -> Result:
     """Learn an observer for a system.
 
+    The stages, in order; each that trains a network has checkpoints of its own:
+
+    1. The run's folder is claimed, and the eigenvalues become a filter.
+    2. Free inverse (input-aware maps of a system with inputs, unless turned off): trajectories without input are
+       simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
+    3. The training trajectories are simulated with the filter beside them; those of input-aware maps have inputs and
+       process noise.
+    4. Forward map (spinn): T is trained on them and on its equation, or solved for, and gives batches z' = T(x'). An
+       input-aware map has no T. Its batches are drawn along the trajectories, with measurement noise added to z.
+    5. The inverse is fitted on these batches, and the observer is put together.
+    6. Closed loop (if the configuration has it): a controller acts on that observer's estimates, and the same inverse
+       is fitted again, on these trajectories too.
+
+    The limits of a monitor and the report of ``kkl-gym train`` come later, and elsewhere.
+
     Parameters
     ----------
-    system : any system.
-    config : how.
-    folder : where checkpoints and TensorBoard scalars go; created if missing.
-    resume : go on from the checkpoints in ``folder`` if there are any; without it they are an error.
-    device : of the networks; None takes a GPU if there is one.
-    console : for the progress bars; None prints none.
+    system : System
+        Any system.
+    config : Config
+        How.
+    folder : Path
+        Where checkpoints and TensorBoard scalars go; created if missing.
+    resume : bool
+        Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
+    device : torch.device, optional
+        Where networks are trained; by default on a GPU if there is one.
+    console : rich.console.Console, optional
+        Where progress bars are shown; by default there are none.
+
+    Returns
+    -------
+    Result
+        The observer, and how the errors fell.
 
     Raises
     ------
-    ValueError : if there are checkpoints, but not ``resume`` or not of this configuration, if another process is at
-        work in the folder, or if the system's trajectories leave its bounds.
-    FloatingPointError : if the loss stops being a number.
+    ValueError
+        If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
+        folder, or if the system's trajectories leave its bounds.
+    FloatingPointError
+        If the loss stops being a number.
     """
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}

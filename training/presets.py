@@ -1,4 +1,8 @@
-"""The configurations behind ``--pipeline`` and ``--preset``."""
+"""The configurations behind ``--pipeline`` and ``--preset``.
+
+What differs from system to system, the spectrum above all, comes from the system's profile in
+:mod:`training.systems`.
+"""
 
 from dataclasses import replace
 from typing import Literal, get_args
@@ -21,6 +25,25 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
     3 million and 5 million points, physics weight 0.1, and nz = ny (2 nx + 1) eigenvalues in [-3, -1.5].
     The paper leaves open the batch (here 4,096), the spacing of the eigenvalues (even) and the decay of
     the learning rate (a cosine). "fast" is what ships: at most ten minutes on two CPU cores.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    pipeline : {"input-aware", "spinn"}
+        How the observer is learned.
+    name : {"fast", "paper"}
+        The sizes.
+
+    Returns
+    -------
+    Config
+        For :func:`training.train`; :func:`training.config.override` changes it.
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown, or no spectrum follows from the system's rate.
     """
     if pipeline not in get_args(Pipeline) or name not in get_args(Preset):
         raise ValueError(
@@ -44,7 +67,25 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
 
 
 def eigenvalues(system: System) -> tuple[float, ...]:
-    """Real ones for an input-aware map, in 1/s: what the system's profile says, else from how fast f changes in X."""
+    """Real eigenvalues of A for an input-aware map.
+
+    The system's profile says them, or they follow from how fast f changes in X.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+
+    Returns
+    -------
+    tuple of float
+        In 1/s, from the slowest to the fastest.
+
+    Raises
+    ------
+    ValueError
+        If there is no profile and the system does not say how fast f changes.
+    """
     chosen = profile(system).eigenvalues
     if chosen is None:
         rate = typical_rate(system)

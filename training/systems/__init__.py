@@ -18,16 +18,42 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """What is known of a system; of one that is not shipped, the defaults."""
+    """What is known of a system.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+
+    Returns
+    -------
+    Profile
+        The one that ships under the system's name; the defaults if there is none.
+    """
     return PROFILES.get(system.name, Profile())
 
 
 def controller(system: System) -> Controller:
-    """A stabilising feedback: states (n, nx) in, actions (n, nu) in [-1, 1] out.
+    """A feedback that brings a system to its target.
 
-    The saturated linear-quadratic regulator, or the law that the system's profile names.
+    It is the saturated linear-quadratic regulator, or the law that the system's profile names.
 
-    Raises ValueError if the system has no inputs, numpy.linalg.LinAlgError if its linearisation cannot be stabilised.
+    Parameters
+    ----------
+    system : System
+        A system with inputs.
+
+    Returns
+    -------
+    callable
+        States, of shape (n, nx), in; actions in [-1, 1], of shape (n, nu), out.
+
+    Raises
+    ------
+    ValueError
+        If the system has no inputs.
+    numpy.linalg.LinAlgError
+        If its linearisation at the target cannot be stabilised, for the regulator.
     """
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")

@@ -1,15 +1,18 @@
-"""Lorenz: what is chosen for it."""
+"""Lorenz: the spectrum of its observer, its control task, and why they were chosen.
+
+Its equation is :class:`kkl_gym.systems.Lorenz`.
+"""
 
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
 from training.systems.task import ControlTask
 
 PROFILE = Profile(
-    eigenvalues=evenly_spaced(13, -1.5, -25.0),
+    eigenvalues=evenly_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
     settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
     fault_deadline=2.0,
     task=ControlTask("lorenz", duration=5.0),  # the input is weak
-    agent_observer="lorenz-v1",
+    agent_observer="lorenz-v1",  # on which the results in docs/agents.md rest
     second_noise=2.0,
     printed={"spinn": 8.64, "ae": 88.1, "dmf": 8.76, "node": 11.0},
 )

@@ -1,4 +1,7 @@
-"""Reverse Duffing: what is chosen for it, and its controller."""
+"""Reverse Duffing: the spectrum of its observer, its controller and control task, and why they were chosen.
+
+Its equation is :class:`kkl_gym.systems.ReverseDuffing`.
+"""
 
 import numpy as np
 
@@ -10,10 +13,20 @@ from training.trajectories.controllers import Controller
 
 
 def homogeneous(system: System) -> Controller:
-    """u = x1 - 2 (x2 + cbrt(x1)) for x1' = x2^3, x2' = -x1 + u, cut at the input bound.
+    """The feedback u = x1 - 2 (x2 + cbrt(x1)), cut at the input bound, for x1' = x2^3, x2' = -x1 + u.
 
     The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -x1 cancelled, x2
     follows -cbrt(x1), on which x1' = -x1.
+
+    Parameters
+    ----------
+    system : System
+        Reverse Duffing.
+
+    Returns
+    -------
+    callable
+        States, of shape (n, 2), in; actions in [-1, 1], of shape (n, 1), out.
     """
     (u_max,) = system.u_max
 

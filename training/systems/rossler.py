@@ -1,4 +1,7 @@
-"""Rössler: what is chosen for it."""
+"""Rössler: the spectrum of its observer, its control task, and why they were chosen.
+
+Its equation is :class:`kkl_gym.systems.Rossler`.
+"""
 
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
@@ -8,6 +11,6 @@ PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -0.4, -8.0),
     fault_deadline=2.0,
     task=ControlTask("rossler", period=0.1, duration=30.0),
-    agent_observer="rossler-v1",
+    agent_observer="rossler-v1",  # on which the results in docs/agents.md rest
     printed={"spinn": 4.77, "ae": 79.9, "dmf": 23.5, "node": 24.7},
 )

@@ -14,13 +14,27 @@ from kkl_gym.wrappers.vector import VectorEnv
 class ControlTask:
     """Bring a system to its target and hold it there.
 
-    system : a shipped name, "module:Class" or "script.py:Class".
-    measurement_noise : standard deviation on every sample of y.
-    period : seconds for which an action is held; the observer sees every sample within.
-    duration : of an episode, in seconds.
-    start_box : where episodes start; None is the training box.
-    tolerance : success is |(x - target) / scale| within this throughout the last fifth of the episode.
-    dt : sampling interval in seconds.
+    Parameters
+    ----------
+    system : str
+        A shipped name, "module:Class" or "script.py:Class".
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    period : float
+        Seconds for which an action is held; the observer sees every sample within.
+    duration : float
+        Length of an episode in seconds.
+    start_box : tuple of (float, float), optional
+        Low and high end of each state, where episodes start; by default the training box.
+    tolerance : float
+        An episode succeeds if |(x - target) / scale| stays within this throughout its last fifth.
+    dt : float
+        Sampling interval in seconds.
+
+    Raises
+    ------
+    ValueError
+        If a number makes no sense, or a time is no whole multiple of the next shorter one.
     """
 
     system: str
@@ -58,10 +72,18 @@ class ControlTask:
 
         Parameters
         ----------
-        num_envs : rows.
-        wrap : what goes around the environment at its own sampling interval, such as
-            :class:`kkl_gym.KKLVectorObservation`; None shows the state.
-        autoreset_mode : as for :class:`kkl_gym.VectorActionRepeat`.
+        num_envs : int
+            Number of rows.
+        wrap : callable, optional
+            Makes what goes around the environment at its own sampling interval, such as
+            :class:`kkl_gym.KKLVectorObservation`; by default the state is shown.
+        autoreset_mode : str or gymnasium.vector.AutoresetMode
+            As for :class:`kkl_gym.VectorActionRepeat`.
+
+        Returns
+        -------
+        kkl_gym.VectorActionRepeat
+            The environment.
         """
         env: VectorEnv = KKLVectorEnv(
             self.system,

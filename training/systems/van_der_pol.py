@@ -1,11 +1,14 @@
-"""Van der Pol: what is chosen for it."""
+"""Van der Pol: the spectrum of its observer, its settings and control task, and why they were chosen.
+
+Its equation is :class:`kkl_gym.systems.VanDerPol`. docs/tuning.md compares its spectrum with others.
+"""
 
 from training.spectrum import evenly_spaced
 from training.systems.profile import Profile
 from training.systems.task import ControlTask
 
 PROFILE = Profile(
-    eigenvalues=evenly_spaced(15, -0.4, -20.0),
+    eigenvalues=evenly_spaced(15, -0.4, -20.0),  # fast ones follow the jumps of y, slow ones average its noise
     # Its phase is the hardest of all to tell from noise. Slow complex modes at frequencies of y help there, as
     # `kkl-gym tune` chooses them, and so do more samples at high noise. No input within its bound leads the oscillator
     # out of X, so stronger ones do.

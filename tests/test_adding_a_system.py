@@ -1,0 +1,113 @@
+"""docs/adding_a_system.md, followed literally in a copy of the packages."""
+
+import dataclasses
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from training.systems import Profile
+
+ROOT = Path(__file__).parent.parent
+PAGE = (ROOT / "docs" / "adding_a_system.md").read_text()
+
+# The line above a block says what to do with it.
+NEW = re.compile(r"New file `(?P<path>[^`]+)`:")
+EDIT = re.compile(
+    r"In `(?P<path>[^`]+)`, (?P<where>above|below|in place of) the line that begins with `(?P<line>[^`]+)`:"
+)
+SCRIPT, LOOK, FULL = "This runs now:", "For a first look", "In full"
+
+
+def blocks():
+    """What each block is for, its language, and its text."""
+    found = re.findall(r"([^\n]+)\n\n```(\w+)\n(.*?)```\n", PAGE, re.DOTALL)
+    assert len(found) == PAGE.count("```") // 2
+    return found
+
+
+def edit(text, where, line, new):
+    """The text with something above, below or in place of its first line that begins so."""
+    lines = text.splitlines(keepends=True)
+    (at, *_) = [i for i, one in enumerate(lines) if one.startswith(line)]
+    lines[at : at + 1] = {"above": [new, lines[at]], "below": [lines[at], new], "in place of": [new]}[where]
+    return "".join(lines)
+
+
+def test_following_the_page_adds_a_system(tmp_path):
+    """Everything is done but the commands in full. One test, so that it is done once."""
+    root = tmp_path
+    for package in ("kkl_gym", "observers", "training"):
+        shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", root)
+    command = root / "bin" / "kkl-gym"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m training "$@"\n')
+    command.chmod(0o755)
+    path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
+    environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
+
+    def do(*arguments):
+        done = subprocess.run(arguments, cwd=root, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, f"{arguments[-1]}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    written = set()
+    for label, language, text in blocks():
+        if found := NEW.fullmatch(label) or EDIT.fullmatch(label):
+            file = root / found["path"]
+            assert file.exists() == (found.re is EDIT)
+            file.write_text(text if found.re is NEW else edit(file.read_text(), found["where"], found["line"], text))
+            written.add(found["path"])
+        elif label.endswith(SCRIPT):
+            do(sys.executable, "-c", text)
+        elif label.startswith(LOOK):
+            do("sh", "-e", "-c", text)
+        else:
+            assert label.startswith(FULL), f"nothing says what to do with\n{text}"
+            assert language == "sh"
+    for check in (("check",), ("format", "--check")):
+        do(sys.executable, "-m", "ruff", *check, *sorted(written))
+
+    look = root / "runs" / "first-look"
+    assert {path.name for path in look.iterdir() if path.is_file()} >= {"fitzhugh_nagumo.safetensors", "report.png"}
+    assert {path.name for path in (look / "tuning").iterdir()} >= {"config.json", "front.csv", "front.png"}
+    certificates = {path.name for path in (look / "certificates").iterdir()}
+    assert certificates == {"table.md", "fitzhugh_nagumo.json", "fitzhugh_nagumo.png"}
+    assert len((look / "faults" / "faults.csv").read_text().splitlines()) == 1 + 8 * 4
+    assert "| fitzhugh_nagumo |" in (look / "faults" / "table.md").read_text()
+    assert (look / "agent" / "agent.safetensors").exists()
+    checks = """
+import numpy as np
+import observers
+from kkl_gym import ENV_IDS, get_system
+from training.agents.agent import Agent
+from training.presets import preset
+from training.systems import PROFILES, controller
+
+assert list(ENV_IDS)[-1] == "fitzhugh_nagumo" and ENV_IDS["fitzhugh_nagumo"] == "KKLFitzHughNagumo-v0"
+system = get_system("fitzhugh_nagumo")
+assert np.allclose(system.f(system.target), 0.0, atol=1e-12)
+assert np.allclose(controller(system)(np.array([system.target])), 0.0)
+assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
+assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
+agent = Agent.read("runs/first-look/agent/agent.safetensors")
+assert agent.observer == "fitzhugh_nagumo-v1" and agent.task == PROFILES["fitzhugh_nagumo"].task
+"""
+    do(sys.executable, "-c", checks)
+
+
+def test_a_first_look_is_the_command_in_full_made_small():
+    commands = {LOOK: [], FULL: []}
+    for label, language, text in blocks():
+        if language == "sh":
+            commands[LOOK if label.startswith(LOOK) else FULL].append(text.strip())
+    assert len(commands[LOOK]) == len(commands[FULL]) >= 6
+    for small, full in zip(commands[LOOK], commands[FULL], strict=True):
+        assert small.startswith(f"{full} --") or full.startswith("cp ")
+
+
+def test_the_table_has_every_field_of_a_profile():
+    assert re.findall(r"^\| `(\w+)` \|", PAGE, re.MULTILINE) == [one.name for one in dataclasses.fields(Profile)]
