@@ -15,15 +15,20 @@ import observers
 from observers import MLP, storage
 
 
-class Unreadable(ValueError):
+class UnreadableError(ValueError):
     pass
 
 
-ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.ones(2, np.float32), "none": np.zeros((0, 3)), "one": np.array(2.0)}
+ARRAYS = {
+    "a": np.arange(6.0).reshape(2, 3),
+    "b": np.ones(2, np.float32),
+    "none": np.zeros((0, 3)),
+    "one": np.array(2.0),
+}
 
 
 def read(path):
-    return storage.read(path, key="ours", error=Unreadable, what="a test")
+    return storage.read(path, key="ours", error=UnreadableError, what="a test")
 
 
 @pytest.fixture
@@ -142,7 +147,7 @@ def test_a_failed_save_leaves_the_old_file_and_nothing_else(path, monkeypatch, f
 
 
 def named(path, words):
-    return pytest.raises(Unreadable, match=f"{re.escape(str(path))}.*{words}|{words}.*{re.escape(str(path))}")
+    return pytest.raises(UnreadableError, match=f"{re.escape(str(path))}.*{words}|{words}.*{re.escape(str(path))}")
 
 
 def test_missing_files_and_folders(tmp_path):
@@ -150,7 +155,7 @@ def test_missing_files_and_folders(tmp_path):
     for name in ("none", "no/folder/none", "file/none", ""):
         with named(tmp_path / name, "there is no file"):
             read(tmp_path / name)
-    with pytest.raises(Unreadable, match="there is no file"):
+    with pytest.raises(UnreadableError, match="there is no file"):
         read("a\0b")
 
 
@@ -258,12 +263,12 @@ def test_files_rewritten_in_place_are_damaged_at_worst(tmp_path):
 @pytest.mark.parametrize("raised", [KeyError("mass"), TypeError("mass"), IndexError("mass"), AttributeError("mass"),
                                     ValueError("mass"), OverflowError("mass"), RecursionError("mass")])  # fmt: skip
 def test_whatever_contents_lead_to_names_the_file(raised):
-    with named("some.file", "mass"), storage.explained("some.file", Unreadable):
+    with named("some.file", "mass"), storage.explained("some.file", UnreadableError):
         raise raised
 
 
 def test_other_errors_are_not_hidden():
-    with pytest.raises(ZeroDivisionError), storage.explained("some.file", Unreadable):
+    with pytest.raises(ZeroDivisionError), storage.explained("some.file", UnreadableError):
         _ = 1 / 0
 
 
