@@ -3,11 +3,9 @@
 :meth:`Artifact.save` writes it, at the end of ``kkl-gym train``; :meth:`Artifact.read` reads it.
 """
 
-import json
 import math
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -15,17 +13,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
+from observers import storage
+from observers.checks import is_finite
 from observers.filter import LinearFilter
 from observers.monitor import Limits
 from observers.network import MLP
 
 FORMATS = (1, 2)  # the second has maps that are told the process noise; the others are still written as the first
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
+_CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
+_HOLDS = {"y": "first-order", "u": "zero-order"}  # what the filter takes signals for between samples
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
+_LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
+_FORWARD_ARRAYS = ("x_offset", "x_scale", "z_offset", "z_scale")
+_INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 # Scalars of an inverse map, and what the files call them.
 _SCALARS = {
     "measurement_noise_unit": "noise_unit",
@@ -35,8 +38,6 @@ _SCALARS = {
     "age_unit": "age_unit",
     "age_max": "age_max",
 }
-_INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
-_LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 
 
 class ArtifactError(ValueError):
@@ -45,7 +46,22 @@ class ArtifactError(ValueError):
 
 @dataclass(frozen=True)
 class ForwardMap:
-    """T: x -> z as learned, T(x) = z_offset + z_scale * mlp((x - x_offset) / x_scale)."""
+    """T: x -> z as learned, T(x) = z_offset + z_scale * mlp((x - x_offset) / x_scale).
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network, of nx inputs and nz outputs.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the states.
+    z_offset, z_scale : ndarray, shape (nz,)
+        Scaling of the filter's state.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit the network.
+    """
 
     mlp: MLP
     x_offset: np.ndarray
@@ -54,14 +70,22 @@ class ForwardMap:
     z_scale: np.ndarray
 
     def __post_init__(self) -> None:
-        sizes = (self.mlp.inputs,), (self.mlp.outputs,)
-        if not sizes[0] == self.x_offset.shape == self.x_scale.shape:
-            raise ArtifactError(f"a network of {self.mlp.inputs} inputs does not fit {self.x_offset.shape[-1]} states")
-        if not sizes[1] == self.z_offset.shape == self.z_scale.shape:
-            raise ArtifactError(f"a network of {self.mlp.outputs} outputs does not fit z of {self.z_offset.shape[-1]}")
+        nx, nz = self.mlp.inputs, self.mlp.outputs
+        _check_shapes(self, {"x_offset": (nx,), "x_scale": (nx,), "z_offset": (nz,), "z_scale": (nz,)})
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """States (..., nx) to z (..., nz)."""
+        """Evaluate T.
+
+        Parameters
+        ----------
+        x : array_like, shape (..., nx)
+            States.
+
+        Returns
+        -------
+        ndarray, shape (..., nz)
+            Filter states.
+        """
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
         return np.asarray(self.z_offset + self.z_scale * z)
 
@@ -80,58 +104,101 @@ class InverseMap:
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs).
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network.
+    features : tuple of str
+        What it is told, an ordered selection of ``FEATURES``.
+    z_offset : ndarray, shape (size,)
+        Mean of the filter's state.
+    whiten : ndarray, shape (modes, size)
+        The coordinates of the filter's state that the network sees.
+    noise_gain : ndarray, shape (modes,)
+        Standard deviation of each of them per unit of sigma_v.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the estimate.
+    measurement_noise_unit : float, default 1
+        Standard deviation that counts as one.
+    measurement_noise_max : float, default inf
+        The largest sigma_v in training. A map without the feature takes any.
+    process_noise_unit : float, default 1
+        Level of process noise that counts as one.
+    process_noise_max : float, default inf
+        The highest level of process noise in training.
+    age_unit : float, default 1
+        Seconds that count as one.
+    age_max : float, default 0
+        Seconds after which the age no longer matters.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit the network, a unit is not positive and finite, or nor is the end of what is told.
     """
 
     mlp: MLP
     features: tuple[str, ...]
-    z_offset: np.ndarray  # (size of the filter's state,)
-    whiten: np.ndarray  # (modes, size)
-    noise_gain: np.ndarray  # (modes,) standard deviation of each whitened mode per unit of sigma_v
-    x_offset: np.ndarray  # (nx,)
-    x_scale: np.ndarray  # (nx,)
+    z_offset: np.ndarray
+    whiten: np.ndarray
+    noise_gain: np.ndarray
+    x_offset: np.ndarray
+    x_scale: np.ndarray
     measurement_noise_unit: float = 1.0
-    measurement_noise_max: float = math.inf  # the largest sigma_v in training; a map without the feature takes any
+    measurement_noise_max: float = math.inf
     process_noise_unit: float = 1.0
-    process_noise_max: float = math.inf  # the highest level of process noise in training
+    process_noise_max: float = math.inf
     age_unit: float = 1.0
     age_max: float = 0.0
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.features if name not in FEATURES]
-        if unknown or self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
+        if self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
             raise ArtifactError(f"inverse features {self.features} are not an ordered selection of {FEATURES}")
         if self.features[0] != "z_y":
             raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
+        for name in _CONDITIONS:
+            unit, end = getattr(self, f"{name}_unit"), getattr(self, f"{name}_max")
+            if not is_finite(unit) or unit <= 0:
+                raise ArtifactError(f"{name}_unit must be a positive, finite number, got {unit!r}")
+            if name in self.features and (not is_finite(end) or end <= 0):
+                raise ArtifactError(f"{name}_max must be a positive, finite number for a map that is told, got {end!r}")
+            if end != math.inf and (not is_finite(end) or end < 0):
+                raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
+        if self.whiten.ndim != 2:
+            raise ArtifactError(f"whiten must have shape (modes, size), got {self.whiten.shape}")
         modes, size = self.whiten.shape
-        if not (
-            self.measurement_noise_unit > 0
-            and self.age_unit > 0
-            and self.process_noise_unit > 0
-            and self.process_noise_max > 0
-        ):
-            raise ArtifactError("units of noise and age, and the highest level of process noise, must be positive")
-        if "process_noise" in self.features and not math.isfinite(self.process_noise_max):
-            raise ArtifactError(
-                "a map that is told the process noise must say the highest level that it was trained for"
-            )
-        conditions = sum(name in self.features for name in ("measurement_noise", "process_noise", "age"))
-        if self.mlp.inputs != modes + conditions or self.noise_gain.shape != (modes,) or self.z_offset.shape != (size,):
+        conditions = sum(name in self.features for name in _CONDITIONS)
+        if self.mlp.inputs != modes + conditions:
             raise ArtifactError(
                 f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
             )
-        if not self.mlp.outputs == len(self.x_offset) == len(self.x_scale):
-            raise ArtifactError(f"a network of {self.mlp.outputs} outputs does not fit {len(self.x_offset)} states")
+        nx = self.mlp.outputs
+        _check_shapes(self, {"z_offset": (size,), "noise_gain": (modes,), "x_offset": (nx,), "x_scale": (nx,)})
 
     def gain(self, measurement_noise: float) -> np.ndarray:
-        """What the whitened modes are multiplied with at this noise level, (modes,)."""
+        """What the whitened modes are multiplied with at this standard deviation of the noise, shape (modes,)."""
         return np.asarray(1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2))
 
     def measurement_noise_feature(self, measurement_noise: Any) -> Any:
-        """The network's input for a noise level."""
+        """The network's input for a standard deviation of the noise; for an array, as many inputs."""
         return np.log1p(measurement_noise / self.measurement_noise_unit)
 
     def noise_features(self, measurement_noise: float, process_noise: float) -> list[float]:
-        """What the network is told of noise, in order: of none, one or both."""
+        """Return what the network is told of noise.
+
+        Parameters
+        ----------
+        measurement_noise : float
+            Standard deviation.
+        process_noise : float
+            Level in multiples of the system's scale per second.
+
+        Returns
+        -------
+        list of float
+            None, one or both of the features, in order.
+        """
         told = []
         if "measurement_noise" in self.features:
             told.append(float(self.measurement_noise_feature(measurement_noise)))
@@ -140,7 +207,7 @@ class InverseMap:
         return told
 
     def age_feature(self, age: Any) -> Any:
-        """The network's input for a time since reset, in seconds."""
+        """The network's input for a time since reset, in seconds; for an array, as many inputs."""
         if isinstance(age, float):  # a single step: numpy's own overhead would be felt
             return math.log1p(min(age, self.age_max) / self.age_unit)
         return np.log1p(np.minimum(age, self.age_max) / self.age_unit)
@@ -150,17 +217,34 @@ class InverseMap:
 class Artifact:
     """An observer as it is stored.
 
-    filter : the linear filter with A, B, dt and the number of inputs.
-    inverse : T_inv.
-    system : name of the system.
-    parameters : its physical parameters.
-    forward : T, where one was learned.
-    C : (ny, nx) where the output is linear, h(x) = C x: what coasting and monitoring need.
-    limits : of the residual y - C x_hat in sound operation, where they were found.
-    free_inverse : T_inv of z_y alone, in use as long as no input has acted since reset: motions without input keep to
-        far fewer states than driven ones, which a map that knows of no input can rely on.
-    training : how it was made: method, preset, configuration, seed, measures.
-    versions : of the libraries that made it.
+    Parameters
+    ----------
+    filter : LinearFilter
+        The filter with A, B, dt and the number of inputs.
+    inverse : InverseMap
+        T_inv.
+    system : str
+        Name of the system.
+    parameters : mapping of str to float
+        The system's physical parameters.
+    forward : ForwardMap, optional
+        T, where one was learned.
+    C : ndarray, shape (ny, nx), optional
+        Where the output is linear, h(x) = C x: what coasting and monitoring need.
+    limits : Limits, optional
+        Limits of the residual y - C x_hat in sound operation, where they were found.
+    free_inverse : InverseMap, optional
+        T_inv of z_y alone, in use as long as no input has acted since reset. Motions without input keep to far fewer
+        states than driven ones, which a map that knows of no input can rely on.
+    training : mapping, optional
+        How it was made: method, preset, configuration, seed, measures.
+    versions : mapping of str to str, optional
+        Versions of the libraries that made it.
+
+    Raises
+    ------
+    ArtifactError
+        If the parts do not fit together, or a parameter is no finite number.
     """
 
     filter: LinearFilter
@@ -175,6 +259,14 @@ class Artifact:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.system, str):
+            raise ArtifactError(f"the system's name must be a string, got {self.system!r}")
+        for name in ("parameters", "training", "versions"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise ArtifactError(f"{name} must be a mapping, got {getattr(self, name)!r}")
+        for name, value in self.parameters.items():
+            if not is_finite(value):
+                raise ArtifactError(f"the parameter {name} must be a finite number, got {value!r}")
         if self.inverse.whiten.shape[1] != self.filter.size or ("z_u" in self.inverse.features) != (self.filter.nu > 0):
             raise ArtifactError(
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
@@ -189,6 +281,11 @@ class Artifact:
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if free is not None and _process(free) != _process(self.inverse):
             raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
+        if self.forward is not None and (self.forward.mlp.inputs, self.forward.mlp.outputs) != (self.nx, nz):
+            raise ArtifactError(
+                f"a forward map of {self.forward.mlp.inputs} states to {self.forward.mlp.outputs} values "
+                f"does not fit {self.nx} states and {nz} values"
+            )
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
         if self.limits is not None and (self.C is None or self.limits.mean.shape[1] != self.ny):
@@ -216,7 +313,24 @@ class Artifact:
         return None if found is None else found[1]
 
     def check(self, system: str, parameters: Mapping[str, float], *, dt: float, ny: int, nu: int) -> None:
-        """Raise ArtifactError, naming both values, unless the observer was made for this system, dt and sizes."""
+        """Raise an error unless the observer was made for this system.
+
+        Parameters
+        ----------
+        system : str
+            Name of the system.
+        parameters : mapping of str to float
+            Its physical parameters.
+        dt : float
+            Sampling interval in seconds.
+        ny, nu : int
+            Numbers of outputs and inputs. An observer that knows of no input serves any number of them.
+
+        Raises
+        ------
+        ArtifactError
+            If anything differs; the message names both values.
+        """
 
         def differ(what: str, here: Any, there: Any) -> None:
             raise ArtifactError(
@@ -238,88 +352,107 @@ class Artifact:
             differ("the number of inputs", self.nu, nu)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the artifact; the file appears whole or not at all."""
-        tensors: dict[str, np.ndarray] = {"A": self.filter.A, "B": self.filter.B}
-        if self.C is not None:
-            tensors["C"] = np.ascontiguousarray(self.C, dtype=float)
-        described = {"inverse": _put_inverse(tensors, "inverse", self.inverse)}
-        if self.free_inverse is not None:
-            described["free"] = _put_inverse(tensors, "free", self.free_inverse)
-        meta: dict[str, Any] = {
+        """Write the artifact; the file appears whole or not at all.
+
+        Parameters
+        ----------
+        path : str or PathLike
+            The file, whose name should end in ``.safetensors``; its folder is made.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        TypeError, ValueError
+            If JSON cannot hold ``training``, ``versions`` or a number.
+        """
+        tensors = {"A": self.filter.A, "B": self.filter.B}
+        described: dict[str, Any] = {
             "format": FORMATS[0] if self.process_noise_max is None else FORMATS[1],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
-            "holds": {"y": "first-order", "u": "zero-order"},
-            **described,
+            "holds": _HOLDS,
+            "inverse": _put_inverse(tensors, "inverse", self.inverse),
             "training": dict(self.training),
             "versions": dict(self.versions),
         }
+        if self.free_inverse is not None:
+            described["free"] = _put_inverse(tensors, "free", self.free_inverse)
+        if self.C is not None:
+            tensors["C"] = np.asarray(self.C, dtype=float)
         if self.forward is not None:
-            _put_mlp(tensors, "forward", self.forward.mlp)
-            for name in ("x_offset", "x_scale", "z_offset", "z_scale"):
-                tensors[f"forward.{name}"] = np.ascontiguousarray(getattr(self.forward, name), dtype=float)
-            meta["forward"] = {"activation": self.forward.mlp.activation}
+            storage.put_mlp(tensors, "forward.", self.forward.mlp)
+            tensors |= {f"forward.{n}": np.asarray(getattr(self.forward, n), dtype=float) for n in _FORWARD_ARRAYS}
+            described["forward"] = {"activation": self.forward.mlp.activation}
         if self.limits is not None:
-            tensors |= {f"limits.{name}": np.ascontiguousarray(getattr(self.limits, name)) for name in _LIMITS}
-            meta["limits"] = {name: getattr(self.limits, name) for name in _LIMIT_SCALARS}
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
-        os.close(handle)
-        try:
-            save_file(tensors, temporary, metadata={_KEY: json.dumps(meta, sort_keys=True, allow_nan=False)})
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, target)
-        except BaseException:
-            os.unlink(temporary)
-            raise
+            tensors |= {f"limits.{name}": np.asarray(getattr(self.limits, name), dtype=float) for name in _LIMITS}
+            described["limits"] = {name: getattr(self.limits, name) for name in _LIMIT_SCALARS}
+        storage.save(path, tensors, key=_KEY, described=described)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Artifact":
-        """Read an artifact; raises ArtifactError if the file is missing, damaged, foreign or of a newer format."""
-        if not Path(path).is_file():
-            raise ArtifactError(f"there is no file {path}")
-        try:
-            with safe_open(path, framework="numpy") as opened:
-                text = (opened.metadata() or {}).get(_KEY)
-                tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, TypeError) as error:  # TypeError: a number type that NumPy lacks
-            raise ArtifactError(f"{path} is damaged or no safetensors file: {error}") from error
-        if text is None:
-            raise ArtifactError(f"{path} was not written by kkl-gym: it carries no {_KEY!r} metadata")
-        try:
-            return cls._assemble(json.loads(text), tensors)
-        except ArtifactError as error:
-            raise ArtifactError(f"{path}: {error}") from error
-        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-            raise ArtifactError(f"{path} is incomplete: {error!r}") from error
+        """Read an artifact.
+
+        Parameters
+        ----------
+        path : str or PathLike
+            The file.
+
+        Returns
+        -------
+        Artifact
+            What :meth:`save` wrote.
+
+        Raises
+        ------
+        ArtifactError
+            If the file is missing, not readable, damaged, foreign or of a newer format, or holds what makes no
+            observer.
+        """
+        tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
+        with storage.explained(path, ArtifactError):
+            return cls._assemble(tensors, described)
 
     @classmethod
-    def _assemble(cls, meta: Any, tensors: Mapping[str, np.ndarray]) -> "Artifact":
-        if meta["format"] not in FORMATS:
-            raise ArtifactError(f"it has format {meta['format']!r}, this version of kkl-gym reads {FORMATS}")
+    def _assemble(cls, tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> "Artifact":
+        if described["format"] not in FORMATS:
+            raise ArtifactError(f"it has format {described['format']!r}, this version of kkl-gym reads {FORMATS}")
+        if described.get("holds", _HOLDS) != _HOLDS:
+            raise ArtifactError(f"its filter holds signals as {described['holds']}, this version knows {_HOLDS}")
         for name, tensor in tensors.items():
             if not np.isfinite(tensor).all():
                 raise ArtifactError(f"its tensor {name} is not finite")
-        forward = None
-        if "forward" in meta:
+        forward = limits = free_inverse = None
+        if "forward" in described:
             forward = ForwardMap(
-                mlp=_get_mlp(tensors, "forward", meta["forward"]["activation"]),
-                **{name: tensors[f"forward.{name}"] for name in ("x_offset", "x_scale", "z_offset", "z_scale")},
+                storage.get_mlp(tensors, "forward.", described["forward"]["activation"]),
+                **{name: tensors[f"forward.{name}"] for name in _FORWARD_ARRAYS},
             )
+        if "limits" in described:
+            arrays: dict[str, Any] = {name: tensors[f"limits.{name}"] for name in _LIMITS}
+            limits = Limits(**arrays, **{name: described["limits"][name] for name in _LIMIT_SCALARS})
+        if "free" in described:
+            free_inverse = _get_inverse(tensors, "free", described["free"])
         return cls(
-            filter=LinearFilter(tensors["A"], tensors["B"], meta["dt"], meta["inputs"]),
-            inverse=_get_inverse(tensors, "inverse", meta["inverse"]),
-            system=meta["system"]["name"],
-            parameters=meta["system"]["parameters"],
+            filter=LinearFilter(tensors["A"], tensors["B"], described["dt"], described["inputs"]),
+            inverse=_get_inverse(tensors, "inverse", described["inverse"]),
+            system=described["system"]["name"],
+            parameters=described["system"]["parameters"],
             forward=forward,
             C=tensors.get("C"),
-            limits=_get_limits(tensors, meta["limits"]) if "limits" in meta else None,
-            free_inverse=_get_inverse(tensors, "free", meta["free"]) if "free" in meta else None,
-            training=meta["training"],
-            versions=meta["versions"],
+            limits=limits,
+            free_inverse=free_inverse,
+            training=described["training"],
+            versions=described["versions"],
         )
+
+
+def _check_shapes(owner: Any, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    for name, shape in shapes.items():
+        found = getattr(owner, name).shape
+        if found != shape:
+            raise ArtifactError(f"{name} does not fit the network: it must have shape {shape}, got {found}")
 
 
 def _process(inverse: InverseMap) -> tuple[float, float] | None:
@@ -328,9 +461,10 @@ def _process(inverse: InverseMap) -> tuple[float, float] | None:
 
 
 def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
-    _put_mlp(tensors, prefix, inverse.mlp)
+    """Add an inverse map's arrays; returns what describes it."""
+    storage.put_mlp(tensors, f"{prefix}.", inverse.mlp)
     for name in _INVERSE_ARRAYS:
-        tensors[f"{prefix}.{name}"] = np.ascontiguousarray(getattr(inverse, name), dtype=float)
+        tensors[f"{prefix}.{name}"] = np.asarray(getattr(inverse, name), dtype=float)
     names = [name for name in _SCALARS if _process(inverse) or not name.startswith("process")]
     scalars = {_SCALARS[name]: getattr(inverse, name) for name in names}
     return {
@@ -344,37 +478,25 @@ def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapp
     unknown = set(described) - {"activation", "features", *_SCALARS.values()}
     if unknown:
         raise ArtifactError(f"its map {prefix} has settings that nobody knows: {', '.join(sorted(unknown))}")
+    features = tuple(described["features"])
+    for name, key in _SCALARS.items():
+        feature = name.rpartition("_")[0]
+        if feature in features and key not in described:
+            raise ArtifactError(f"its map {prefix} is told {feature}, but lacks {key!r}")
+    mlp = storage.get_mlp(tensors, f"{prefix}.", described["activation"])
+    arrays: dict[str, Any] = {name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}
     scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
-    return InverseMap(
-        mlp=_get_mlp(tensors, prefix, described["activation"]),
-        features=tuple(described["features"]),
-        **{**scalars, **{name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}},
-    )
-
-
-def _put_mlp(tensors: dict[str, np.ndarray], prefix: str, mlp: MLP) -> None:
-    for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-        tensors[f"{prefix}.{i}.weight"] = np.ascontiguousarray(weight, dtype=np.float32)
-        tensors[f"{prefix}.{i}.bias"] = np.ascontiguousarray(bias, dtype=np.float32)
-
-
-def _get_limits(tensors: Mapping[str, np.ndarray], described: Mapping[str, float]) -> Limits:
-    arrays = {name: tensors[f"limits.{name}"] for name in _LIMITS}
-    scalars = {name: described[name] for name in _LIMIT_SCALARS}
-    return Limits(**arrays, **scalars)  # type: ignore[arg-type]
-
-
-def _get_mlp(tensors: Mapping[str, np.ndarray], prefix: str, activation: str) -> MLP:
-    layers = sum(bool(re.fullmatch(rf"{prefix}\.\d+\.weight", name)) for name in tensors)
-    weights = [tensors[f"{prefix}.{i}.weight"] for i in range(layers)]
-    biases = [tensors[f"{prefix}.{i}.bias"] for i in range(layers)]
-    return MLP(weights, biases, activation)
+    return InverseMap(mlp, features, **arrays, **scalars)
 
 
 def shipped() -> dict[str, str]:
-    """Names of the maps that ship with the package: ``{"van_der_pol": "van_der_pol-v1", ...}``.
+    """Return the names of the maps that ship with the package: ``{"van_der_pol": "van_der_pol-v2", ...}``.
 
-    Every version that ever shipped is there under its full name; the name without a version is the newest.
+    Returns
+    -------
+    dict of str to str
+        The name of a file, without its ending, by name. Every version that ever shipped is there under its full name;
+        the name without a version is the newest.
     """
     versions: dict[str, list[int]] = {}
     for entry in files("observers").joinpath("maps").iterdir():
@@ -389,7 +511,23 @@ def shipped() -> dict[str, str]:
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    """The file behind a shipped name, or behind a path if it ends in ``.safetensors``."""
+    """Return the file behind a name.
+
+    Parameters
+    ----------
+    name_or_path : str or PathLike
+        A shipped name, or a path that ends in ``.safetensors``, whether there is such a file or not.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    ArtifactError
+        If no map of this name ships.
+    """
     text = os.fspath(name_or_path)
     if text.endswith(".safetensors"):
         return Path(text)

@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from observers.checks import is_finite
 from observers.sparse import MANY_ROWS, SparseUpdate
+
+MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
 
 
 class LinearFilter:
@@ -21,14 +24,30 @@ class LinearFilter:
 
     Parameters
     ----------
-    A : (nz, nz), Hurwitz and diagonalisable, in 1/s.
-    B : (nz, ny).
-    dt : sampling interval in seconds.
-    nu : number of known inputs that are filtered, 0 for the paper's observer.
+    A : ndarray, shape (nz, nz)
+        Hurwitz and diagonalisable, in 1/s.
+    B : ndarray, shape (nz, ny)
+        What the outputs act through.
+    dt : float
+        Sampling interval in seconds.
+    nu : int, default 0
+        Number of known inputs that are filtered, 0 to 64; none make the paper's observer.
+
+    Attributes
+    ----------
+    transition : ndarray, shape (size, size)
+        What z_k+1 keeps of z_k.
+    early_y, late_y : ndarray, shape (size, ny)
+        What the outputs at the beginning and at the end of an interval add.
+    held_u : ndarray, shape (size, nu)
+        What the inputs held over an interval add.
+    equilibrium : ndarray, shape (size, ny)
+        The state that constant outputs lead to.
 
     Raises
     ------
-    ValueError : if a shape is wrong, A is not Hurwitz or not diagonalisable, or dt <= 0.
+    ValueError
+        If a shape is wrong, A is not Hurwitz or not diagonalisable, or dt or nu is out of range.
     """
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
@@ -37,8 +56,10 @@ class LinearFilter:
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
-        if not 0 < dt < np.inf:
+        if not is_finite(dt) or dt <= 0:
             raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
+        if not isinstance(nu, int | np.integer) or isinstance(nu, bool) or not 0 <= nu <= MOST_INPUTS:
+            raise ValueError(f"the number of inputs must be whole, from 0 to {MOST_INPUTS}, got {nu!r}")
         if np.count_nonzero(A - np.diag(A.diagonal())):
             poles, V = np.linalg.eig(A)
         else:
@@ -60,7 +81,7 @@ class LinearFilter:
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:
             return np.vstack([matrix, np.zeros((nu * nz, ny))])
 
-        self.A, self.B, self.dt, self.nu = A, B, float(dt), nu
+        self.A, self.B, self.dt, self.nu = A, B, float(dt), int(nu)
         self.transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
         self.early_y = acts_on_z_y(function_of_A(hold - late) @ B)
         self.late_y = acts_on_z_y(function_of_A(late) @ B)
@@ -75,23 +96,69 @@ class LinearFilter:
         return len(self.transition)
 
     def start(self, y0: np.ndarray) -> np.ndarray:
-        """The state that a constant output y0, (..., ny), would have led to: z_y = -A^-1 B y0, z_u = 0."""
+        """Return the state that a constant output would have led to: z_y = -A^-1 B y0, z_u = 0.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (..., ny)
+            The output.
+
+        Returns
+        -------
+        ndarray, shape (..., size)
+            The state.
+        """
         z: np.ndarray = y0 @ self.equilibrium.T
         return z
 
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
-        """The state one sample later.
+        """Return the state one sample later.
 
-        z : (..., size); y, y_next : (..., ny), the outputs at both ends; u : (..., nu), held between them. A batch
-        (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
+        A batch (n, size) of many rows goes through Numba where it is installed, which rounds a little differently.
+
+        Parameters
+        ----------
+        z : ndarray, shape (..., size)
+            The state.
+        y : ndarray, shape (..., ny)
+            The output at the same time.
+        u : ndarray, shape (..., nu)
+            The input held until the next sample.
+        y_next : ndarray, shape (..., ny)
+            The output at the next sample.
+
+        Returns
+        -------
+        ndarray, shape (..., size)
+            The state at the next sample.
+
+        Raises
+        ------
+        ValueError
+            If the shapes do not go together.
         """
-        if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
-            return self._compiled(z, y, u, y_next)
+        if z.ndim == 2 and len(z) >= MANY_ROWS and self._sparse is not None:
+            return self._sparse(z, y, u, y_next)
         z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
         return z_next
 
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
-        """States at ``ages``, (m, n, size), along outputs (steps + 1, n, ny) and inputs (steps, n, nu)."""
+        """Return the states at some samples of a record.
+
+        Parameters
+        ----------
+        y : ndarray, shape (steps + 1, n, ny)
+            Outputs.
+        u : ndarray, shape (steps, n, nu)
+            Inputs, each held after the output of its row.
+        ages : ndarray of int, shape (m,)
+            Samples since the start, from 0 to ``steps``, without repetition.
+
+        Returns
+        -------
+        ndarray, shape (m, n, size)
+            States.
+        """
         z = self.start(y[0])
         out = np.empty((len(ages), *z.shape))
         slot = {int(age): i for i, age in enumerate(ages)}
@@ -103,10 +170,10 @@ class LinearFilter:
         return out
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+        return {name: value for name, value in self.__dict__.items() if name != "_sparse"}  # Numba is not everywhere
 
     @functools.cached_property
-    def _compiled(self) -> SparseUpdate | None:
+    def _sparse(self) -> SparseUpdate | None:
         try:
             return SparseUpdate(self.transition, self._drive)
         except (ImportError, ValueError):

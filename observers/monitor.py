@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from observers.checks import is_finite
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -13,11 +15,27 @@ class Limits:
     environments and random inputs, a run of ``duration`` seconds exceeds one of the limits with probability
     ``false_alarms``.
 
-    levels : standard deviations of the noise, rising from 0, (k,); limits are interpolated between them.
-    mean : of the absolute running mean of the residual, (k, ny).
-    low, high : of its running mean square, (k, ny); ``low`` is 0 where there is no noise to be missed.
-    window : time constant of the running means, in seconds.
-    warm_up : seconds after reset in which the observer is still converging and nothing is judged.
+    Parameters
+    ----------
+    levels : ndarray, shape (k,)
+        Standard deviations of the measurement noise, rising from 0. Limits are interpolated between them.
+    mean : ndarray, shape (k, ny)
+        Limits of the absolute running mean of the residual.
+    low, high : ndarray, shape (k, ny)
+        Limits of the running mean square of the residual. ``low`` is 0 where there is no noise to be missed.
+    window : float
+        Time constant of the running means, in seconds.
+    warm_up : float
+        Seconds after reset in which the observer is still converging and nothing is judged.
+    false_alarms : float
+        Probability of an alarm in a sound run, within (0, 1).
+    duration : float
+        Seconds of such a run.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, a limit is not finite or out of order, or a number is out of range.
     """
 
     levels: np.ndarray
@@ -31,18 +49,41 @@ class Limits:
 
     def __post_init__(self) -> None:
         k = len(self.levels)
-        if self.levels.ndim != 1 or k < 1 or self.levels[0] != 0 or (np.diff(self.levels) <= 0).any():
+        if self.levels.ndim != 1 or k < 1 or self.levels[0] != 0 or not (np.diff(self.levels) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not self.mean.shape == self.low.shape == self.high.shape == (k, *self.mean.shape[1:]) or self.mean.ndim != 2:
             raise ValueError(f"limits must be (levels, ny), got {self.mean.shape}, {self.low.shape}, {self.high.shape}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
-        sane = 0 < self.window < np.inf and 0 <= self.warm_up < np.inf and 0 < self.duration < np.inf
-        if not sane or not 0 < self.false_alarms < 1:
-            raise ValueError("window and duration must be positive, warm_up not negative, false_alarms within (0, 1)")
+        if not all(np.isfinite(limit).all() for limit in (self.levels, self.mean, self.high)):
+            raise ValueError("limits and their levels must be finite")
+        for name in ("window", "warm_up", "false_alarms", "duration"):
+            if not is_finite(getattr(self, name)):
+                raise ValueError(f"the limits' {name} must be a finite number, got {getattr(self, name)!r}")
+        if not (self.window > 0 and 0 <= self.warm_up < self.duration and 0 < self.false_alarms < 1):
+            raise ValueError(
+                "limits need window > 0, 0 <= warm_up < duration and 0 < false_alarms < 1, got "
+                f"{self.window}, {self.warm_up}, {self.duration} and {self.false_alarms}"
+            )
 
     def at(self, level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Limits of mean, low and high at a noise level, each (ny,)."""
+        """Return the limits at a noise level.
+
+        Parameters
+        ----------
+        level : float
+            Standard deviation of the measurement noise.
+
+        Returns
+        -------
+        mean, low, high : ndarray, shape (ny,)
+            Limits, interpolated as variances add up.
+
+        Raises
+        ------
+        ValueError
+            If the level is beyond the last one.
+        """
         if level > self.levels[-1]:
             raise ValueError(f"no limits beyond noise {self.levels[-1]:g}, got {level:g}: calibrate for it")
 
@@ -60,11 +101,17 @@ class Monitor:
 
     Parameters
     ----------
-    limits : of sound operation.
-    level : standard deviation of the measurement noise.
-    dt : sampling interval in seconds.
+    limits : Limits
+        The limits of sound operation.
+    level : float
+        Standard deviation of the measurement noise.
+    dt : float
+        Sampling interval in seconds.
 
-    Raises ValueError if there are no limits for the level.
+    Raises
+    ------
+    ValueError
+        If there are no limits for the level.
     """
 
     def __init__(self, limits: Limits, level: float, dt: float) -> None:
@@ -74,18 +121,38 @@ class Monitor:
         self._sound = np.maximum(level**2, self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:
-        """Begin anew, with rows of shape (...,)."""
+        """Begin anew.
+
+        Parameters
+        ----------
+        batch : tuple of int
+            Shape (...,) of the batch from here on.
+        """
         ny = len(self._sound)
         self._mean = np.zeros((*batch, ny))
         self._square = np.broadcast_to(self._sound, (*batch, ny)).copy()
         self._age = np.zeros(batch, dtype=int)
 
     def restart(self, rows: np.ndarray) -> None:
-        """Begin anew in some rows, boolean (...,)."""
+        """Begin anew in some rows.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (...,)
+            The rows.
+        """
         self._mean[rows], self._square[rows], self._age[rows] = 0.0, self._sound, 0
 
     def update(self, residual: np.ndarray, rows: np.ndarray | None = None) -> None:
-        """Take in residuals y - C x_hat, (..., ny); with ``rows``, boolean (...,), those of some rows only."""
+        """Take in residuals y - C x_hat.
+
+        Parameters
+        ----------
+        residual : ndarray, shape (..., ny)
+            The residuals.
+        rows : ndarray of bool, shape (...,), optional
+            The rows whose residuals count; by default all.
+        """
         share = self._share if rows is None else self._share * rows[..., None]
         self._mean += share * (residual - self._mean)
         self._square += share * (residual**2 - self._square)

@@ -24,11 +24,19 @@ ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "si
 class MLP:
     """A multilayer perceptron in float32.
 
-    weights : for each layer (outputs, inputs), as torch stores them.
-    biases : for each layer (outputs,).
-    activation : after every layer but the last, "tanh" or "silu".
+    Parameters
+    ----------
+    weights : sequence of ndarray, shape (outputs, inputs) each
+        For each layer, as torch stores them.
+    biases : sequence of ndarray, shape (outputs,) each
+        For each layer.
+    activation : {"tanh", "silu"}
+        After every layer but the last.
 
-    Raises ValueError if shapes do not chain, a weight is not finite or the activation is unknown.
+    Raises
+    ------
+    ValueError
+        If shapes do not chain, a weight is not finite in float32 or the activation is unknown.
     """
 
     weights: Sequence[np.ndarray]
@@ -41,17 +49,15 @@ class MLP:
             raise ValueError(f"unknown activation {self.activation!r}, expected one of {', '.join(ACTIVATIONS)}")
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
-        width = np.shape(self.weights[0])[-1]
+        width, layers = np.shape(self.weights[0])[-1], []
         for weight, bias in zip(self.weights, self.biases, strict=True):
             if weight.ndim != 2 or bias.shape != weight.shape[:1] or weight.shape[1] != width:
                 raise ValueError(f"layer of shape {weight.shape}, bias {bias.shape}, cannot follow {width} values")
-            if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            with np.errstate(over="ignore"):  # what is too large is infinite, and refused
+                layers.append((np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32)))
+            if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights that are not finite")
             width = len(bias)
-        layers = [
-            (np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32))
-            for weight, bias in zip(self.weights, self.biases, strict=True)
-        ]
         object.__setattr__(self, "_layers", layers)
 
     @property
@@ -65,7 +71,18 @@ class MLP:
         return int(self.weights[-1].shape[0])
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """(..., inputs) to (..., outputs), float32."""
+        """Evaluate the network.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., inputs)
+            Inputs, any type of float.
+
+        Returns
+        -------
+        ndarray of float32, shape (..., outputs)
+            Outputs.
+        """
         activation = ACTIVATIONS[self.activation]
         *hidden, (weight, bias) = self._layers
         h: np.ndarray = x.astype(np.float32, copy=False)

@@ -2,12 +2,12 @@
 
 import math
 import os
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
+from observers.checks import noise_level, real_array
 from observers.monitor import Monitor
 
 _LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
@@ -23,16 +23,21 @@ class KKLObserver:
 
     Parameters
     ----------
-    artifact : what was learned.
-    measurement_noise : standard deviation of the noise on each sample of the output, for maps that ask for it.
-    monitor : whether to watch if the samples fit the estimates, see :attr:`score`.
-    process_noise : level of the noise on the state's derivative, in multiples of the system's scale per second as for
-        the environments, for maps that ask for it. What lies beyond their training counts as its end, and so does None:
+    artifact : Artifact
+        What was learned.
+    measurement_noise : float, default 0.5
+        Standard deviation of the noise on each sample of the output, for maps that ask for it.
+    process_noise : float, optional
+        Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
+        environments, for maps that ask for it. What lies beyond their training counts as its end. So does None: it is
         the system's own level, which is also that of the environments and of the monitor's limits.
+    monitor : bool, default False
+        Whether to watch if the samples fit the estimates, see :attr:`score`.
 
     Raises
     ------
-    ValueError : if a noise level is negative or not finite, the measurement noise is beyond what the map was trained
+    ValueError
+        If a noise level is no number, negative or not finite, the measurement noise is beyond what the map was trained
         for, or the artifact holds no limits for a monitor.
     """
 
@@ -61,9 +66,7 @@ class KKLObserver:
 
     @measurement_noise.setter
     def measurement_noise(self, level: float) -> None:
-        inverse = self.artifact.inverse
-        if not 0 <= level < math.inf:
-            raise ValueError(f"measurement_noise must be finite and not negative, got {level!r}")
+        inverse, level = self.artifact.inverse, noise_level("measurement_noise", level)
         if "measurement_noise" in inverse.features and level > inverse.measurement_noise_max:
             raise ValueError(
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
@@ -73,7 +76,7 @@ class KKLObserver:
         monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
-        self._measurement_noise, self._monitor, self._x_hat = float(level), monitor, None
+        self._measurement_noise, self._monitor, self._x_hat = level, monitor, None
         self._tell()
 
     @property
@@ -89,9 +92,7 @@ class KKLObserver:
     def _level(self, process_noise: float | None) -> float:
         if process_noise is None:
             return self.artifact.process_noise_max or 0.0
-        if isinstance(process_noise, bool) or not isinstance(process_noise, Real) or not 0 <= process_noise < math.inf:
-            raise ValueError(f"process_noise must be a finite number, not negative, got {process_noise!r}")
-        return float(process_noise)
+        return noise_level("process_noise", process_noise)
 
     def _tell(self) -> None:
         """Tell the maps the levels of noise."""
@@ -107,8 +108,24 @@ class KKLObserver:
         return self._z.copy()
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """Forget the past and take in the first sample, (..., ny); returns the first estimate, (..., nx)."""
-        y0 = np.array(y0, dtype=float)  # a copy: it is kept, and the caller may reuse its array
+        """Forget the past and take in the first sample.
+
+        Parameters
+        ----------
+        y0 : array_like, shape (..., ny)
+            The sample; its shape is that of the batch from here on.
+
+        Returns
+        -------
+        ndarray, shape (..., nx)
+            The first estimate.
+
+        Raises
+        ------
+        ValueError
+            If the shape is wrong, or there is anything but finite real numbers; the observer is then as it was.
+        """
+        y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1])
         self._z, self._y, self._age, self._x_hat = self.artifact.filter.start(y0), y0, 0, None
         if self._monitor is not None:
@@ -117,13 +134,16 @@ class KKLObserver:
 
     @property
     def score(self) -> np.ndarray:
-        """How well the samples since reset fit the estimates, (...,): above 1 something is wrong.
+        """How well the samples since reset fit the estimates, shape (...,): above 1 something is wrong.
 
-        The running mean and mean square of y - C x_hat over their limits in sound operation; 0 right after reset, as it
-        was while samples are missing. A sensor's bias, freezing or dropping out raise it, and states that
-        the map was not made for. See :class:`observers.monitor.Limits` for what a score above 1 is worth.
+        The running mean and mean square of y - C x_hat over their limits in sound operation. The score is 0 right after
+        reset, and stays as it was while samples are missing. A sensor's bias, freezing or dropping out raise it, and so
+        do states that the map was not made for. See :class:`observers.Limits` for what a score above 1 is worth.
 
-        Raises RuntimeError before :meth:`reset` or without ``monitor=True``.
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`, or without ``monitor=True``.
         """
         if self._monitor is None or self._z is None:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
@@ -134,14 +154,21 @@ class KKLObserver:
 
         Parameters
         ----------
-        y0 : first samples, (number of True in rows, ny).
-        rows : boolean, of the batch's shape (...,).
+        y0 : array_like, shape (number of True in rows, ny)
+            First samples.
+        rows : array_like of bool, shape (...,)
+            The rows of the batch.
 
-        Raises ValueError on a wrong shape, NaN or infinity, RuntimeError before :meth:`reset`.
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, or there is anything but finite real numbers.
+        RuntimeError
+            Before :meth:`reset`.
         """
         rows = np.asarray(rows)
         z = self._rows(rows)
-        y0 = np.asarray(y0, dtype=float)
+        y0 = real_array("y", y0)
         self._check_output(y0, (int(rows.sum()),))
         z[rows] = self.artifact.filter.start(y0)
         self._z, self._y = z, self._y.copy()
@@ -152,20 +179,52 @@ class KKLObserver:
             self._monitor.restart(rows)
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
-        """Take in the sample y, (..., ny), that followed the input u, (..., nu); returns the estimate, (..., nx).
+        """Take in the next sample.
 
-        Without a sample (``y=None``) the observer coasts on its own prediction of the output, C x_hat, which makes
-        z' = A z + B C T_inv(z) a model of the system; where the output is not linear (the artifact holds no C) it
-        takes the last sample as still valid. ``u=None`` is zero.
+        Without a sample the observer coasts on its own prediction of the output, C x_hat, which makes
+        z' = A z + B C T_inv(z) a model of the system. Where the output is not linear (the artifact holds no C) it
+        takes the last sample as still valid.
 
-        Raises ValueError on a wrong shape, NaN or infinity, or a nonzero input that the map does not know of;
-        the observer is then as it was. Raises RuntimeError before :meth:`reset`.
+        Parameters
+        ----------
+        y : array_like, shape (..., ny), or None
+            The sample; None if it is missing.
+        u : array_like, shape (..., nu), optional
+            The input that led to it, by default zero.
+
+        Returns
+        -------
+        ndarray, shape (..., nx)
+            The estimate.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, there is anything but finite real numbers, or an input that the map does not know of
+            is not zero; the observer is then as it was.
+        RuntimeError
+            Before :meth:`reset`.
         """
         self.advance(y, u)
         return self.decode()
 
     def advance(self, y: np.ndarray | None, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """The filter's half of :meth:`step`; with ``rows``, boolean of the batch's shape, in these rows only."""
+        """Take in the next sample without an estimate: the filter's half of :meth:`step`.
+
+        Parameters
+        ----------
+        y : array_like, shape (..., ny), or None
+            The sample; None if it is missing.
+        u : array_like, shape (..., nu), optional
+            The input that led to it, by default zero.
+        rows : array_like of bool, shape (...,), optional
+            The rows of the batch that take it in, by default all.
+
+        Raises
+        ------
+        ValueError, RuntimeError
+            As :meth:`step`.
+        """
         if self._z is None:
             raise RuntimeError("call reset(y0) before step(y)")
         batch = self._z.shape[:-1]
@@ -174,7 +233,7 @@ class KKLObserver:
         if y is None:
             y = self._predicted_output(self._z, u)
         else:
-            y = np.array(y, dtype=float)
+            y = real_array("y", y).copy()  # as in reset
             self._check_output(y, batch)
         z = self.artifact.filter.advance(self._z, self._y, u, y)
         if rows is None:
@@ -191,7 +250,25 @@ class KKLObserver:
             self._monitor.update(self._y - self._x_hat @ self.artifact.C.T, rows)  # type: ignore[union-attr]
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The estimate T_inv(z) as things stand, (..., nx), or of some rows of the batch only, (number of rows, nx)."""
+        """Return the estimate T_inv(z) as things stand: the network's half of :meth:`step`.
+
+        Parameters
+        ----------
+        rows : array_like of bool, shape (...,), optional
+            The rows of the batch to estimate, by default all.
+
+        Returns
+        -------
+        ndarray, shape (..., nx) or (number of True in rows, nx)
+            The estimate.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        ValueError
+            If ``rows`` does not fit the batch.
+        """
         if self._z is None:
             raise RuntimeError("call reset(y0) before the observer is used")
         z, age = self._z, self._age
@@ -219,24 +296,36 @@ class KKLObserver:
         return np.asarray(self._invert(z_next, (self._age + 1) * linear.dt) @ C.T)
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Estimates for a whole record, the same as :meth:`reset` and :meth:`step` would give row by row.
+        """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
+
+        The observer's own state is left as it was.
 
         Parameters
         ----------
-        y : (steps, ..., ny); the first row is y_0.
-        u : (steps - 1, ..., nu), the input held after each row but the last (a last row more is ignored); None is 0.
+        y : array_like, shape (steps, ..., ny)
+            Outputs; the first row is y_0.
+        u : array_like, shape (steps - 1, ..., nu), optional
+            The input held after each row but the last, by default zero. A last row more is ignored.
 
         Returns
         -------
-        (steps, ..., nx). The observer's own state is left as it was.
+        ndarray, shape (steps, ..., nx)
+            Estimates.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`step`.
         """
-        y = np.asarray(y, dtype=float)
+        y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"a record must have shape (steps, ..., {self.artifact.ny}), got {y.shape}")
         self._check_output(y, y.shape[:-1])
         steps, batch = len(y), y.shape[1:-1]
-        if u is not None and len(u) not in (steps - 1, steps):
-            raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got {len(u)}")
+        if u is not None:
+            u = real_array("u", u)
+            if u.ndim < 1 or len(u) not in (steps - 1, steps):
+                raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
         linear = self.artifact.filter
         out = np.empty((*y.shape[:-1], self.artifact.nx))
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
@@ -279,7 +368,7 @@ class KKLObserver:
         nu = self.artifact.nu
         if u is None:
             return np.zeros((*batch, nu))
-        u = np.asarray(u, dtype=float)
+        u = real_array("u", u)
         if nu == 0:
             if u.any():
                 raise ValueError(
@@ -290,7 +379,7 @@ class KKLObserver:
         if u.shape != (*batch, nu):
             raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
         if not _finite(u):
-            raise ValueError("u holds NaN or infinity")
+            raise ValueError("u holds NaN, infinity or values beyond 1e15")
         return u
 
 
@@ -333,14 +422,31 @@ def load(
     process_noise: float | None = None,
     monitor: bool = False,
 ) -> KKLObserver:
-    """The observer behind a shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
+    """Return the observer behind a name.
 
-    A name without a version is the newest; ``"van_der_pol-v1"`` is that version for good.
+    Parameters
+    ----------
+    name_or_path : str or PathLike
+        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file. A name without a version is
+        the newest; ``"van_der_pol-v1"`` is that version for good.
+    measurement_noise : float, default 0.5
+        As for :class:`KKLObserver`.
+    process_noise : float, optional
+        As for :class:`KKLObserver`.
+    monitor : bool, default False
+        As for :class:`KKLObserver`.
 
-    The other parameters are those of :class:`KKLObserver`.
+    Returns
+    -------
+    KKLObserver
+        The observer, which awaits :meth:`KKLObserver.reset`.
 
-    Raises ArtifactError (a ValueError) if there is none or the file is damaged, ValueError on a noise level out
-    of range, or if it holds no limits and a monitor is asked for.
+    Raises
+    ------
+    ArtifactError
+        If there is no such name or file, or the file is damaged or foreign. It is a ValueError.
+    ValueError
+        If a noise level is out of range, or a monitor is asked for and the file holds no limits.
     """
     return KKLObserver(
         Artifact.read(resolve(name_or_path)), measurement_noise, process_noise=process_noise, monitor=monitor

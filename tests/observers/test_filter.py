@@ -3,8 +3,6 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 import observers.sparse
 from observers import LinearFilter
@@ -38,6 +36,7 @@ def signals(linear, steps, *batch):
 @pytest.mark.parametrize("dt", [1e-3, 0.1, 2.0])
 def test_one_interval_is_exact(A, nu, dt):
     """Against the exponential of the system augmented with the ramp of y and the constant u."""
+    expm = pytest.importorskip("scipy.linalg").expm
     linear = random_filter(A, 2, nu, dt)
     nz = len(A)
     (y, y_next), (u,) = signals(linear, 1)
@@ -56,6 +55,7 @@ def test_one_interval_is_exact(A, nu, dt):
 @both
 def test_a_record_is_exact(A):
     """Against an integrator that knows nothing of matrix exponentials."""
+    solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
     linear = random_filter(A)
     steps, nz = 15, len(A)
     y, u = signals(linear, steps)
@@ -106,10 +106,11 @@ def test_batched_equals_looped(A, nu, batch):
 @pytest.mark.parametrize("nu", [0, 1, 2])
 def test_a_large_batch_equals_its_rows(A, ny, nu):
     """Compiled, for 2 to 6 terms beside z."""
+    pytest.importorskip("numba")
     linear = random_filter(A, ny, nu)
     y, u = signals(linear, 3, MANY_ROWS)
     z = run(linear, y, u)
-    assert linear._compiled is not None
+    assert linear._sparse is not None
     for row in range(MANY_ROWS):
         assert np.allclose(z[:, row], run(linear, y[:, row], u[:, row]), rtol=1e-13, atol=1e-14)
 
@@ -121,7 +122,7 @@ def test_a_large_batch_without_numba(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     observers.sparse._kernel.cache_clear()
     assert np.allclose(run(other, y, u), expected, rtol=1e-13, atol=1e-14)
-    assert other._compiled is None
+    assert other._sparse is None
 
 
 def test_a_filter_that_has_compiled_goes_where_numba_is_not(monkeypatch):
@@ -140,7 +141,7 @@ def test_a_full_transition_is_numpys():
     linear = random_filter(V @ -np.diag([0.5, 1.0, 2.0, 4.0]) @ np.linalg.inv(V))
     y, u = signals(linear, 2, MANY_ROWS)
     assert np.allclose(run(linear, y, u)[:, 0], run(linear, y[:, 0], u[:, 0]), rtol=1e-13, atol=1e-14)
-    assert linear._compiled is None
+    assert linear._sparse is None
 
 
 @pytest.mark.parametrize("rows", [3, MANY_ROWS])
@@ -182,10 +183,17 @@ def test_wrong_matrices_raise(A, B, match):
         LinearFilter(A, B, DT)
 
 
-@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("dt", [0.0, -1.0, np.nan, np.inf, True, "0.1", None, 10**400])
 def test_wrong_dt_raises(dt):
     with pytest.raises(ValueError, match="dt must be"):
         LinearFilter(DIAGONAL, np.ones((3, 1)), dt)
+
+
+@pytest.mark.parametrize("nu", [-1, 65, 10**9, 1.0, True, "1", None])
+def test_wrong_numbers_of_inputs_raise(nu):
+    with pytest.raises(ValueError, match=f"number of inputs must be whole, from 0 to 64, got {nu!r}"):
+        LinearFilter(DIAGONAL, np.ones((3, 1)), DT, nu)
+    assert LinearFilter(DIAGONAL, np.ones((3, 1)), DT, np.int64(64)).size == 65 * 3
 
 
 def test_repeated_poles_are_allowed_where_diagonal():

@@ -1,5 +1,8 @@
 import dataclasses
+import inspect
 import math
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -199,6 +202,7 @@ BAD_Y = [
 BAD_U = [
     ([math.nan], "u holds NaN"),
     ([math.inf], "u holds NaN"),
+    ([1e16], "u holds NaN, infinity or values beyond 1e15"),
     (1.0, r"u must have shape \(1,\), got \(\)"),
     ([1.0, 2.0], r"u must have shape \(1,\), got \(2,\)"),
     ([[1.0]], r"u must have shape \(1,\), got \(1, 1\)"),
@@ -227,6 +231,63 @@ def test_a_refused_reset_changes_nothing(y0, match, make_artifact):
     assert np.array_equal(observer.z, z)
 
 
+NO_NUMBERS = {
+    "a string": ["1.0"],
+    "bytes": [b"1.0"],
+    "a date": np.array(["2020-01-01"], "datetime64[s]"),
+    "a time": np.array([3], "timedelta64[s]"),
+    "complex": [1.0 + 2.0j],
+    "a complex array": np.array([1.0 + 0.0j]),
+    "structured": np.zeros(1, [("y", float)]),
+    "masked": np.ma.masked_array([1.0], [True]),
+    "objects": np.array([1.0], dtype=object),
+    "decimal": [Decimal(1)],
+    "nothing": [None],
+}
+
+
+@pytest.mark.parametrize("kind", NO_NUMBERS)
+def test_what_are_no_numbers_is_refused_and_changes_nothing(kind, make_artifact):
+    wrong, words = NO_NUMBERS[kind], "masked entries" if kind == "masked" else "real numbers"
+    tried, other = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    for observer in (tried, other):
+        observer.reset([0.5])
+        observer.step([0.7], [0.1])
+    batch, blind = KKLObserver(make_artifact()), KKLObserver(make_artifact(inputs=False))
+    batch.reset([[0.5], [0.5]])
+    blind.reset([0.5])
+    for call in (
+        lambda: tried.step(wrong),
+        lambda: tried.reset(wrong),
+        lambda: tried.advance(wrong),
+        lambda: tried.estimate(np.ma.stack([wrong, wrong]) if kind == "masked" else np.array([wrong, wrong])),
+        lambda: batch.restart(np.ma.stack([wrong]) if kind == "masked" else np.array([wrong]), np.array([True, False])),
+    ):
+        with pytest.raises(ValueError, match=f"y (must hold|holds) {words}"):
+            call()
+    for call in (
+        lambda: tried.step([0.3], wrong),
+        lambda: blind.step([0.3], wrong),
+        lambda: tried.estimate(np.ones((2, 1)), np.ma.stack([wrong]) if kind == "masked" else np.array([wrong])),
+    ):
+        with pytest.raises(ValueError, match=f"u (must hold|holds) {words}"):
+            call()
+    assert np.array_equal(tried.z, other.z)
+    assert np.array_equal(tried.step(None), other.step(None))
+
+
+@pytest.mark.parametrize(
+    "same", [[0.5], (0.5,), np.array([0.5], np.float32), np.array([0.5], ">f8"), np.ma.masked_array([0.5], [False]),
+             np.ma.masked_array([0.5]), np.array([0.5], np.float16), np.array([0.5], np.longdouble)],
+)  # fmt: skip
+def test_every_kind_of_real_array_is_taken(same, make_artifact):
+    observer, plain = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    assert np.array_equal(observer.reset(same), plain.reset(np.array([0.5])))
+    assert np.array_equal(observer.step(same, same), plain.step(np.array([0.5]), np.array([0.5])))
+    assert type(observer._y) is np.ndarray
+    assert np.array_equal(observer.step([1], [True]), plain.step([1.0], [1.0]))
+
+
 def test_reset_is_required(make_artifact):
     observer = KKLObserver(make_artifact())
     with pytest.raises(RuntimeError, match="reset"):
@@ -244,7 +305,8 @@ def test_reset_is_required(make_artifact):
         (np.zeros((0, 1)), None, "record"),
         (np.zeros((3, 2)), None, r"\(3, 1\)"),
         (np.full((3, 1), math.nan), None, "NaN"),
-        (np.zeros((3, 1)), np.zeros((1, 1)), "2 or 3 rows for 3 rows of y, got 1"),
+        (np.zeros((3, 1)), np.zeros((1, 1)), r"2 or 3 rows for 3 rows of y, got shape \(1, 1\)"),
+        (np.zeros((3, 1)), 0.0, r"2 or 3 rows for 3 rows of y, got shape \(\)"),
         (np.zeros((3, 1)), np.zeros((2, 2)), r"u must have shape \(1,\)"),
         (np.zeros((3, 1)), np.full((2, 1), math.nan), "u holds NaN"),
     ],
@@ -266,15 +328,27 @@ def test_blind_map_refuses_inputs(make_artifact):
     observer.step([1.0], [0.0])
 
 
-@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf])
+NO_LEVELS = [
+    -0.1, math.nan, math.inf, 10**400, True, np.True_, "0.5", b"0.5", [0.5], np.array([0.5]), 0.5 + 0j, Decimal("0.5")
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("level", [*NO_LEVELS, None], ids=lambda value: repr(value)[:9])
 @pytest.mark.parametrize("noise", [False, True])
 def test_wrong_noise_level_raises(level, noise, make_artifact):
     observer = KKLObserver(make_artifact(noise=noise), 0.2)
-    with pytest.raises(ValueError, match="measurement_noise must be finite and not negative"):
+    with pytest.raises(ValueError, match="measurement_noise must be a finite number, not negative, got "):
         observer.measurement_noise = level
     assert observer.measurement_noise == 0.2
-    with pytest.raises(ValueError, match="measurement_noise"):
+    with pytest.raises(ValueError, match="measurement_noise must be a finite number, not negative, got "):
         KKLObserver(make_artifact(noise=noise), level)
+
+
+@pytest.mark.parametrize("level", [0, 1, np.float32(0.5), np.int8(1), Fraction(1, 2)])
+def test_every_kind_of_real_number_is_a_noise_level(level, make_artifact):
+    observer = KKLObserver(make_artifact(process=True), level, process_noise=level)
+    assert (observer.measurement_noise, observer.process_noise) == (float(level), float(level))
+    assert type(observer.measurement_noise) is type(observer.process_noise) is float
 
 
 def test_noise_level_beyond_training_raises_only_where_it_is_a_feature(make_artifact):
@@ -322,7 +396,7 @@ def test_process_noise_is_told_only_to_maps_that_ask(make_artifact):
     assert np.array_equal(KKLObserver(artifact, process_noise=0.1).reset([1.0]), KKLObserver(artifact).reset([1.0]))
 
 
-@pytest.mark.parametrize("level", [-0.1, math.nan, math.inf, True, "0.1"])
+@pytest.mark.parametrize("level", NO_LEVELS, ids=lambda value: repr(value)[:9])
 def test_wrong_process_noise_raises(level, make_artifact):
     with pytest.raises(ValueError, match="process_noise must be a finite number, not negative, got"):
         KKLObserver(make_artifact(), process_noise=level)
@@ -343,6 +417,19 @@ def test_age_changes_the_estimate_until_age_max(make_artifact):
 def test_load_passes_its_settings_on(saved):
     observer = load(saved(process=True), 0.3, process_noise=0.1)
     assert (observer.measurement_noise, observer.process_noise) == (0.3, 0.1)
+
+
+@pytest.mark.parametrize("call", [load, KKLObserver])
+def test_all_but_the_measurement_noise_goes_by_name(call, saved, make_artifact):
+    first = saved() if call is load else make_artifact()
+    with pytest.raises(TypeError, match="positional"):
+        call(first, 0.3, True)
+    kinds = [(name, p.kind.name, p.default) for name, p in inspect.signature(call).parameters.items()][1:]
+    assert kinds == [
+        ("measurement_noise", "POSITIONAL_OR_KEYWORD", 0.5),
+        ("process_noise", "KEYWORD_ONLY", None),
+        ("monitor", "KEYWORD_ONLY", False),
+    ]
 
 
 def test_load_from_a_file(saved, make_artifact):

@@ -5,24 +5,19 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from kkl_gym import get_system
-from observers import MLP
+from observers import MLP, storage
 from observers.artifact import ArtifactError, resolve, shipped
 from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, STACKED, Features, Information, make
 from training.jobs import describe
 from training.systems import ControlTask
 
 FORMAT = 1
-
-
 _KEY = "kkl-gym-agent"
 
 
@@ -34,14 +29,29 @@ class AgentError(ValueError):
 class Agent:
     """A deterministic policy, the task it was trained on and what it knows of the state.
 
-    network : features in, actions out.
-    squashed : whether tanh bounds the actions (SAC) or a cut at -1 and 1 (PPO).
-    task : where it acts.
-    information : what it is shown.
-    observer : name and version of the shipped map, or path of the file, that it was trained on; None without.
-    fingerprint : SHA-256 of that file.
-    rules : what else its observations follow from, see :func:`rules`.
-    training : how it was trained.
+    Parameters
+    ----------
+    network : MLP
+        Features in, actions out.
+    squashed : bool
+        Whether tanh bounds the actions (SAC) or a cut at -1 and 1 (PPO).
+    task : ControlTask
+        Where it acts.
+    information : {"state", "x_hat", "z", "y", "stacked", "ekf"}
+        What it is shown.
+    observer : str, optional
+        Name and version of the shipped map, or path of the file, that it was trained on.
+    fingerprint : str, optional
+        SHA-256 of that file.
+    rules : mapping, optional
+        What else its observations follow from, see :func:`rules`.
+    training : mapping, optional
+        How it was trained.
+
+    Raises
+    ------
+    AgentError
+        If ``squashed`` is no bool or ``information`` is unknown.
     """
 
     network: MLP
@@ -53,17 +63,49 @@ class Agent:
     rules: Mapping[str, Any] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.squashed, bool):
+            raise AgentError(f"squashed must be a bool, got {self.squashed!r}")
+        if self.information not in INFORMATION:
+            raise AgentError(f"an agent knows one of {', '.join(INFORMATION)}, got {self.information!r}")
+
     def __call__(self, obs: np.ndarray) -> np.ndarray:
-        """Features (n, width) in, actions (n, nu) in [-1, 1] out."""
+        """Act.
+
+        Parameters
+        ----------
+        obs : ndarray, shape (n, width)
+            Features.
+
+        Returns
+        -------
+        ndarray, shape (n, nu)
+            Actions in [-1, 1].
+        """
         action = self.network(obs)
         bounded: np.ndarray = np.tanh(action) if self.squashed else np.clip(action, -1.0, 1.0)
         return bounded
 
     def make(self, num_envs: int, autoreset_mode: str | AutoresetMode = AutoresetMode.DISABLED) -> Features:
-        """The environment that the agent was trained in.
+        """Make the environment that the agent was trained in.
 
-        Raises AgentError if its observer, the system's equations or what its observations are made of have changed, or
-        the policy does not fit the environment.
+        Parameters
+        ----------
+        num_envs : int
+            Number of episodes at a time.
+        autoreset_mode : str or AutoresetMode, default DISABLED
+            What happens at the end of an episode, as for :class:`gymnasium.vector.VectorEnv`.
+
+        Returns
+        -------
+        Features
+            The environment.
+
+        Raises
+        ------
+        AgentError
+            If its observer, the system's equations or what its observations are made of have changed, or the policy
+            does not fit the environment.
         """
         if self.information in ("x_hat", "z") and self.observer is None:
             raise AgentError(f"an agent that knows {self.information} must name its observer")
@@ -82,10 +124,22 @@ class Agent:
         return env
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and description to one safetensors file, whole or not at all."""
+        """Write weights and description to one safetensors file, whole or not at all.
+
+        Parameters
+        ----------
+        path : str or PathLike
+            The file, whose name should end in ``.safetensors``; its folder is made.
+
+        Raises
+        ------
+        OSError
+            If the file cannot be written.
+        TypeError, ValueError
+            If JSON cannot hold ``rules`` or ``training``.
+        """
         tensors: dict[str, np.ndarray] = {}
-        for i, (weight, bias) in enumerate(zip(self.network.weights, self.network.biases, strict=True)):
-            tensors |= {f"{i}.weight": np.ascontiguousarray(weight), f"{i}.bias": np.ascontiguousarray(bias)}
+        storage.put_mlp(tensors, "", self.network)
         described = {
             "format": FORMAT,
             "activation": self.network.activation,
@@ -97,49 +151,51 @@ class Agent:
             "rules": dict(self.rules),
             "training": dict(self.training),
         }
-        target = Path(path)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.new")
-        save_file(tensors, temporary, metadata={_KEY: json.dumps(described, sort_keys=True, allow_nan=False)})
-        os.replace(temporary, target)
+        storage.save(path, tensors, key=_KEY, described=described)
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Agent":
-        """Read an agent; raises AgentError if the file is missing, damaged, foreign or of a newer format."""
-        if not Path(path).is_file():
-            raise AgentError(f"there is no file {path}")
-        try:
-            with safe_open(path, framework="numpy") as opened:
-                text = (opened.metadata() or {}).get(_KEY)
-                tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, TypeError) as error:
-            raise AgentError(f"{path} is damaged or no safetensors file: {error}") from error
-        if text is None:
-            raise AgentError(f"{path} is no agent of kkl-gym: it carries no {_KEY!r} metadata")
-        try:
-            described = json.loads(text)
+        """Read an agent.
+
+        Parameters
+        ----------
+        path : str or PathLike
+            The file.
+
+        Returns
+        -------
+        Agent
+            What :meth:`save` wrote.
+
+        Raises
+        ------
+        AgentError
+            If the file is missing, not readable, damaged, foreign or of a newer format.
+        """
+        tensors, described = storage.read(path, key=_KEY, error=AgentError, what="an agent")
+        with storage.explained(path, AgentError):
             if described.pop("format") != FORMAT:
-                raise AgentError(f"{path} has another format than {FORMAT}, which this version of kkl-gym reads")
-            layers = range(len(tensors) // 2)
-            network = MLP(
-                [tensors[f"{i}.weight"] for i in layers],
-                [tensors[f"{i}.bias"] for i in layers],
-                described.pop("activation"),
-            )
+                raise AgentError(f"it has another format than {FORMAT}, which this version of kkl-gym reads")
+            network = storage.get_mlp(tensors, "", described.pop("activation"))
             task = described.pop("task")
             if task["start_box"] is not None:
                 task["start_box"] = tuple(tuple(ends) for ends in task["start_box"])
-            if described["information"] not in INFORMATION:
-                raise AgentError(f"{path} knows {described['information']!r}, none of {', '.join(INFORMATION)}")
             return cls(network=network, task=ControlTask(**task), **described)
-        except AgentError:
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise AgentError(f"{path} is incomplete: {error!r}") from error
 
 
 def rules(task: ControlTask) -> dict[str, Any]:
-    """What an agent's observations follow from beside its task and observer: equations, target, scale, constants."""
+    """Return what an agent's observations follow from beside its task and observer.
+
+    Parameters
+    ----------
+    task : ControlTask
+        Where it acts.
+
+    Returns
+    -------
+    dict
+        Equations, target, scale and constants, as JSON gives them back.
+    """
     system = get_system(task.system)
     described = {
         "equations": describe(system)["equations"],
@@ -158,7 +214,23 @@ def versioned(observer: str) -> str:
 
 
 def fingerprint(observer: str) -> str:
-    """SHA-256 of an observer's file; raises AgentError if there is none."""
+    """Return the SHA-256 of an observer's file.
+
+    Parameters
+    ----------
+    observer : str
+        A shipped name, or a path that ends in ``.safetensors``.
+
+    Returns
+    -------
+    str
+        The digest in hexadecimal.
+
+    Raises
+    ------
+    AgentError
+        If there is no such file.
+    """
     try:
         return hashlib.sha256(resolve(observer).read_bytes()).hexdigest()
     except (OSError, ArtifactError) as error:

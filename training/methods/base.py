@@ -10,17 +10,17 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 from torch import nn
 
 from kkl_gym.system import System
-from observers.storage import replacing
+from observers import storage
 from training.jobs import describe
 from training.maps.optimise import Loss, Stage, optimise
 from training.progress import progress_bars
 from training.seeds import Stream, generator
 from training.trajectories.record import recording_ages, trajectories
+
+_KEY = "kkl-gym-method"
 
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
@@ -330,21 +330,19 @@ class Method(ABC, Generic[Trained]):
 
         Parameters
         ----------
-        trained : object
-            What :meth:`train` returned.
+        trained : Trained
+            What :meth:`train` returned; by default arrays of float32 or float64 by name.
         path : Path
-            File to write.
+            The file.
 
         Raises
         ------
         TypeError
-            If it is no dictionary, and the method does not override this.
+            If it is no dictionary, or an array is of another type.
         """
         if not isinstance(trained, dict):
             raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
-        arrays = {name: np.ascontiguousarray(value) for name, value in trained.items()}
-        with replacing(path) as temporary:
-            save_file(arrays, temporary, metadata={"kkl-gym-method": self.name})
+        storage.save(path, trained, key=_KEY, described={"method": self.name})
 
     def load(self, path: Path) -> Trained:
         """Read what :meth:`save` wrote.
@@ -356,20 +354,18 @@ class Method(ABC, Generic[Trained]):
 
         Returns
         -------
-        object
-            As :meth:`train` returned it.
+        Trained
+            What was trained.
 
         Raises
         ------
         ValueError
-            If the file is damaged, or of another method.
+            If the file is missing, damaged or of another method.
         """
         try:
-            with safe_open(path, framework="numpy") as opened:
-                name = (opened.metadata() or {}).get("kkl-gym-method")
-                arrays = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
-        except (SafetensorError, OSError, TypeError) as error:
-            raise ValueError(f"{path} is damaged, remove it to train anew: {error}") from error
-        if name != self.name:
-            raise ValueError(f"{path} was written by method {name!r}, not {self.name!r}")
+            arrays, described = storage.read(path, key=_KEY, error=ValueError, what="a trained method")
+        except ValueError as error:
+            raise ValueError(f"{error}; remove it to train anew") from error
+        if described.get("method") != self.name:
+            raise ValueError(f"{path} was written by method {described.get('method')!r}, not {self.name!r}")
         return arrays  # type: ignore[return-value]

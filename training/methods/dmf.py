@@ -8,6 +8,8 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, LinearFilter
+from observers.network import ACTIVATIONS
+from observers.storage import get_mlp, put_mlp
 from training.maps.networks import Network
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 from training.methods.kkl import SPECTRA, spectrum
@@ -136,18 +138,13 @@ class _Stage(nn.Module):
 
 def _pack(name: str, network: Network) -> Arrays:
     mlp = network.export()
-    arrays = {f"{name}.{i}.weight": weight for i, weight in enumerate(mlp.weights)}
-    arrays |= {f"{name}.{i}.bias": bias for i, bias in enumerate(mlp.biases)}
-    return {**arrays, f"{name}.{mlp.activation}": np.ones(1)}
+    arrays = {f"{name}.{mlp.activation}": np.ones(1)}
+    put_mlp(arrays, f"{name}.", mlp)
+    return arrays
 
 
 def _unpack(arrays: Arrays, name: str) -> MLP:
-    layers = range(sum(key.startswith(f"{name}.") and key.endswith(".weight") for key in arrays))
-    return MLP(
-        [arrays[f"{name}.{i}.weight"] for i in layers],
-        [arrays[f"{name}.{i}.bias"] for i in layers],
-        next(activation for activation in ("tanh", "silu") if f"{name}.{activation}" in arrays),
-    )
+    return get_mlp(arrays, f"{name}.", next(kind for kind in ACTIVATIONS if f"{name}.{kind}" in arrays))
 
 
 class Switching:

@@ -1,6 +1,8 @@
 """Training, saving and playing agents, at toy size."""
 
 import json
+import os
+import re
 import shutil
 from dataclasses import replace
 
@@ -8,6 +10,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from safetensors import safe_open
+from safetensors.numpy import save_file
 from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
@@ -105,7 +109,7 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         "empty": (b"", "damaged"),
         "newer": (content.replace(b'\\"format\\": 1', b'\\"format\\": 9'), "another format"),
         "incomplete": (content.replace(b'\\"squashed\\"', b'\\"squished\\"'), "incomplete"),
-        "unknown": (content.replace(b'\\"x_hat\\"', b'\\"x_hut\\"'), "knows 'x_hut', none of"),
+        "unknown": (content.replace(b'\\"x_hat\\"', b'\\"x_hut\\"'), "knows one of state, .* got 'x_hut'"),
     }
     for name, (changed, match) in cases.items():
         assert changed != content
@@ -113,12 +117,70 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         path.write_bytes(changed)
         with pytest.raises(AgentError, match=match):
             Agent.read(path)
-    with pytest.raises(AgentError, match="is no agent"):
+    with pytest.raises(AgentError, match="is not an agent of kkl-gym"):
         Agent.read(saved())
     with pytest.raises(AgentError, match="there is no file"):
         Agent.read(tmp_path / "none.safetensors")
     with pytest.raises(AgentError, match="no agent 'nothing' ships"):
         find("nothing")
+
+
+@pytest.fixture
+def parts():
+    """Tensors and description of a shipped agent, to be written again changed."""
+    with safe_open(find("lorenz"), framework="numpy") as opened:
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        return tensors, json.loads(opened.metadata()["kkl-gym-agent"])
+
+
+@pytest.mark.parametrize("change", [
+    lambda t, d: t.update({"0.weight": t["0.weight"].astype(np.int64)}),
+    lambda t, d: t.update({"0.bias": t["0.bias"] > 0}),
+    lambda t, d: t.update({"0.bias": np.full_like(t["0.bias"], np.nan)}),
+    lambda t, d: t.pop("1.bias"),
+    lambda t, d: t.clear(),
+    lambda t, d: d.update(activation=["tanh"]),
+    lambda t, d: d.update(squashed="false"),
+    lambda t, d: d.update(squashed=0),
+    lambda t, d: d.update(task=[]),
+    lambda t, d: d["task"].update(start_box=3),
+    lambda t, d: d["task"].update(period="0.05"),
+    lambda t, d: d.update(invented=1),
+    lambda t, d: d.update(information=["x_hat"]),
+    lambda t, d: d.update(format="1"),
+    lambda t, d: d.pop("activation"),
+])  # fmt: skip
+def test_contents_that_make_no_agent(change, parts, tmp_path):
+    tensors, described = parts
+    change(tensors, described)
+    path = tmp_path / "agent.safetensors"
+    save_file(tensors, path, metadata={"kkl-gym-agent": json.dumps(described)})
+    with pytest.raises(AgentError, match=re.escape(str(path))):
+        Agent.read(path)
+
+
+def test_metadata_nested_without_end(tmp_path):
+    path = tmp_path / "agent.safetensors"
+    save_file({"0.weight": np.ones((1, 1))}, path, metadata={"kkl-gym-agent": "[" * 100_000})
+    with pytest.raises(AgentError, match=re.escape(str(path))):
+        Agent.read(path)
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
+    Agent.read(find(name)).save(tmp_path / "new" / "agent.safetensors")
+    assert (tmp_path / "new" / "agent.safetensors").read_bytes() == find(name).read_bytes()
+    assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
+
+
+def test_an_interrupted_save_leaves_nothing_behind(tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(KeyboardInterrupt):
+        Agent.read(find("lorenz")).save(tmp_path / "agent.safetensors")
+    assert not os.listdir(tmp_path)
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "ppo_lstm"])
@@ -230,8 +292,6 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
 
 
 def test_metadata_is_json(learned):
-    from safetensors import safe_open
-
     _, folder = learned
     with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
         described = json.loads(opened.metadata()["kkl-gym-agent"])

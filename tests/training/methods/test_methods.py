@@ -393,6 +393,19 @@ def test_a_file_of_another_method_is_refused(tmp_path):
         get_method("gru").load(tmp_path / "one.safetensors")
 
 
+def test_damaged_files_and_what_is_no_array_of_floats(tmp_path):
+    method, path = get_method("ekf"), tmp_path / "new" / "one.safetensors"
+    with pytest.raises(TypeError, match=r"'steps' is of type int64.* float32 and float64: convert it"):
+        method.save({"steps": np.arange(3)}, path)
+    method.save({"process_noise": np.ones(1)}, path)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+    path.write_bytes(b"nothing")
+    with pytest.raises(ValueError, match=r"one\.safetensors is damaged .*; remove it to train anew"):
+        method.load(path)
+    with pytest.raises(ValueError, match="there is no file"):
+        method.load(tmp_path / "none")
+
+
 def test_methods_that_make_artifacts_make_files_for_everyone(tmp_path):
     method, _, trained, _ = trained_on_oscillator("node", tmp_path / "train", steps=2)
     method.save(trained, tmp_path / "node.safetensors")
