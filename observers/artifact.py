@@ -60,7 +60,7 @@ class ForwardMap:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """States (..., nx) to z (..., nz)."""
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
-        return np.asarray(self.z_offset + self.z_scale * z)
+        return self.z_offset + self.z_scale * z
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class InverseMap:
 
     def gain(self, measurement_noise: float) -> np.ndarray:
         """What the whitened modes are multiplied with at this noise level, (modes,)."""
-        return np.asarray(1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2))
+        return 1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2)
 
     def measurement_noise_feature(self, measurement_noise: Any) -> Any:
         """The network's input for a noise level."""

@@ -76,8 +76,7 @@ class LinearFilter:
 
     def start(self, y0: np.ndarray) -> np.ndarray:
         """The state that a constant output y0, (..., ny), would have led to: z_y = -A^-1 B y0, z_u = 0."""
-        z: np.ndarray = y0 @ self.equilibrium.T
-        return z
+        return y0 @ self.equilibrium.T
 
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """The state one sample later.
@@ -87,8 +86,7 @@ class LinearFilter:
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
             return self._compiled(z, y, u, y_next)
-        z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
-        return z_next
+        return np.concatenate((z, y, u, y_next), axis=-1) @ self._update
 
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
         """States at ``ages``, (m, n, size), along outputs (steps + 1, n, ny) and inputs (steps, n, nu)."""

@@ -216,7 +216,7 @@ class KKLObserver:
             return self._y
         y = self._invert(z, self._age * linear.dt) @ C.T
         z_next = linear.advance(z, self._y, u, y)
-        return np.asarray(self._invert(z_next, (self._age + 1) * linear.dt) @ C.T)
+        return self._invert(z_next, (self._age + 1) * linear.dt) @ C.T
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimates for a whole record, the same as :meth:`reset` and :meth:`step` would give row by row.
@@ -317,7 +317,7 @@ class _Decoder:
             inputs[..., :width] = modes
             for i, condition in enumerate(conditions):
                 inputs[..., width + i] = condition
-        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
+        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
 
 
 def _finite(values: np.ndarray) -> bool:
