@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from safetensors import safe_open
 from safetensors.numpy import save_file
-from safetensors.torch import save_file as save_torch
 
 import observers.artifact
 from kkl_gym import SYSTEMS, get_system
@@ -122,7 +120,8 @@ def test_foreign_files(tmp_path):
     save_file({"A": np.eye(2)}, path, metadata={"format": "pt"})
     with raises_naming(path):
         Artifact.read(path)
-    save_torch({"A": torch.zeros(2, dtype=torch.bfloat16)}, path)  # a type that NumPy lacks
+    header = json.dumps({"A": {"dtype": "BF16", "shape": [2], "data_offsets": [0, 4]}}).encode()
+    path.write_bytes(len(header).to_bytes(8, "little") + header + bytes(4))  # a type that NumPy lacks
     with raises_naming(path):
         Artifact.read(path)
     path.write_text("this is no map\n" * 100)
@@ -335,16 +334,17 @@ def layers(*sizes):
     ]
 
 
-@pytest.mark.parametrize(("activation", "module"), [("tanh", torch.nn.Tanh), ("silu", torch.nn.SiLU)])
+@pytest.mark.parametrize(("activation", "module"), [("tanh", "Tanh"), ("silu", "SiLU")])
 @pytest.mark.parametrize("sizes", [(3, 2), (4, 16, 3), (7, 32, 32, 32, 2)])
 @pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
 def test_mlp_equals_torch(activation, module, sizes, batch):
+    torch = pytest.importorskip("torch")
     weights, biases = layers(*sizes)
     steps = []
     for weight, bias in zip(weights, biases, strict=True):
         linear = torch.nn.Linear(*weight.shape[::-1])
         linear.load_state_dict({"weight": torch.from_numpy(weight), "bias": torch.from_numpy(bias)})
-        steps += [linear, module()]
+        steps += [linear, getattr(torch.nn, module)()]
     x = 3 * np.random.default_rng(4).normal(size=(*batch, sizes[0]))
     kept = x.copy()
     with torch.no_grad():

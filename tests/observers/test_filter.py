@@ -3,8 +3,6 @@ import sys
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
-from scipy.linalg import expm
 
 import observers.sparse
 from observers import LinearFilter
@@ -38,6 +36,7 @@ def signals(linear, steps, *batch):
 @pytest.mark.parametrize("dt", [1e-3, 0.1, 2.0])
 def test_one_interval_is_exact(A, nu, dt):
     """Against the exponential of the system augmented with the ramp of y and the constant u."""
+    linalg = pytest.importorskip("scipy.linalg")
     linear = random_filter(A, 2, nu, dt)
     nz = len(A)
     (y, y_next), (u,) = signals(linear, 1)
@@ -49,13 +48,14 @@ def test_one_interval_is_exact(A, nu, dt):
         )
         M = np.zeros((nz + 2, nz + 2))  # (z, 1, t)
         M[:nz, :nz], M[:nz, nz], M[:nz, nz + 1], M[nz + 1, nz] = A, drive, slope, 1.0
-        expected.append((expm(M * dt) @ [*z[block * nz : (block + 1) * nz], 1.0, 0.0])[:nz])
+        expected.append((linalg.expm(M * dt) @ [*z[block * nz : (block + 1) * nz], 1.0, 0.0])[:nz])
     assert np.allclose(linear.advance(z, y, u, y_next), np.concatenate(expected), rtol=1e-10, atol=1e-11)
 
 
 @both
 def test_a_record_is_exact(A):
     """Against an integrator that knows nothing of matrix exponentials."""
+    integrate = pytest.importorskip("scipy.integrate")
     linear = random_filter(A)
     steps, nz = 15, len(A)
     y, u = signals(linear, steps)
@@ -66,7 +66,7 @@ def test_a_record_is_exact(A):
             held = y[k] + (y[k + 1] - y[k]) * t / DT
             return np.concatenate([A @ z[:nz] + linear.B @ held, A @ z[nz:] + linear.B @ np.ones(2) * u[k, 0]])
 
-        z = solve_ivp(field, (0, DT), z, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+        z = integrate.solve_ivp(field, (0, DT), z, "DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
     assert np.allclose(run(linear, y, u)[-1], z, rtol=1e-9, atol=1e-10)
 
 
@@ -106,6 +106,7 @@ def test_batched_equals_looped(A, nu, batch):
 @pytest.mark.parametrize("nu", [0, 1, 2])
 def test_a_large_batch_equals_its_rows(A, ny, nu):
     """Compiled, for 2 to 6 terms beside z."""
+    pytest.importorskip("numba")
     linear = random_filter(A, ny, nu)
     y, u = signals(linear, 3, MANY_ROWS)
     z = run(linear, y, u)

@@ -6,10 +6,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from conftest import random_artifact
-from linear_system import Oscillator, sylvester
 
 from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
 from observers import MLP, Artifact, ArtifactError, InverseMap, KKLObserver, Limits, LinearFilter, Monitor
+
+pytest.importorskip("torch")
+
+from linear_system import Oscillator, sylvester
+
 from training.evaluation.calibration import WARM_UP, calibrate, sound_trajectories
 
 ONES, ZEROS = np.ones, np.zeros

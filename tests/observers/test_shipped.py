@@ -7,6 +7,9 @@ import pytest
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
+
+pytest.importorskip("torch")
+
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape
 from training.presets import preset
