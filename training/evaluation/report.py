@@ -15,21 +15,28 @@ from training.trajectories.noise import noisy_output
 
 
 def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
-    """Errors in training, PDE residual over the domain, estimate against truth.
+    """Draw the errors in training, the PDE residual over the domain, and estimates against the truth.
 
-    Where no T was learned, the error by noise level takes the place of the residual.
+    Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
+    unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
 
-    The trajectories shown are unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    result : Result
+        What the training made.
+    system : System
+        What it was made for.
+    seed : int
+        Seed of the trajectories and their noise.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     artifact = result.artifact
     seconds = min(20.0, artifact.training["duration"])
-    runs = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
-    figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
+    trajectories = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
+    figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
     for name, history in result.losses.items():
@@ -38,11 +45,11 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
     if artifact.forward is None:
-        _draw_noise_levels(right, result, system, runs, seed)
+        _draw_noise_levels(right, result, system, trajectories, seed)
     else:
         draw_residual(figure, right, artifact, system)
 
-    x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
+    x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
     for column, noise in enumerate((0.0, 0.5)):
@@ -59,23 +66,41 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
                 ax.legend(loc="upper right")
         ax.set_xlabel("t in s")
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
-def _draw_noise_levels(ax: Any, result: Result, system: System, runs: UnseenTrajectories, seed: int) -> None:
+def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: UnseenTrajectories, seed: int) -> None:
     artifact = result.artifact
-    if not runs.x.shape[1]:
+    if not trajectories.x.shape[1]:
         ax.set_title("every trajectory left the declared bounds")
         return
     levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
-    medians = [np.median(errors(artifact, system, runs, measurement_noise=level, seed=seed).late) for level in levels]
+    medians = [np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels]
     ax.plot(range(len(levels)), medians, "o-")
     ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
 def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 150) -> None:
-    """Size of the PDE's residual over the plane of the phase portrait, the other states at the centre of X."""
+    """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+        Which gets a colour bar.
+    ax : matplotlib.axes.Axes
+        Where to draw.
+    artifact : Artifact
+        An observer with a forward map.
+    system : System
+        What it was made for.
+    n : int
+        Points along each axis.
+
+    Raises
+    ------
+    ValueError
+        If the artifact holds no forward map.
+    """
     from matplotlib.colors import LogNorm
 
     first, second = (i % system.nx for i in system.portrait)
