@@ -46,4 +46,6 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(f"training.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f'{error}: training.{name} needs pip install "kkl-gym[train]"', name=error.name) from None
+        raise ModuleNotFoundError(
+            f'{error}: training.{name} needs pip install "kkl-gym[train]"', name=error.name
+        ) from None

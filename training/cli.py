@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
         _run(arguments)
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
-        sys.exit(f'kkl-gym: {error}' + (f': pip install "kkl-gym[{extra}]"' if extra else ""))
+        sys.exit(f"kkl-gym: {error}" + (f': pip install "kkl-gym[{extra}]"' if extra else ""))
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"kkl-gym: {_message(error)}")
     except KeyboardInterrupt:

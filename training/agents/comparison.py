@@ -128,13 +128,13 @@ def _run(case: Case) -> None:
     if case.information in ("recurrent", "recurrent-state"):
         of: Literal["y", "state"] = "y" if case.information == "recurrent" else "state"
         policy = learn_recurrent(task, of, case.folder, seed=case.seed, timesteps=case.timesteps)()
-        env = make(task, of, case.episodes, "Disabled", with_action=True)
+        env = make(task, of, case.episodes, autoreset_mode="Disabled", with_action=True)
     else:
         information: Any = case.information
         policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
         env = agent.make(case.episodes)
     seconds = time.process_time() - began
-    x = play(env, policy, task.steps, AGENT_EVALUATION_SEED).x
+    x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     result = {
         "scores": scores(get_system(task.system), x).round(6).tolist(),
         "successes": successes(task, x).tolist(),
@@ -161,9 +161,9 @@ def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
         As :func:`training.agents.tasks.scores` gives them.
     """
     task = get_task(system, measurement_noise)
-    env = make(task, "state", episodes, "Disabled")
+    env = make(task, "state", episodes, autoreset_mode="Disabled")
     (nu,) = env.single_action_space.shape  # type: ignore[misc]
-    x = play(env, lambda obs: np.zeros((len(obs), nu)), task.steps, AGENT_EVALUATION_SEED).x
+    x = play(env, lambda obs: np.zeros((len(obs), nu)), steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     return scores(get_system(task.system), x)
 
 

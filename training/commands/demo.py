@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
+from observers.storage import replacing
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
 
@@ -55,7 +56,9 @@ class Demo:
             for env_id in progress.track(kkl_gym.ENV_IDS.values(), description="running"):
                 episode = play(env_id, self.measurement_noise, duration=self.duration, seed=self.seed)
                 steps = len(episode.x) - 1
-                full, late = (smape(episode.x[:, None], episode.x_hat[:, None], skip)[0] for skip in (0, (steps + 1) // 5))
+                full, late = (
+                    smape(episode.x[:, None], episode.x_hat[:, None], skip)[0] for skip in (0, (steps + 1) // 5)
+                )
                 table.add_row(env_id, f"{full:.2f}", f"{late:.2f}", f"{1e6 * episode.seconds / steps:.0f}")
                 episodes.append(episode)
         console.print(table)
@@ -159,6 +162,8 @@ def draw(path: Path, episodes: Sequence[Episode], measurement_noise: float) -> N
         axes[system.nx - 1, column].set_xlabel("t in s")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower left", ncols=len(labels))
-    figure.suptitle(f"Hidden states estimated from one noisy output (standard deviation {measurement_noise:g} on every sample)")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    figure.suptitle(
+        f"Hidden states estimated from one noisy output (standard deviation {measurement_noise:g} on every sample)"
+    )
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

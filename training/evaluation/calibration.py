@@ -32,9 +32,9 @@ def calibrate(
 ) -> Artifact:
     """Find limits for an observer's monitor.
 
-    Sound trajectories are simulated from starts in X with the system's process noise, half of them under random inputs if the
-    map knows inputs, at several noise levels. Each limit is the one that a new trajectory exceeds with a sixth of the
-    probability ``false_alarms`` (and of an output's share in it). A margin makes up for finding it among few.
+    Sound trajectories are simulated from starts in X with the system's process noise, half of them under random inputs
+    if the map knows inputs, at several noise levels. Each limit is the one that a new trajectory exceeds with a sixth
+    of the probability ``false_alarms`` (and of an output's share in it). A margin makes up for finding it among few.
 
     Parameters
     ----------

@@ -64,7 +64,9 @@ class UnseenTrajectories:
         return int((~self.inside).sum())
 
     def first(self, n: int) -> "UnseenTrajectories":
-        """The first of those drawn. (Alone they might differ: rounding depends on the batch, and chaos on it.)
+        """Take the first of those drawn.
+
+        Drawn alone they might differ: rounding depends on the batch, and chaos on rounding.
 
         Parameters
         ----------

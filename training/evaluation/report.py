@@ -7,6 +7,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from observers.storage import replacing
 from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.maps.smooth import residual
@@ -47,7 +48,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     if artifact.forward is None:
         _draw_noise_levels(right, result, system, trajectories, seed)
     else:
-        draw_residual(figure, right, artifact, system)
+        draw_residual(right, artifact, system)
 
     x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
@@ -65,7 +66,8 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
                 ax.set_title(f"measurement noise {level:g}")
                 ax.legend(loc="upper right")
         ax.set_xlabel("t in s")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: UnseenTrajectories, seed: int) -> None:
@@ -74,27 +76,27 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: Un
         ax.set_title("every trajectory left the declared bounds")
         return
     levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
-    medians = [np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels]
+    medians = [
+        np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels
+    ]
     ax.plot(range(len(levels)), medians, "o-")
     ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
-def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 150) -> None:
+def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 150) -> None:
     """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X.
 
     Parameters
     ----------
-    figure : matplotlib.figure.Figure
-        Which gets a colour bar.
     ax : matplotlib.axes.Axes
-        Where to draw.
+        Where to draw; its figure gets a colour bar.
     artifact : Artifact
         An observer with a forward map.
     system : System
         What it was made for.
-    n : int
-        Points along each axis.
+    points : int
+        Along each axis.
 
     Raises
     ------
@@ -104,11 +106,11 @@ def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: i
     from matplotlib.colors import LogNorm
 
     first, second = (i % system.nx for i in system.portrait)
-    x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
-    grids = [np.linspace(*system.X[i], n) for i in (first, second)]
+    x = np.tile(np.mean(system.X, axis=1), (points**2, 1))
+    grids = [np.linspace(*system.X[i], points) for i in (first, second)]
     x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
-    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
+    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(points, points)
     image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
-    figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
+    ax.figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
     ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

@@ -64,7 +64,7 @@ def test_a_saved_agent_plays_the_same(learned):
     assert read.fingerprint == fingerprint("van_der_pol-closed-loop")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
-    episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
+    episodes = [play(one.make(4), one, steps=TASK.steps, seed=0) for one in (agent, read)]
     assert np.array_equal(episodes[0].x, episodes[1].x)
     assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)
 
@@ -202,7 +202,7 @@ def test_an_agent_learns():
     task = TASKS["van_der_pol"]
     with tempfile.TemporaryDirectory() as folder:
         agent = learn(task, "state", Path(folder), timesteps=200_000)
-    x = play(agent.make(50), agent, task.steps, 0).x
+    x = play(agent.make(50), agent, steps=task.steps, seed=0).x
     assert scores(get_system(task.system), x).mean() > -0.25
 
 
@@ -245,6 +245,6 @@ def test_shipped_agents_act_on_estimates(name, least):
     agent = Agent.read(find(name))
     assert (agent.information, agent.observer) == ("x_hat", versioned(observer_of(get_system(name))))
     assert agent.task == TASKS[name]
-    system, episodes = get_system(name), play(agent.make(20), agent, agent.task.steps, 0)
+    system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
     assert not episodes.escaped.any()

@@ -24,7 +24,9 @@ def toy(out, **options):
 
 
 def toy_cases(out, *information):
-    return planned(out, systems=("lorenz",), information=information, seeds=1, episodes=3, timesteps=1, more_noise=False)
+    return planned(
+        out, systems=("lorenz",), information=information, seeds=1, episodes=3, timesteps=1, more_noise=False
+    )
 
 
 def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):

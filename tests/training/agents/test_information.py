@@ -43,7 +43,7 @@ def test_observations_are_finite_and_of_the_size_of_one(name, information):
 @pytest.mark.parametrize("information", INFORMATION)
 def test_last_observations_of_episodes_and_first_ones_of_the_next(information):
     """Against the same environment that leaves resets to us."""
-    ours, bare = make(TASK, information, N), make(TASK, information, N, "Disabled")
+    ours, bare = make(TASK, information, N), make(TASK, information, N, autoreset_mode="Disabled")
     assert (ours.reset(seed=1)[0] == bare.reset(seed=1)[0]).all()
     ends = 0
     for action in actions(25):
@@ -150,7 +150,7 @@ def test_kalman_filters_follow_a_driven_state():
 
 
 def test_rows_that_have_ended_stay_as_they_are():
-    env = make(TASK, "stacked", N, "Disabled")
+    env = make(TASK, "stacked", N, autoreset_mode="Disabled")
     env.reset(seed=0)
     for action in actions(TASK.steps):
         obs, _, _, truncated, _ = env.step(action)
