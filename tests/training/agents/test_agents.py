@@ -167,8 +167,10 @@ def test_hyperparameters():
     assert hyperparameters(TASKS["reverse_duffing"])[0] == "sac"
     assert hyperparameters(TASKS["lorenz"])[0] == "ppo"
     assert hyperparameters(TASKS["reverse_duffing"], "ppo")[0] == "ppo"
-    with pytest.raises(ValueError, match=r"sac\.yml has no settings for KKLLorenz-v0"):
-        hyperparameters(TASKS["lorenz"], "sac")
+    for algorithm in ("ppo", "sac", "ppo_lstm"):  # any of them for any system
+        for task in TASKS.values():
+            assert hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000
+    assert hyperparameters(TASKS["lorenz"], "sac") == hyperparameters(TASKS["reverse_duffing"])
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
         hyperparameters(TASKS["lorenz"], "dqn")
     with pytest.raises(ValueError, match="algorithm must be one of ppo, sac"):
@@ -178,7 +180,9 @@ def test_hyperparameters():
 
 
 def test_own_systems_get_the_defaults(script):
-    assert hyperparameters(ControlTask(f"{script}:Pendulum"))[0] == "ppo"
+    task = ControlTask(f"{script}:Pendulum")
+    assert hyperparameters(task)[0] == "ppo"
+    assert hyperparameters(task, "sac") == hyperparameters(TASKS["reverse_duffing"])
 
 
 def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
@@ -209,7 +213,7 @@ def test_an_agent_learns():
 def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
-    folder = tmp_path / "agents" / "lorenz-y-0"
+    folder = tmp_path / "runs" / "agents" / "lorenz-y-0"
     assert Agent.read(folder / "agent.safetensors").information == "y"
     with pytest.raises(SystemExit, match="holds an agent already"):
         main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
@@ -219,7 +223,7 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
         assert animation.n_frames > 20
     with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.png") as figure:
         assert figure.size[0] > 200
-    with pytest.raises(SystemExit, match="episodes must be positive"):
+    with pytest.raises(SystemExit, match="episodes from 1 to 10000; got 0 and 0"):
         main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "0"])
     own = replace(Agent.read(folder / "agent.safetensors"), task=ControlTask("some.py:Evil"))
     own.save("own.safetensors")

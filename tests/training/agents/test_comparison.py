@@ -15,6 +15,7 @@ import training.agents.learn
 import training.commands.compare
 from training.agents.comparison import COMPARED, MORE_NOISE, interval, middle, normalised, planned, run_case
 from training.commands.compare import Compare, report
+from training.jobs import locked
 from training.systems import PROFILES
 
 
@@ -138,6 +139,31 @@ def test_interquartile_means_and_intervals():
 def test_wrong_numbers(tmp_path):
     with pytest.raises(ValueError, match="must be positive"):
         toy(tmp_path, seeds=0).run(Console())
-    for wrong in ({"systems": ("lorenz", "lorenz")}, {"information": ("y", "y")}, {"information": ()}):
+    for wrong in (
+        {"systems": ("lorenz", "lorenz")},
+        {"systems": ("mine.py:Mine",)},  # whose agents the report would leave out
+        {"information": ("y", "y")},
+        {"information": ()},
+    ):
         with pytest.raises(ValueError, match="each once"):
             toy(tmp_path, **wrong).run(Console())
+
+
+def test_a_result_of_which_nobody_knows_what_it_is_of_is_no_result(tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    case.folder.mkdir(parents=True)
+    (case.folder / "result.json").write_text("{}")
+    assert not case.done
+
+
+def test_one_agent_is_not_trained_twice_at_a_time(tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    with locked(case.folder), pytest.raises(ValueError, match="another process is at work"):
+        run_case(case)
+
+
+def test_the_published_table_follows_from_the_published_results(tmp_path):
+    published = Path(__file__).parents[3] / "docs" / "results" / "agents"
+    shutil.copy(published / "results.csv", tmp_path)
+    report(tmp_path)
+    assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from linear_system import Oscillator
 
 from kkl_gym import SYSTEMS, VanDerPol, get_system
 from observers import load
@@ -95,6 +96,11 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
 def test_agents_keep_the_version_of_their_map_whatever_ships_later(name):
     fitted_in_closed_loop = "-closed-loop" if name in ("reverse_duffing", "van_der_pol") else ""
     assert observer_of(get_system(name)) == f"{name}{fitted_in_closed_loop}-v1"
+
+
+def test_no_observer_ships_for_a_system_of_ones_own():
+    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
+        observer_of(Oscillator())
 
 
 def test_an_output_that_is_flat_at_the_target():
