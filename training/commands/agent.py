@@ -187,9 +187,10 @@ def show(console: Console, agent: Agent, n: int, seed: int = 0) -> Episodes:
     ValueError
         If number or seed make no sense, or the agent does not fit its task.
     """
+    first = agent_evaluation_seed(seed, n)
     task = agent.task
     system = get_system(task.system)
-    episodes = play(agent.make(n), agent, steps=task.steps, seed=agent_evaluation_seed(seed, n))
+    episodes = play(agent.make(n), agent, steps=task.steps, seed=first)
     score, success = scores(system, episodes.x), successes(task, episodes.x)
     table = Table(show_header=False)
     for label, value in (
