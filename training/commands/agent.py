@@ -31,7 +31,7 @@ class Train:
     run's folder. Hyperparameters are those of training/agents/hyperparameters.
     """
 
-    system: tyro.conf.Positional[str]
+    system: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM")]
     """A shipped system, or a class of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[Information, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
     """What the agent knows: docs/agents.md explains each."""
@@ -47,11 +47,9 @@ class Train:
     """Actions to learn from, in all environments together."""
     observer: Annotated[
         str | None,
-        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the map on which the published agents act)"),
+        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: that of the agents that ship, of version 1)"),
     ] = None
-    """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z. The published agents act on
-    version 1: on the map fitted in closed loop, NAME-closed-loop-v1, where one ships, else on NAME-v1. For a system of
-    your own there is no default."""
+    """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
     algorithm: Annotated[
         Literal["ppo", "sac"] | None,
         tyro.conf.arg(metavar="{ppo,sac}", help_behavior_hint="(default: sac on reverse_duffing, else ppo)"),
@@ -109,7 +107,7 @@ class Evaluate:
     Score and success are means over the episodes, with bootstrap 95 % intervals.
     """
 
-    agent: tyro.conf.Positional[str]
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")]
     """A system whose agent ships with the package, or an agent.safetensors file."""
     episodes: int = 500
     """Number of episodes."""
@@ -152,10 +150,11 @@ class Evaluate:
 class AgentCommand:
     """Train, evaluate and compare agents that act on what an observer shows."""
 
-    command: tyro.conf.OmitSubcommandPrefixes[
+    command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Compare, tyro.conf.subcommand("compare")],
+        tyro.conf.arg(name=""),
     ]
 
     def run(self, console: Console) -> None:

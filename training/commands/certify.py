@@ -14,7 +14,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import replacing, write
-from training.commands.options import OwnSystem, read_observers
+from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.certificates.certificate import (
     QUANTILES,
     Certificate,
@@ -36,7 +36,7 @@ class Certify:
     each line.
     """
 
-    observers: tyro.conf.Positional[tuple[str, ...]]
+    observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
     measurement_noise: float = 0.5

@@ -13,7 +13,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
-from training.commands.options import OwnSystem, read_observers
+from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.errors import Domain, errors, unseen_trajectories
 
 
@@ -27,7 +27,7 @@ class Evaluate:
     left out.
     """
 
-    observers: tyro.conf.Positional[tuple[str, ...]]
+    observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
     measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)

@@ -12,7 +12,7 @@ from rich.table import Column, Table
 
 from kkl_gym import SYSTEMS
 from observers.storage import replacing, write
-from training.commands.options import OwnSystem, read_observers
+from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.faults import FAULTS, simulate_faults
 
 
@@ -27,8 +27,8 @@ class Faults:
     score varies.
     """
 
-    observers: tyro.conf.Positional[tuple[str, ...]] = tuple(SYSTEMS)
-    """Shipped maps, or .safetensors files, with limits for a monitor."""
+    observers: Observers = tuple(SYSTEMS)
+    """Shipped maps, or .safetensors files, with limits for a monitor; by default the newest of each shipped system."""
     system: OwnSystem = None
     trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 500
     """Number of trajectories for each observer."""

@@ -10,6 +10,9 @@ from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.artifact import resolve
 
+Observers = Annotated[
+    tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
+]
 OwnSystem = Annotated[
     str | None,
     tyro.conf.arg(
