@@ -18,40 +18,16 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """What is known of a system.
-
-    Parameters
-    ----------
-    system : System
-        Any.
-
-    Returns
-    -------
-    Profile
-        That of a shipped system by its name, else the defaults.
-    """
+    """What is known of a system; of one that is not shipped, the defaults."""
     return PROFILES.get(system.name, Profile())
 
 
 def controller(system: System) -> Controller:
-    """Make a stabilising feedback: the saturated linear-quadratic regulator, or the law that the profile names.
+    """A stabilising feedback: states (n, nx) in, actions (n, nu) in [-1, 1] out.
 
-    Parameters
-    ----------
-    system : System
-        What is to be held at its target.
+    The saturated linear-quadratic regulator, or the law that the system's profile names.
 
-    Returns
-    -------
-    callable
-        States (n, nx) in, actions (n, nu) in [-1, 1] out.
-
-    Raises
-    ------
-    ValueError
-        If the system has no inputs.
-    numpy.linalg.LinAlgError
-        If its linearisation cannot be stabilised.
+    Raises ValueError if the system has no inputs, numpy.linalg.LinAlgError if its linearisation cannot be stabilised.
     """
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")

@@ -13,26 +13,15 @@ from training.trajectories.controllers import Controller, linear_quadratic
 class Profile:
     """What is chosen for one system; the defaults serve any.
 
-    Parameters
-    ----------
-    eigenvalues : tuple of float, optional
-        Real eigenvalues of A for an input-aware map, in 1/s; by default they follow from how fast f changes in X.
-    settings : mapping
-        Of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
-    controller : callable
-        Makes the feedback of a system that drives closed-loop data and that agents are measured against.
-    fault_deadline : float, optional
-        Seconds within which a faulty sensor should be noticed; by default a fifth of the trajectory.
-    task : ControlTask, optional
-        What agents are to do; by default :class:`ControlTask` with its defaults.
-    algorithm : {"ppo", "sac"}
-        What agents are trained with.
-    agent_observer : str, optional
-        Shipped map on which agents act; by default the system's newest.
-    second_noise : float, optional
-        A further level of measurement noise at which agents are compared.
-    printed : mapping of str to float
-        Component-wise SMAPE in % after the first 20 %, without noise, from starts in 1.5X without X, by method: what
+    eigenvalues : real eigenvalues of A for an input-aware map, in 1/s; None follows from how fast f changes in X.
+    settings : of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
+    controller : makes the feedback that drives closed-loop data and that agents are measured against.
+    fault_deadline : seconds within which a faulty sensor should be noticed; None is a fifth of the run.
+    task : what agents are to do; None is :class:`ControlTask` with its defaults.
+    algorithm : what agents are trained with.
+    agent_observer : shipped map on which agents act; None is the system's newest.
+    second_noise : a further level of measurement noise at which agents are compared.
+    printed : component-wise SMAPE in % after the first 20 %, without noise, from starts in 1.5X \\ X, by method: what
         the notebooks print that were released with the paper.
     """
 

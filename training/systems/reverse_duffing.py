@@ -10,20 +10,10 @@ from training.trajectories.controllers import Controller
 
 
 def homogeneous(system: System) -> Controller:
-    """Make the law u = x1 - 2 (x2 + cbrt(x1)) for x1' = x2^3, x2' = -x1 + u, cut at the bound.
+    """u = x1 - 2 (x2 + cbrt(x1)) for x1' = x2^3, x2' = -x1 + u, cut at the input bound.
 
     The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -x1 cancelled, x2
     follows -cbrt(x1), on which x1' = -x1.
-
-    Parameters
-    ----------
-    system : System
-        Reverse Duffing, with an input bound of its own.
-
-    Returns
-    -------
-    callable
-        States (n, 2) in, actions (n, 1) in [-1, 1] out.
     """
     (u_max,) = system.u_max
 

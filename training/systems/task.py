@@ -14,27 +14,13 @@ from kkl_gym.wrappers.vector import VectorEnv
 class ControlTask:
     """Bring a system to its target and hold it there.
 
-    Parameters
-    ----------
-    system : str
-        A shipped name, "module:Class" or "script.py:Class".
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
-    period : float
-        Seconds for which an action is held; the observer sees every sample within.
-    duration : float
-        Length of an episode in seconds.
-    start_box : tuple of (low, high), optional
-        Where episodes start; by default the training box X.
-    tolerance : float
-        Success is |(x - target) / scale| within this throughout the last fifth of the episode.
-    dt : float
-        Sampling interval in seconds.
-
-    Raises
-    ------
-    ValueError
-        Unless the times make sense and are whole multiples of one another, and the tolerance is positive.
+    system : a shipped name, "module:Class" or "script.py:Class".
+    measurement_noise : standard deviation on every sample of y.
+    period : seconds for which an action is held; the observer sees every sample within.
+    duration : of an episode, in seconds.
+    start_box : where episodes start; None is the training box.
+    tolerance : success is |(x - target) / scale| within this throughout the last fifth of the episode.
+    dt : sampling interval in seconds.
     """
 
     system: str
@@ -68,22 +54,14 @@ class ControlTask:
         wrap: Callable[[VectorEnv], VectorEnv] | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> VectorEnv:
-        """Make the task as a vector environment that acts once a period.
+        """The task as a vector environment that acts once a period.
 
         Parameters
         ----------
-        num_envs : int
-            Rows.
-        wrap : callable, optional
-            What goes around the environment at its own sampling interval, such as
-            :class:`kkl_gym.KKLVectorObservation`; by default nothing, which shows the state.
-        autoreset_mode : str or AutoresetMode
-            As for :class:`kkl_gym.VectorActionRepeat`.
-
-        Returns
-        -------
-        VectorEnv
-            Its actions are in [-1, 1], as the environments'.
+        num_envs : rows.
+        wrap : what goes around the environment at its own sampling interval, such as
+            :class:`kkl_gym.KKLVectorObservation`; None shows the state.
+        autoreset_mode : as for :class:`kkl_gym.VectorActionRepeat`.
         """
         env: VectorEnv = KKLVectorEnv(
             self.system,
