@@ -32,11 +32,11 @@ AFTER_INTERRUPTION = {
     ("agent", "compare"): "the same command goes on",
 }
 
-# The extra that brings a module.
+# Modules that an extra of the package brings.
 EXTRAS = {
-    **dict.fromkeys(("stable_baselines3", "sb3_contrib", "yaml"), "agents"),
-    **dict.fromkeys(("matplotlib", "PIL"), "plots"),
-    **dict.fromkeys(("filelock", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "torch", "tyro"), "train"),
+    "train": {"filelock", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"},
+    "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
+    "plots": {"PIL", "matplotlib"},
 }
 
 
@@ -57,8 +57,9 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         _run(arguments)
     except ModuleNotFoundError as error:
-        extra = EXTRAS.get((error.name or "").partition(".")[0])
-        sys.exit(f"kkl-gym: {error}" + (f': pip install "kkl-gym[{extra}]"' if extra else ""))
+        module = (error.name or "").partition(".")[0]
+        hints = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
+        sys.exit(": ".join(["kkl-gym", str(error), *hints]))
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"kkl-gym: {_message(error)}")
     except KeyboardInterrupt:

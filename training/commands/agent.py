@@ -47,12 +47,14 @@ class Train:
     """Actions to learn from, in all environments together."""
     observer: Annotated[
         str | None,
-        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: that of the agents that ship, of version 1)"),
+        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: that of the published agents, of version 1)"),
     ] = None
     """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
     algorithm: Annotated[
         Literal["ppo", "sac"] | None,
-        tyro.conf.arg(metavar="{ppo,sac}", help_behavior_hint="(default: sac on reverse_duffing, else ppo)"),
+        tyro.conf.arg(
+            metavar="{ppo,sac}", help_behavior_hint="(default: the profile's; sac for reverse_duffing, else ppo)"
+        ),
     ] = None
     """What the agent is trained with."""
     out: Annotated[
@@ -247,7 +249,8 @@ def find(name: str) -> Path:
     if name.endswith(".safetensors"):
         return Path(name)
     folder = files("training.agents").joinpath("shipped")
-    shipped = sorted(entry.name.removesuffix(".safetensors") for entry in folder.iterdir())
+    names = sorted(entry.name for entry in folder.iterdir())
+    shipped = [entry.removesuffix(".safetensors") for entry in names if entry.endswith(".safetensors")]
     if name not in shipped:
         raise AgentError(f"no agent {name!r} ships; there are {', '.join(shipped)}; a file ends in .safetensors")
     return Path(str(folder.joinpath(f"{name}.safetensors")))

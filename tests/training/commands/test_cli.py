@@ -78,14 +78,14 @@ def test_extras_are_those_of_the_package():
         names = [text.partition(">")[0].lower().replace("_", "-") for text in declared[extra]]
         return {name for name in names if not name.startswith("kkl-gym")}
 
-    brought_by = {name: {entry.lower().replace("_", "-") for entry in found}
-                  for name, found in packages_distributions().items()}  # fmt: skip
-    for module, extra in EXTRAS.items():
-        if module != "PIL":  # which matplotlib brings
-            assert brought_by[module] & of(extra), module
-    for extra in ("agents", "plots"):
-        modules = {module for module, found in brought_by.items() if found & of(extra) and not module.startswith("_")}
-        assert {module for module, its in EXTRAS.items() if its == extra} & modules
+    for name, distributions in packages_distributions().items():
+        its = {entry.lower().replace("_", "-") for entry in distributions}
+        for extra, modules in EXTRAS.items():
+            if name in modules and name != "PIL":  # which matplotlib brings, whatever else does
+                assert its & of(extra), name
+    modules = set().union(*EXTRAS.values())
+    assert modules <= set(packages_distributions())
+    assert len(modules) == sum(map(len, EXTRAS.values()))
 
 
 def test_a_module_of_ones_own_that_is_missing_gets_no_hint(monkeypatch):
