@@ -1,6 +1,9 @@
 """Learning KKL observers offline: data, forward and inverse maps, evaluation. Needs the extra ``train``."""
 
-try:
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
     from training.config import Config
     from training.evaluation.calibration import calibrate
     from training.evaluation.certificates import Certificate, certify
@@ -8,10 +11,6 @@ try:
     from training.evaluation.metrics import smape
     from training.pipeline import Result, train
     from training.presets import preset
-except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(
-        f'{error}: training and the kkl-gym command need pip install "kkl-gym[train]"', name=error.name
-    ) from None
 
 __all__ = [
     "Certificate",
@@ -25,3 +24,28 @@ __all__ = [
     "train",
     "unseen_trajectories",
 ]
+
+_MODULES = {
+    "Certificate": "evaluation.certificates",
+    "Config": "config",
+    "Result": "pipeline",
+    "calibrate": "evaluation.calibration",
+    "certify": "evaluation.certificates",
+    "errors": "evaluation.errors",
+    "preset": "presets",
+    "smape": "evaluation.metrics",
+    "train": "pipeline",
+    "unseen_trajectories": "evaluation.errors",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """What is public, imported when it is asked for: torch takes seconds, and parts of the package need none."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        return getattr(import_module(f"training.{_MODULES[name]}"), name)
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            f'{error}: training.{name} needs pip install "kkl-gym[train]"', name=error.name
+        ) from None

@@ -1,55 +1,114 @@
-"""The command line, ``kkl-gym`` (or ``python -m training``)."""
+"""The command line, ``kkl-gym`` (or ``python -m training``): a table of commands, and what is said of errors.
 
+Importing this module imports nothing that takes time or may be missing. The module of a command is imported when that
+command is called.
+"""
+
+import ast
 import sys
 from collections.abc import Callable
+from importlib import import_module
+from importlib.resources import files
 from typing import Any
 
-import tyro
-from rich.console import Console
+# The module under training.commands and the class in it that are behind each command.
+COMMANDS = {
+    "train": ("train", "Train"),
+    "evaluate": ("evaluate", "Evaluate"),
+    "benchmark": ("benchmark", "Benchmark"),
+    "agent": ("agent", "AgentCommand"),
+    "certify": ("certify", "Certify"),
+    "tune": ("tune", "Tune"),
+    "faults": ("faults", "Faults"),
+    "maps": ("maps", "Maps"),
+    "demo": ("demo", "Demo"),
+    "speed": ("speed", "Speed"),
+}
 
-from training.commands.evaluate import Evaluate
-from training.commands.maps import Maps
-from training.commands.train import Train
+# What an interruption may be followed by, by the first words of the command.
+AFTER_INTERRUPTION = {
+    ("train",): "--resume goes on from the last checkpoint",
+    ("benchmark",): "the same command goes on",
+    ("agent", "compare"): "the same command goes on",
+}
+
+# Modules that an extra of the package brings.
+EXTRAS = {
+    "train": {"filelock", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"},
+    "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
+    "plots": {"PIL", "matplotlib"},
+}
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the ``kkl-gym`` command."""
-    from training.commands.agent import AgentCommand
-    from training.commands.benchmark import Benchmark
-    from training.commands.certify import Certify
-    from training.commands.compare import Compare
-    from training.commands.demo import Demo
-    from training.commands.faults import Faults
-    from training.commands.speed import Speed
-    from training.commands.tune import Tune
+    """Entry point of the ``kkl-gym`` command.
 
-    commands: dict[str, Callable[..., Any]] = {
-        "train": Train,
-        "evaluate": Evaluate,
-        "benchmark": Benchmark,
-        "agent": AgentCommand,
-        "certify": Certify,
-        "tune": Tune,
-        "faults": Faults,
-        "maps": Maps,
-        "demo": Demo,
-        "speed": Speed,
-    }
-    console = Console()
+    Parameters
+    ----------
+    arguments : list of str, optional
+        What follows ``kkl-gym``; by default what the process was called with.
+
+    Raises
+    ------
+    SystemExit
+        After help, and with one line that says what is wrong where something is.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        _run(arguments)
+    except ModuleNotFoundError as error:
+        module = (error.name or "").partition(".")[0]
+        hints = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
+        sys.exit(": ".join(["kkl-gym", str(error), *hints]))
+    except (ValueError, OSError, FloatingPointError) as error:
+        sys.exit(f"kkl-gym: {_message(error)}")
+    except KeyboardInterrupt:
+        hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
+        sys.exit("; ".join(["kkl-gym: interrupted", *hints]))
+
+
+def _run(arguments: list[str]) -> None:
+    import tyro
+    from rich.console import Console
+
+    called = arguments[:1]
+    if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
+        called = list(COMMANDS)
+    commands = {name: (_load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
     command: Any = tyro.extras.subcommand_cli_from_dict(
         commands,
         prog="kkl-gym",
         description="Learned KKL observers for Gymnasium environments.",
         args=arguments,
     )
-    try:
-        command.run(console)
-    except ModuleNotFoundError as error:
-        sys.exit(f"kkl-gym: {error}; pip install 'kkl-gym[agents]' has everything")
-    except (ValueError, OSError, FloatingPointError) as error:
-        sys.exit(f"kkl-gym: {error}")
-    except KeyboardInterrupt:
-        hint = "; --resume goes on from the last checkpoint" if isinstance(command, Train) else ""
-        goes_on = isinstance(command, Benchmark) or isinstance(getattr(command, "command", None), Compare)
-        hint = "; the same command goes on" if goes_on else hint
-        sys.exit(f"kkl-gym: interrupted{hint}")
+    command.run(Console())
+
+
+def _load(module: str, name: str) -> Callable[..., Any]:
+    found: Callable[..., Any] = getattr(import_module(f"training.commands.{module}"), name)
+    return found
+
+
+def _described(module: str, name: str) -> Callable[..., Any]:
+    """In the place of a command that is not called: the summary of its class, read without importing the module."""
+    source = files("training.commands").joinpath(f"{module}.py").read_text(encoding="utf-8")
+    classes = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)}
+
+    def command() -> None: ...
+
+    command.__doc__ = (ast.get_docstring(classes[name]) or "").partition("\n\n")[0]
+    return command
+
+
+def _message(error: Exception) -> str:
+    """What is wrong; of a configuration, a line for each setting: ``name = value: what it should be``."""
+    from pydantic import ValidationError
+
+    if not isinstance(error, ValidationError):
+        return str(error)
+    lines = []
+    for found in error.errors(include_url=False, include_context=False):
+        name = ".".join(map(str, found["loc"]))
+        text = found["msg"].removeprefix("Value error, ").removeprefix("Input ")
+        lines.append(f"{name} = {found['input']!r}: {text}" if name else text)
+    return "\n".join(lines)

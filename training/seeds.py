@@ -17,9 +17,37 @@ class Stream(IntEnum):
     TUNING = 7
 
 
-# Of an agent's first episode: in training, times one more than the agent's own seed, and in evaluation.
+# Of an agent's first episode, which the others follow one by one; in training, times one more than the agent's seed.
 AGENT_TRAINING_SEED = 10_000
 AGENT_EVALUATION_SEED = 10**9
+AGENT_EVALUATION_EPISODES = 10_000  # at most
+
+
+def agent_evaluation_seed(seed: int, episodes: int) -> int:
+    """Seed of the first episode on which agents are evaluated; no two seeds share an episode.
+
+    Parameters
+    ----------
+    seed : int
+        What a user asks for.
+    episodes : int
+        Number of episodes to play.
+
+    Returns
+    -------
+    int
+        Beyond those of training.
+
+    Raises
+    ------
+    ValueError
+        If the seed is negative, or there are no episodes or more than 10,000.
+    """
+    if seed < 0 or not 1 <= episodes <= AGENT_EVALUATION_EPISODES:
+        raise ValueError(
+            f"seed must not be negative, and episodes from 1 to {AGENT_EVALUATION_EPISODES}; got {seed} and {episodes}"
+        )
+    return AGENT_EVALUATION_SEED + AGENT_EVALUATION_EPISODES * seed
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:

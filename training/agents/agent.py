@@ -115,7 +115,7 @@ class Agent:
         for name in now:
             if self.rules.get(name) != now[name]:
                 raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is {now[name]} now")
-        env = make(self.task, self.information, num_envs, autoreset_mode, self.observer)
+        env = make(self.task, self.information, num_envs, autoreset_mode=autoreset_mode, observer=self.observer)
         sizes = (env.single_observation_space.shape[0], env.single_action_space.shape[0])  # type: ignore[index]
         if sizes != (self.network.inputs, self.network.outputs):
             raise AgentError(

@@ -21,12 +21,15 @@ class SB3VecEnv(VecEnv):
 
     Parameters
     ----------
-    env : a vector environment with ``autoreset_mode`` SAME_STEP.
-    info_keys : what of ``info`` to pass on in every step.
+    env : gymnasium.vector.VectorEnv
+        With ``autoreset_mode`` SAME_STEP.
+    info_keys : sequence of str
+        What of ``info`` to pass on in every step.
 
     Raises
     ------
-    ValueError : if the environment resets otherwise, or stable-baselines3 sets different options for different rows.
+    ValueError
+        If the environment resets otherwise, or stable-baselines3 sets different options for different rows.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], info_keys: Sequence[str] = ()) -> None:
@@ -41,7 +44,18 @@ class SB3VecEnv(VecEnv):
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
 
     def reset(self) -> VecEnvObs:
-        """Reset all rows, with the seeds and options that were set for the next reset."""
+        """Reset all rows, with the seeds and options that were set for the next reset.
+
+        Returns
+        -------
+        ndarray or dict
+            First observations of all rows.
+
+        Raises
+        ------
+        ValueError
+            If different options were set for different rows.
+        """
         seeds: Any = None if all(seed is None for seed in self._seeds) else list(self._seeds)
         options = self._options
         self._reset_seeds()
@@ -57,7 +71,13 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step all rows."""
+        """Step all rows.
+
+        Returns
+        -------
+        obs, rewards, done, infos
+            As stable-baselines3 expects them: what ended shows the next episode's first observation.
+        """
         obs, reward, terminated, truncated, info = self.env.step(self._actions)
         done = terminated | truncated
         infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
@@ -77,9 +97,24 @@ class SB3VecEnv(VecEnv):
         return [None] * self.num_envs if frames is None else list(frames)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each row: of the vector environment's wrappers, or its own in Sync and Async vectors.
+        """Look up an attribute of each row: of the vector environment's wrappers, or its own in Sync and Async vectors.
 
-        Raises AttributeError if there is none.
+        Parameters
+        ----------
+        attr_name : str
+            Its name.
+        indices : int or iterable of int, optional
+            Rows; by default all.
+
+        Returns
+        -------
+        list
+            One value for each row.
+
+        Raises
+        ------
+        AttributeError
+            If there is none.
         """
         rows = list(self._get_indices(indices))
         owner = self._owner(attr_name)
@@ -89,7 +124,22 @@ class SB3VecEnv(VecEnv):
         return [values[row] for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set an attribute where :meth:`get_attr` finds it; raises ValueError for some rows only."""
+        """Set an attribute where :meth:`get_attr` finds it.
+
+        Parameters
+        ----------
+        attr_name : str
+            Its name.
+        value : object
+            The same for all rows.
+        indices : int or iterable of int, optional
+            Rows; only all together.
+
+        Raises
+        ------
+        ValueError
+            For some rows only.
+        """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("attributes of a vector environment are set for all rows at once")
         owner = self._owner(attr_name)
@@ -101,7 +151,28 @@ class SB3VecEnv(VecEnv):
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **options: Any) -> list[Any]:
         """Call a method of each row in Sync and Async vectors.
 
-        Raises AttributeError for other vectors, whose rows are no environments, ValueError for some rows only.
+        Parameters
+        ----------
+        method_name : str
+            Its name.
+        *args
+            Passed on.
+        indices : int or iterable of int, optional
+            Rows; only all together.
+        **options
+            Passed on.
+
+        Returns
+        -------
+        list
+            What each row's method returns.
+
+        Raises
+        ------
+        AttributeError
+            For other vectors, whose rows are no environments.
+        ValueError
+            For some rows only.
         """
         if len(list(self._get_indices(indices))) != self.num_envs:
             raise ValueError("methods of a vector environment's rows are called in all rows at once")
@@ -122,7 +193,20 @@ class SB3VecEnv(VecEnv):
         return getattr(self.env.unwrapped, how)
 
     def env_is_wrapped(self, wrapper_class: Any, indices: VecEnvIndices = None) -> list[bool]:
-        """Whether a wrapper of this class is around the vector environment."""
+        """Whether a wrapper of this class is around the vector environment.
+
+        Parameters
+        ----------
+        wrapper_class : type
+            The class.
+        indices : int or iterable of int, optional
+            Rows; by default all.
+
+        Returns
+        -------
+        list of bool
+            The same for each row.
+        """
         env: Any = self.env
         while not (found := isinstance(env, wrapper_class)) and hasattr(env, "env"):
             env = env.env

@@ -1,4 +1,4 @@
-"""What knowing is worth: agents on every information set, several seeds each, on the same unseen episodes."""
+"""What information is worth: agents on every information set, several seeds each, on the same unseen episodes."""
 
 import json
 import time
@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pandas as pd
 import torch
-from filelock import FileLock, Timeout
+from scipy.stats import bootstrap, trim_mean
 
 import kkl_gym
 from kkl_gym import get_system
@@ -19,14 +19,13 @@ from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
+from training.jobs import check_identity, locked
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
 
-Knows = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"]
-
-
-KNOWS: tuple[Knows, ...] = get_args(Knows)
-
+# What agents know: an information set of training.agents.information, or y or the state with a policy that remembers.
+Compared = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"]
+COMPARED: tuple[Compared, ...] = get_args(Compared)
 
 MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if found.second_noise}
 RECURRENT_SEEDS = 3
@@ -39,12 +38,27 @@ PROTOCOL = 1  # changes where results must not be mixed with earlier ones
 class Case:
     """One agent: trained, then played on the evaluation's episodes.
 
-    folder : receives result.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
+    Parameters
+    ----------
+    system : str
+        A shipped system.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    information : {"state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"}
+        What the agent knows.
+    seed : int
+        The agent's.
+    episodes : int
+        Number of episodes that it is played on.
+    timesteps : int or None
+        Actions to learn from; None takes what the hyperparameters say.
+    folder : Path
+        Receives job.json, result.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
     """
 
     system: str
     measurement_noise: float
-    knows: Knows
+    information: Compared
     seed: int
     episodes: int
     timesteps: int | None
@@ -53,7 +67,7 @@ class Case:
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.system} at noise {self.measurement_noise:g}/{self.knows}/{self.seed}"
+        return f"{self.system} at noise {self.measurement_noise:g}/{self.information}/{self.seed}"
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -61,8 +75,8 @@ class Case:
         from training.agents.learn import hyperparameters
 
         task = get_task(self.system, self.measurement_noise)
-        recurrent = self.knows.startswith("recurrent")
-        observer = versioned(observer_of(get_system(task.system))) if self.knows in ("x_hat", "z") else None
+        recurrent = self.information.startswith("recurrent")
+        named = versioned(observer_of(get_system(task.system))) if self.information in ("x_hat", "z") else None
         described = {
             "protocol": PROTOCOL,
             "episodes": self.episodes,
@@ -70,36 +84,38 @@ class Case:
             "task": asdict(task),
             "rules": rules(task),
             "hyperparameters": hyperparameters(task, "ppo_lstm" if recurrent else None),
-            "observer": None if observer is None else [observer, fingerprint(observer)],
+            "observer": None if named is None else [named, fingerprint(named)],
             "version": kkl_gym.__version__,
         }
         return dict(json.loads(json.dumps(described)))
 
     @property
     def done(self) -> bool:
-        """Whether its result is there; raises ValueError if it is that of another comparison."""
-        path = self.folder / "result.json"
-        if not path.exists():
+        """Whether its result is there; raises ValueError if the folder holds an agent of another comparison."""
+        paths = [self.folder / name for name in ("job.json", "result.json")]
+        if not all(path.exists() for path in paths):
             return False
-        found, asked = json.loads(path.read_text())["identity"], self.identity
-        for name, value in asked.items():
-            if found.get(name) != value:
-                raise ValueError(
-                    f"{path} is of another comparison: {name} = {found.get(name)}, not {value}; choose another --out, "
-                    "or remove it"
-                )
+        check_identity(paths[0], self.identity, "an agent of another comparison")
         return True
 
 
 def run_case(case: Case) -> None:
-    """Train and evaluate, unless another process is at it or it is done."""
-    case.folder.mkdir(parents=True, exist_ok=True)
-    try:
-        with FileLock(case.folder / "lock", timeout=0):
-            if not case.done:
-                _run(case)
-    except Timeout:
-        raise ValueError("another process is working on it") from None
+    """Train and evaluate an agent, unless that is done.
+
+    Parameters
+    ----------
+    case : Case
+        The agent.
+
+    Raises
+    ------
+    ValueError
+        If another process is at work on it, or its folder holds an agent of another comparison.
+    """
+    with locked(case.folder):
+        if not case.done:
+            write(case.folder / "job.json", json.dumps(case.identity, indent=2) + "\n")
+            _run(case)
 
 
 def _run(case: Case) -> None:
@@ -109,18 +125,17 @@ def _run(case: Case) -> None:
     task = get_task(case.system, case.measurement_noise)
     began = time.process_time()
     policy: Policy
-    if case.knows in ("recurrent", "recurrent-state"):
-        of: Literal["y", "state"] = "y" if case.knows == "recurrent" else "state"
+    if case.information in ("recurrent", "recurrent-state"):
+        of: Literal["y", "state"] = "y" if case.information == "recurrent" else "state"
         policy = learn_recurrent(task, of, case.folder, seed=case.seed, timesteps=case.timesteps)()
-        env = make(task, of, case.episodes, "Disabled", with_action=True)
+        env = make(task, of, case.episodes, autoreset_mode="Disabled", with_action=True)
     else:
-        information: Any = case.knows
+        information: Any = case.information
         policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
         env = agent.make(case.episodes)
     seconds = time.process_time() - began
-    x = play(env, policy, task.steps, AGENT_EVALUATION_SEED).x
+    x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     result = {
-        "identity": case.identity,
         "scores": scores(get_system(task.system), x).round(6).tolist(),
         "successes": successes(task, x).tolist(),
         "seconds": round(seconds, 1),
@@ -129,11 +144,26 @@ def _run(case: Case) -> None:
 
 
 def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
-    """Scores of zero input on the evaluation's episodes, (episodes,)."""
+    """Scores of zero input on the evaluation's episodes.
+
+    Parameters
+    ----------
+    system : str
+        A system with a control task.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    episodes : int
+        Their number.
+
+    Returns
+    -------
+    ndarray, shape (episodes,)
+        As :func:`training.agents.tasks.scores` gives them.
+    """
     task = get_task(system, measurement_noise)
-    env = make(task, "state", episodes, "Disabled")
+    env = make(task, "state", episodes, autoreset_mode="Disabled")
     (nu,) = env.single_action_space.shape  # type: ignore[misc]
-    x = play(env, lambda obs: np.zeros((len(obs), nu)), task.steps, AGENT_EVALUATION_SEED).x
+    x = play(env, lambda obs: np.zeros((len(obs), nu)), steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     return scores(get_system(task.system), x)
 
 
@@ -141,13 +171,36 @@ def planned(
     out: Path,
     *,
     systems: Sequence[str] = tuple(TASKS),
-    knows: Sequence[Knows] = KNOWS,
+    information: Sequence[Compared] = COMPARED,
     seeds: int = 5,
     episodes: int = 100,
     timesteps: int | None = None,
     more_noise: bool = True,
 ) -> list[Case]:
-    """All agents of a comparison, the first seed of each first; the defaults are the full set."""
+    """All agents of a comparison, the first seed of each first; the defaults are the full set.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the comparison, under which each agent has one.
+    systems : sequence of str
+        Systems with a control task.
+    information : sequence of str
+        What agents know.
+    seeds : int
+        Agents of each kind; of recurrent ones at most three, and one at the further noise level.
+    episodes : int
+        Number of episodes that each is played on.
+    timesteps : int, optional
+        Actions to learn from; by default what the hyperparameters say.
+    more_noise : bool
+        Also at the further noise level of those systems that have one.
+
+    Returns
+    -------
+    list of Case
+        What is to be done.
+    """
     noise: dict[str, tuple[float, ...]] = {system: (get_task(system).measurement_noise,) for system in systems}
     if more_noise:
         noise |= {name: (*noise[name], level) for name, level in MORE_NOISE.items() if name in noise}
@@ -155,7 +208,7 @@ def planned(
         Case(
             system=system,
             measurement_noise=level,
-            knows=what,
+            information=what,
             seed=seed,
             episodes=episodes,
             timesteps=timesteps,
@@ -164,14 +217,34 @@ def planned(
         for seed in range(seeds)
         for system in systems
         for level in noise[system]
-        for what in knows
+        for what in information
         if not what.startswith("recurrent")
         or seed < (RECURRENT_SEEDS if level == noise[system][0] else MORE_NOISE_RECURRENT_SEEDS)
     ]
 
 
 def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
-    """One row for each agent in the folder, whoever trained it; raises ValueError if some are of another comparison."""
+    """What there is in a comparison's folder, whichever run it is from.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the comparison.
+    episodes : int
+        Number of episodes that each agent was played on.
+    timesteps : int or None
+        Actions that each learned from; None for what the hyperparameters say.
+
+    Returns
+    -------
+    DataFrame
+        One row for each agent.
+
+    Raises
+    ------
+    ValueError
+        If some agents are of another comparison.
+    """
     plan = planned(out, seeds=MANY, episodes=episodes, timesteps=timesteps)
     idle_scores: dict[tuple[str, float], float] = {}
     rows = []
@@ -186,7 +259,7 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
             {
                 "system": case.system,
                 "noise": case.measurement_noise,
-                "knows": case.knows,
+                "knows": case.information,
                 "seed": case.seed,
                 "score": np.mean(result["scores"]),
                 "success": np.mean(result["successes"]),
@@ -197,35 +270,58 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def normalised(scores: np.ndarray, top: float, idle: float) -> np.ndarray:
-    """0 is zero input, 1 is ``top``; NaN if that is no better than zero input."""
-    return (scores - idle) / (top - idle) if top > idle else np.full(np.shape(scores), np.nan)
+def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
+    """Scores on a scale on which zero input has 0.
+
+    Parameters
+    ----------
+    scores : array_like
+        To be put on the scale.
+    top : array_like
+        What has 1, of a shape that goes with that of ``scores``.
+    idle : float
+        Score of zero input.
+
+    Returns
+    -------
+    ndarray
+        NaN where ``top`` is no better than zero input.
+    """
+    span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
+    return np.asarray((scores - idle) / span)
 
 
 def middle(values: np.ndarray, axis: int = -1) -> Any:
-    """Interquartile mean."""
-    from scipy.stats import trim_mean
-
+    """Interquartile mean along an axis."""
     return trim_mean(values, 0.25, axis=axis)
 
 
 def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
     """Interquartile mean of the normalised scores of agents, with a bootstrap 95 % interval.
 
-    values, best : scores of these agents and of those that know the full state, one for each agent; both are resampled.
-    The interval is NaN for fewer than three agents. With five it covers about nine times in ten, for which bootstrap
-    intervals of so few are known.
+    With five agents the interval covers about nine times in ten, for which bootstrap intervals of so few are known.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n,)
+        Scores of these agents, one for each.
+    best : ndarray, shape (m,)
+        Scores of those that know the full state. They are resampled as well, unless they are ``values`` itself.
+    idle : float
+        Score of zero input.
+
+    Returns
+    -------
+    found, low, high : float
+        The mean and the ends of the interval, which are NaN for fewer than three agents.
     """
-    found = float(normalised(middle(values), float(middle(best)), idle))
+
+    def statistic(mine: np.ndarray, tops: np.ndarray = best, axis: int = -1) -> np.ndarray:
+        return normalised(middle(mine, axis), middle(tops, axis), idle)
+
+    found = float(statistic(values))
     if min(len(values), len(best)) < 3:
         return found, np.nan, np.nan
-    rng = np.random.default_rng(0)
-    same = values is best
-    draws = []
-    for _ in range(2000):
-        tops = rng.choice(best, len(best))
-        mine = tops if same else rng.choice(values, len(values))
-        reference = float(middle(best)) if same else float(middle(tops))
-        draws.append(float(normalised(middle(mine), reference, idle)))
-    low, high = np.nanquantile(draws, [0.025, 0.975])
-    return found, float(low), float(high)
+    samples = (values,) if values is best else (values, best)
+    ends = bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
+    return found, float(ends.low), float(ends.high)

@@ -13,7 +13,7 @@ from kkl_gym import KKLVectorObservation, get_system
 from kkl_gym.system import System
 from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
-from observers import KKLObserver, load
+from observers import KKLObserver, load, shipped
 from training.agents.tasks import deviation
 from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter
 from training.systems import ControlTask, profile
@@ -33,12 +33,23 @@ class Features(VectorWrapper):
 
     Parameters
     ----------
-    env : with ``autoreset_mode`` SAME_STEP or DISABLED, as :class:`kkl_gym.VectorActionRepeat` offers them.
-    keys : of ``info``, what the feature is made of.
-    feature : a mapping of the keys to (n, ...) in, (n, width) out.
-    width : of the feature.
-    stacked : steps shown, the latest last; before an episode's first step, its first feature and action 0.
-    with_action : whether each feature has the action before it appended.
+    env : VectorEnv
+        With ``autoreset_mode`` SAME_STEP or DISABLED, as :class:`kkl_gym.VectorActionRepeat` offers them.
+    keys : sequence of str
+        Of ``info``, what the feature is made of.
+    feature : callable
+        A mapping of the keys to arrays of shape (n, ...) in, an array of shape (n, width) out.
+    width : int
+        Of the feature.
+    stacked : int
+        Steps shown, the latest last; before an episode's first step, its first feature and action 0.
+    with_action : bool
+        Whether each feature has the action before it appended.
+
+    Raises
+    ------
+    ValueError
+        If the environment resets in the step after an episode's last.
     """
 
     def __init__(
@@ -66,7 +77,22 @@ class Features(VectorWrapper):
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments and what is remembered of them."""
+        """Reset the environments and what is remembered of them.
+
+        Parameters
+        ----------
+        seed : int or sequence of int, optional
+            As for any vector environment.
+        options : mapping, optional
+            As for any vector environment; "reset_mask" says which rows are meant.
+
+        Returns
+        -------
+        obs : ndarray, shape (n, stacked * (width + actions))
+            The features.
+        info : dict
+            The environment's.
+        """
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         first = self._first(info)
@@ -75,7 +101,18 @@ class Features(VectorWrapper):
         return self._shown(), info
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Step the environments."""
+        """Step the environments.
+
+        Parameters
+        ----------
+        actions : ndarray, shape (n, nu)
+            As the environment takes them.
+
+        Returns
+        -------
+        obs, reward, terminated, truncated, info
+            The features, and what the environment returns beside its observation.
+        """
         _, reward, terminated, truncated, info = self.env.step(actions)
         values = {key: info[key] for key in self._keys}
         ended = info.get("_final_info", np.zeros(self.num_envs, dtype=bool))
@@ -105,7 +142,13 @@ class Features(VectorWrapper):
 
 
 class KalmanFilters:
-    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them."""
+    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them.
+
+    Parameters
+    ----------
+    env : VectorEnv
+        Whose rows they follow.
+    """
 
     def __init__(self, env: VectorEnv) -> None:
         plant = plant_of(env)
@@ -117,11 +160,11 @@ class KalmanFilters:
         self.reset, self.restart, self.advance = self._filters.reset, self._filters.restart, self._filters.advance
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """The estimates."""
+        """Report the estimates, (n, nx), of all rows or of those that a mask names."""
         return {"x_hat": self._filters.decode(rows)}
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """The estimates."""
+        """Show the estimates that were reported."""
         return report["x_hat"]
 
 
@@ -129,21 +172,40 @@ def make(
     task: ControlTask,
     information: Information,
     num_envs: int,
+    *,
     autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     observer: str | None = None,
     with_action: bool = False,
 ) -> Features:
-    """A task in which the agent knows what ``information`` says, in units of about one, taken from the target.
+    """Make a task in which the agent knows what ``information`` says, in units of about one, taken from the target.
 
-    "state": the true state. "x_hat": the learned observer's estimate. "z": its filter's state as its network sees it,
-    with the time since reset. "ekf": the estimate of an extended Kalman filter with the exact model. These observers
-    see every sample. "y": the noisy output when the agent acts. "stacked": the last ``STACKED`` of those, each with
-    the action before it.
+    Parameters
+    ----------
+    task : ControlTask
+        What the agent is to do.
+    information : {"state", "x_hat", "z", "ekf", "y", "stacked"}
+        "state": the true state. "x_hat": the learned observer's estimate. "z": its filter's state as its network sees
+        it, with the time since reset. "ekf": the estimate of an extended Kalman filter with the exact model. These
+        observers see every sample. "y": the noisy output when the agent acts. "stacked": the last ``STACKED`` of
+        those, each with the action before it.
+    num_envs : int
+        Rows.
+    autoreset_mode : str or AutoresetMode
+        Same step or disabled.
+    observer : str, optional
+        A shipped map or a ``.safetensors`` file; by default :func:`observer_of` the system.
+    with_action : bool
+        Whether "state" and "y" come with the action before them.
 
-    observer : a shipped name or a ``.safetensors`` file; None takes :func:`observer_of`.
-    with_action : whether "state" and "y" come with the action before them.
+    Returns
+    -------
+    Features
+        The vector environment.
 
-    Raises ValueError on an unknown name.
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if no observer is named and none ships for the system.
     """
     if information not in INFORMATION:
         raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
@@ -179,12 +241,42 @@ def make(
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on."""
-    return profile(system).agent_observer or system.name
+    """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on.
+
+    Parameters
+    ----------
+    system : System
+        Where the agents act.
+
+    Returns
+    -------
+    str
+        A shipped map.
+
+    Raises
+    ------
+    ValueError
+        If none ships for the system.
+    """
+    name = profile(system).agent_observer or system.name
+    if name not in shipped():
+        raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
+    return name
 
 
 def output_deviation(system: System) -> Feature:
-    """(y - h(target)) over the size that the states' scales give to y, to first order."""
+    """Make the feature (y - h(target)) over the size that the states' scales give to y, to first order.
+
+    Parameters
+    ----------
+    system : System
+        Whose output it is.
+
+    Returns
+    -------
+    callable
+        A mapping with "y" of shape (n, ny) in, an array of the same shape out.
+    """
     _, _, C = linearised(system, system.target)
     y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
     size = np.where(size > 0, size, 1.0)  # an output that is flat at the target
@@ -192,7 +284,22 @@ def output_deviation(system: System) -> Feature:
 
 
 def modes(observer: KKLObserver, system: System) -> tuple[Feature, int]:
-    """z as the observer's network sees it, but from its value at the target, and the age; and their number."""
+    """Make the feature of z as the observer's network sees it, but from its value at the target, and of the age.
+
+    Parameters
+    ----------
+    observer : KKLObserver
+        Whose z it is.
+    system : System
+        Whose target is meant.
+
+    Returns
+    -------
+    feature : callable
+        A mapping with "z" of shape (n, nz) and "sample" of shape (n,) in, an array of shape (n, width) out.
+    width : int
+        Number of modes, and one for the age if the network is told it.
+    """
     inverse, linear = observer.artifact.inverse, observer.artifact.filter
     matrix = (inverse.gain(observer.measurement_noise)[:, None] * inverse.whiten).T
     rest = linear.start(np.array(system.h(system.target), dtype=float))

@@ -26,7 +26,7 @@ from training.agents.bridge import SB3VecEnv
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
 from training.seeds import AGENT_TRAINING_SEED
-from training.systems import ControlTask
+from training.systems import ControlTask, profile
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
 FEEDFORWARD = ("ppo", "sac")  # whose policies are perceptrons, which ship
@@ -43,17 +43,37 @@ def learn(
     algorithm: str | None = None,
     progress: Progress | None = None,
 ) -> Agent:
-    """Train one agent; the learning curve is written to FOLDER/progress.csv.
+    """Train one agent.
 
     Parameters
     ----------
-    task, information, observer : as for :func:`training.agents.information.make`.
-    seed : of networks, exploration and episodes.
-    timesteps : actions in all rows together; None takes what hyperparameters/ALGORITHM.yml says.
-    algorithm : "ppo" or "sac"; None takes the one that the task has hyperparameters for.
-    progress : where to show a bar.
+    task : ControlTask
+        What it is to do.
+    information : {"state", "x_hat", "z", "y", "stacked", "ekf"}
+        What it knows, as for :func:`training.agents.information.make`.
+    folder : Path
+        Receives agent.safetensors and the learning curve, progress.csv.
+    seed : int
+        Seed of networks, exploration and episodes.
+    timesteps : int, optional
+        Actions in all rows together; by default what hyperparameters/ALGORITHM.yml says.
+    observer : str, optional
+        A shipped map or a ``.safetensors`` file, for an agent that knows "x_hat" or "z"; by default
+        :func:`training.agents.information.observer_of` the system.
+    algorithm : {"ppo", "sac"}, optional
+        By default that of the system's profile.
+    progress : rich.progress.Progress, optional
+        Where a bar is shown.
 
-    Raises ValueError on an unknown algorithm.
+    Returns
+    -------
+    Agent
+        As saved.
+
+    Raises
+    ------
+    ValueError
+        On an unknown algorithm or a number of timesteps that makes no sense, or if no observer ships for the system.
     """
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
@@ -97,7 +117,30 @@ def learn_recurrent(
 ) -> Callable[[], Policy]:
     """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before.
 
-    The parameters are those of :func:`learn`. Returns what makes a policy, with a memory of its own, for one play.
+    Parameters
+    ----------
+    task : ControlTask
+        What the agent is to do.
+    of : {"y", "state"}
+        What it sees.
+    folder : Path
+        Receives the learning curve, progress.csv.
+    seed : int
+        Seed of networks, exploration and episodes.
+    timesteps : int, optional
+        Actions in all rows together; by default what hyperparameters/ppo_lstm.yml says.
+    progress : rich.progress.Progress, optional
+        Where a bar is shown.
+
+    Returns
+    -------
+    callable
+        Makes a policy, with a memory of its own, for one play.
+
+    Raises
+    ------
+    ValueError
+        If the number of timesteps makes no sense.
     """
     name, settings = hyperparameters(task, "ppo_lstm")
     env = make(task, of, settings["n_envs"], with_action=True)
@@ -163,19 +206,33 @@ def _fit(
 
 
 def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[str, dict[str, Any]]:
-    """The algorithm and its settings for a task; a system of the user's gets the defaults.
+    """Find the algorithm and its settings for a task.
 
-    Raises ValueError if the algorithm is unknown or has no settings for the task.
+    Parameters
+    ----------
+    task : ControlTask
+        Of a shipped system, which has settings of its own, or of one of the user's, which gets the defaults.
+    algorithm : {"ppo", "sac", "ppo_lstm"}, optional
+        By default that of the system's profile.
+
+    Returns
+    -------
+    algorithm : str
+        Its name.
+    settings : dict
+        What hyperparameters/ALGORITHM.yml says of it.
+
+    Raises
+    ------
+    ValueError
+        If the algorithm is unknown.
     """
-    env_id = ENV_IDS.get(get_system(task.system).name)
-    for name in FEEDFORWARD if algorithm is None else [algorithm]:
-        if name not in ALGORITHMS:
-            raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
-        known = _read(name)
-        for key in (env_id, "default"):
-            if key in known and (key != "default" or algorithm is not None or env_id is None):
-                return name, dict(known[key])
-    raise ValueError(f"hyperparameters/{algorithm}.yml has no settings for {env_id or task.system}")
+    system = get_system(task.system)
+    name = algorithm or profile(system).algorithm
+    if name not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
+    known = _read(name)
+    return name, dict(known.get(ENV_IDS.get(system.name, "default"), known["default"]))
 
 
 @cache
@@ -192,6 +249,13 @@ class Cost(VectorWrapper):
 
     The environment's reward is flat far from the target, where c still tells an agent which way to go. A state that
     escapes is taken to stay where it left for the rest of the episode, so that escaping never pays.
+
+    Parameters
+    ----------
+    env : VectorEnv
+        Whose rewards are replaced; it resets in the same step.
+    task : ControlTask
+        What made it.
     """
 
     def __init__(self, env: VectorEnv, task: ControlTask) -> None:
@@ -199,7 +263,18 @@ class Cost(VectorWrapper):
         self._task = task
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step, and replace the rewards."""
+        """Step, and replace the rewards.
+
+        Parameters
+        ----------
+        actions : ndarray, shape (n, nu)
+            As the environment takes them.
+
+        Returns
+        -------
+        obs, reward, terminated, truncated, info
+            What the environment returns, but for the rewards.
+        """
         obs, total, terminated, truncated, info = self.env.step(actions)
         samples = np.full(self.num_envs, self._task.repeat)
         remaining = np.zeros(self.num_envs)

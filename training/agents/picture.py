@@ -18,7 +18,17 @@ TRUTH, ESTIMATE, TARGET = "k", "C6", "C2"
 
 
 def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
-    """States, estimates, target and input over time."""
+    """Draw states, estimates, target and input over time.
+
+    Parameters
+    ----------
+    task : ControlTask
+        What was played.
+    episodes : Episodes
+        The first few are shown.
+    path : Path
+        Of the figure.
+    """
     system = get_system(task.system)
     shown = min(SHOWN, episodes.x.shape[1])
     figure = Figure(figsize=(2.6 * shown, 1.6 * (system.nx + system.nu)), layout="constrained")
@@ -44,7 +54,17 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
 
 
 def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
-    """The phase portrait of the first episode as a GIF."""
+    """Draw the phase portrait of the first episode, moving.
+
+    Parameters
+    ----------
+    task : ControlTask
+        What was played.
+    episodes : Episodes
+        The first is shown.
+    path : Path
+        Of the GIF.
+    """
     system = get_system(task.system)
     x = episodes.x[:, 0]
     x_hat = None if episodes.x_hat is None else episodes.x_hat[:, 0]

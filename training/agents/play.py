@@ -15,10 +15,16 @@ Policy = Callable[[np.ndarray], np.ndarray]
 class Episodes:
     """Episodes side by side, at the instants at which the agent acts.
 
-    x : true states, (steps + 1, n, nx); after an escape the last one inside.
-    x_hat : estimates, (steps + 1, n, nx), where an observer makes them.
-    u : inputs, (steps, n, nu).
-    escaped : boolean, (n,).
+    Parameters
+    ----------
+    x : ndarray, shape (steps + 1, n, nx)
+        True states; after an escape the last one inside.
+    x_hat : ndarray, shape (steps + 1, n, nx), or None
+        Estimates, where an observer makes them.
+    u : ndarray, shape (steps, n, nu)
+        Inputs.
+    escaped : ndarray of bool, shape (n,)
+        Whether the state left the system's bounds.
     """
 
     x: np.ndarray
@@ -27,13 +33,29 @@ class Episodes:
     escaped: np.ndarray
 
 
-def play(env: VectorEnv, policy: Policy, steps: int, seed: int) -> Episodes:
-    """One episode in each row of an environment that does not reset by itself (``autoreset_mode="Disabled"``).
+def play(env: VectorEnv, policy: Policy, *, steps: int, seed: int) -> Episodes:
+    """Play one episode in each row of an environment that does not reset by itself.
 
-    policy : observations (n, ...) in, actions (n, nu) out; rows that have ended are played on in place.
-    seed : row i starts from seed + i.
+    Parameters
+    ----------
+    env : VectorEnv
+        Made with ``autoreset_mode="Disabled"``.
+    policy : callable
+        Observations (n, ...) in, actions (n, nu) out; rows that have ended are played on in place.
+    steps : int
+        Actions in an episode.
+    seed : int
+        Row i starts from seed + i.
 
-    Raises ValueError if the environment resets by itself.
+    Returns
+    -------
+    Episodes
+        One for each row.
+
+    Raises
+    ------
+    ValueError
+        If the environment resets by itself.
     """
     if env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED:
         raise ValueError(

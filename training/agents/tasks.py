@@ -12,9 +12,24 @@ TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.it
 
 
 def get_task(name: str, measurement_noise: float | None = None) -> ControlTask:
-    """The task of a system, shipped or ``"script.py:Class"``, with another noise level if one is given.
+    """The task of a system, with another noise level if one is given.
 
-    Raises ValueError on an unknown name, or if the system has no inputs.
+    Parameters
+    ----------
+    name : str
+        A shipped system, or ``"script.py:Class"``.
+    measurement_noise : float, optional
+        Standard deviation of the noise on each sample of y.
+
+    Returns
+    -------
+    ControlTask
+        That of the system's profile, or one with the defaults.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if the system has no inputs.
     """
     system = get_system(name)
     if not system.nu:
@@ -24,22 +39,58 @@ def get_task(name: str, measurement_noise: float | None = None) -> ControlTask:
 
 
 def deviation(system: System, x: np.ndarray) -> np.ndarray:
-    """(x - target) / scale, of the shape of x, (..., nx)."""
+    """(x - target) / scale.
+
+    Parameters
+    ----------
+    system : System
+        Whose target and scale are meant.
+    x : ndarray, shape (..., nx)
+        States.
+
+    Returns
+    -------
+    ndarray, shape (..., nx)
+        Zero at the target.
+    """
     out: np.ndarray = (x - np.array(system.target)) / np.array(system.scale)
     return out
 
 
 def scores(system: System, x: np.ndarray) -> np.ndarray:
-    """mean over time of exp(-4 c) - 1 in [-1, 0], 0 being best, c = mean(((x - target) / scale)^2).
+    """Scores of episodes: mean over time of exp(-4 c) - 1, where c = mean(((x - target) / scale)^2).
 
-    x : states, (steps, n, nx). Returns (n,).
+    Parameters
+    ----------
+    system : System
+        Whose target and scale are meant.
+    x : ndarray, shape (steps, n, nx)
+        States.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In [-1, 0]; 0 is best.
     """
     c = np.square(deviation(system, x)).mean(-1)
     return np.asarray(np.expm1(-4.0 * c).mean(0))
 
 
 def successes(task: ControlTask, x: np.ndarray) -> np.ndarray:
-    """Whether the last fifth of x, (steps, n, nx), stays within the task's tolerance of the target; boolean (n,)."""
+    """Whether episodes stay within the task's tolerance of the target for their last fifth.
+
+    Parameters
+    ----------
+    task : ControlTask
+        What was to be done.
+    x : ndarray, shape (steps, n, nx)
+        States.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        One for each episode.
+    """
     late = x[-max(1, round(0.2 * len(x))) :]
     distance = np.linalg.norm(deviation(get_system(task.system), late), axis=-1)
     return np.asarray((distance <= task.tolerance).all(0))

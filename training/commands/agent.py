@@ -1,15 +1,17 @@
 """``kkl-gym agent``: train and evaluate agents."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
+import numpy as np
 import torch
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from scipy.stats import bootstrap
 
 from kkl_gym import SYSTEMS, get_system
 from training.agents.agent import Agent, AgentError
@@ -17,7 +19,8 @@ from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.commands.compare import Compare
-from training.seeds import AGENT_EVALUATION_SEED
+from training.progress import progress_bars
+from training.seeds import agent_evaluation_seed
 
 
 @dataclass(frozen=True)
@@ -28,37 +31,63 @@ class Train:
     run's folder. Hyperparameters are those of training/agents/hyperparameters.
     """
 
-    system: tyro.conf.Positional[str]
-    """A system with a control task: reverse_duffing, van_der_pol, rossler or lorenz."""
-    information: Information = "x_hat"
-    """What the agent knows."""
+    system: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM")]
+    """A shipped system, or a class of yours with inputs as script.py:Class or module:Class."""
+    information: Annotated[Information, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
+    """What the agent knows: docs/agents.md explains each."""
     seed: int = 0
-    """Of networks, exploration and episodes."""
-    measurement_noise: float | None = None
-    """Standard deviation on every sample of y; default: the task's, 0.5."""
-    timesteps: int | None = None
-    """Actions to learn from, in all environments together; default: the hyperparameters'."""
-    observer: str | None = None
-    """A shipped map's name or a .safetensors file; default: the map that ships for the system, the one fitted in closed
-    loop if there is one."""
-    algorithm: Literal["ppo", "sac"] | None = None
-    """Default: the one that there are hyperparameters for."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: agents/SYSTEM-INFORMATION-SEED)")] = None
+    """Seed of networks, exploration and episodes."""
+    measurement_noise: Annotated[
+        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the task's, 0.5)")
+    ] = None
+    """Standard deviation of the noise on each sample of y."""
+    timesteps: Annotated[
+        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
+    ] = None
+    """Actions to learn from, in all environments together."""
+    observer: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: that of the published agents, of version 1)"),
+    ] = None
+    """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
+    algorithm: Annotated[
+        Literal["ppo", "sac"] | None,
+        tyro.conf.arg(
+            metavar="{ppo,sac}", help_behavior_hint="(default: the profile's; sac for reverse_duffing, else ppo)"
+        ),
+    ] = None
+    """What the agent is trained with."""
+    out: Annotated[
+        Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(default: runs/agents/SYSTEM-INFORMATION-SEED)")
+    ] = None
     """The run's folder."""
     threads: int = 1
     """CPU threads of the networks."""
 
     def run(self, console: Console) -> None:
-        """Train."""
+        """Train, and play a hundred episodes.
+
+        Parameters
+        ----------
+        console : Console
+            Where progress and the scores are shown.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, or the observer cannot be had.
+        FileExistsError
+            If the folder holds an agent already.
+        """
         from training.agents.learn import learn  # stable-baselines3 takes seconds to import
 
         task = get_task(self.system, self.measurement_noise)
-        folder = self.out or Path("agents") / f"{self.system}-{self.information}-{self.seed}"
+        name = get_system(task.system).name
+        folder = self.out or Path("runs/agents") / f"{name}-{self.information}-{self.seed}"
         if (folder / "agent.safetensors").exists():
             raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
         torch.set_num_threads(self.threads)
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as progress:
+        with progress_bars(console) as progress:
             agent = learn(
                 task,
                 self.information,
@@ -75,28 +104,42 @@ class Train:
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play an agent on unseen episodes; draw closed-loop trajectories and an animated phase portrait."""
+    """Play an agent on unseen episodes; draw closed-loop trajectories and an animated phase portrait.
 
-    agent: tyro.conf.Positional[str]
+    Score and success are means over the episodes, with bootstrap 95 % intervals.
+    """
+
+    agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")]
     """A system whose agent ships with the package, or an agent.safetensors file."""
-    episodes: int = 100
-    """Episodes that score and success are taken over."""
-    system: str | None = None
-    """Class of the agent's system if that is none of the package's: script.py:Class, as its file names it."""
-    out: Path = Path("agents")
+    episodes: int = 500
+    """Number of episodes."""
+    seed: int = 0
+    """Seed of the episodes; no seed gives any that training draws."""
+    system: Annotated[str | None, tyro.conf.arg(metavar="CLASS", help_behavior_hint="")] = None
+    """The agent's system if it is one of your own: script.py:Class or module:Class, as the agent's file names it."""
+    out: Path = Path("runs/agents")
     """Folder for NAME.png and NAME.gif."""
 
     def run(self, console: Console) -> None:
-        """Evaluate."""
+        """Evaluate.
+
+        Parameters
+        ----------
+        console : Console
+            Where the scores are printed.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, or the agent cannot be played.
+        """
         from training.agents.picture import animate, draw
 
-        if self.episodes < 1:
-            raise ValueError(f"episodes must be positive, got {self.episodes}")
         agent = Agent.read(find(self.agent))
         task = agent.task
         if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
-        episodes = show(console, agent, self.episodes)
+        episodes = show(console, agent, self.episodes, self.seed)
         system = get_system(task.system).name
         name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.training.get('seed', 0)}"
         self.out.mkdir(parents=True, exist_ok=True)
@@ -107,12 +150,13 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class AgentCommand:
-    """Agents that act on what an observer shows."""
+    """Train, evaluate and compare agents that act on what an observer shows."""
 
-    command: tyro.conf.OmitSubcommandPrefixes[
+    command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Compare, tyro.conf.subcommand("compare")],
+        tyro.conf.arg(name=""),
     ]
 
     def run(self, console: Console) -> None:
@@ -120,39 +164,93 @@ class AgentCommand:
         self.command.run(console)
 
 
-def show(console: Console, agent: Agent, n: int) -> Episodes:
-    """Play n episodes, print score and success; returns the episodes."""
+def show(console: Console, agent: Agent, n: int, seed: int = 0) -> Episodes:
+    """Play episodes; print score and success.
+
+    Parameters
+    ----------
+    console : Console
+        Where they are printed.
+    agent : Agent
+        Who plays.
+    n : int
+        Number of episodes.
+    seed : int
+        Seed of the episodes.
+
+    Returns
+    -------
+    Episodes
+        As played.
+
+    Raises
+    ------
+    ValueError
+        If number or seed make no sense, or the agent does not fit its task.
+    """
+    first = agent_evaluation_seed(seed, n)
     task = agent.task
     system = get_system(task.system)
-    episodes = play(agent.make(n), agent, task.steps, AGENT_EVALUATION_SEED)
+    episodes = play(agent.make(n), agent, steps=task.steps, seed=first)
     score, success = scores(system, episodes.x), successes(task, episodes.x)
-    table = Table("system", "knows", "noise", "score", f"holds the target within {task.tolerance:g}", "escaped")
-    table.add_row(
-        task.system,
-        agent.information,
-        f"{task.measurement_noise:g}",
-        f"{score.mean():.3f}",
-        f"{100 * success.mean():.0f} %",
-        f"{100 * episodes.escaped.mean():.0f} %",
-    )
+    table = Table(show_header=False)
+    for label, value in (
+        ("system", task.system),
+        ("information", agent.information),
+        ("measurement noise", f"{task.measurement_noise:g}"),
+        ("episodes", str(n)),
+        ("score", "{:.3f} [{:.3f}, {:.3f}]".format(*interval(score))),
+        (f"holds the target within {task.tolerance:g}", "{:.0f} % [{:.0f}, {:.0f}]".format(*interval(100.0 * success))),
+        ("escaped", f"{100 * episodes.escaped.mean():.0f} %"),
+    ):
+        table.add_row(label, value)
     console.print(table)
     return episodes
 
 
+def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+    """Mean of what episodes gave, with a bootstrap 95 % interval over the episodes.
+
+    Parameters
+    ----------
+    values : array_like, shape (n,)
+        One for each episode.
+
+    Returns
+    -------
+    mean, low, high : float
+        NaN for both ends if there is one episode only.
+    """
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        return mean, np.nan, np.nan
+    ends = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    return mean, float(ends.low), float(ends.high)
+
+
 def find(name: str) -> Path:
-    """The file of a shipped agent, or the path itself; raises AgentError if there is none."""
+    """Find the file of an agent.
+
+    Parameters
+    ----------
+    name : str
+        A system whose agent ships, or a path that ends in ``.safetensors``.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    AgentError
+        If no such agent ships.
+    """
     if name.endswith(".safetensors"):
         return Path(name)
-    shipped = {path.name.removesuffix(".safetensors"): Path(str(path)) for path in _shipped()}
-    if name not in shipped:
-        raise AgentError(
-            f"no agent {name!r} ships; there are {', '.join(shipped) or 'none'}; a file ends in .safetensors"
-        )
-    return shipped[name]
-
-
-def _shipped() -> list[Any]:
     folder = files("training.agents").joinpath("shipped")
-    if not folder.is_dir():  # no agent ships yet
-        return []
-    return sorted((path for path in folder.iterdir() if path.name.endswith(".safetensors")), key=lambda path: path.name)
+    names = sorted(entry.name for entry in folder.iterdir())
+    shipped = [entry.removesuffix(".safetensors") for entry in names if entry.endswith(".safetensors")]
+    if name not in shipped:
+        raise AgentError(f"no agent {name!r} ships; there are {', '.join(shipped)}; a file ends in .safetensors")
+    return Path(str(folder.joinpath(f"{name}.safetensors")))

@@ -13,8 +13,8 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.artifact import resolve, shipped
-from observers.storage import write
+from observers.storage import replacing, write
+from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.certificates.certificate import (
     QUANTILES,
     Certificate,
@@ -36,35 +36,48 @@ class Certify:
     each line.
     """
 
-    observers: tyro.conf.Positional[tuple[str, ...]]
+    observers: Observers
     """Shipped maps, or .safetensors files."""
-    system: str | None = None
-    """For files of your own system: its class, as script.py:Class or module:Class."""
+    system: OwnSystem = None
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
-    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
-    """Bound of the process noise as a multiple of the states' scales."""
-    psi: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the motion's diameter)")] = None
+    process_noise: Annotated[
+        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the system's)")
+    ] = None
+    """Bound of the process noise, in multiples of the system's scale per second."""
+    psi: Annotated[
+        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the motion's diameter)")
+    ] = None
     """Bound of how far process noise moves the state from where it would have been."""
     trajectories: int = 200
-    """Number of motions, from starts uniform in X."""
+    """Number of trajectories, from starts uniform in X."""
     delta: float = 0.05
     """Probability with which each generalisation term may fail."""
     seed: int = 0
-    """Of everything random."""
-    out: Path = Path("certificates")
+    """Seed of starts and noise."""
+    out: Path = Path("runs/certificates")
     """Folder for what is written."""
 
     def run(self, console: Console) -> list[Certificate]:
-        """Certify."""
-        from kkl_gym.systems import system_of
+        """Certify.
 
-        if not self.observers:
-            raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
+        Parameters
+        ----------
+        console : Console
+            Where the table is printed.
+
+        Returns
+        -------
+        list of Certificate
+            One for each observer.
+
+        Raises
+        ------
+        ValueError
+            If an observer cannot be had, or a number makes no sense.
+        """
         found = []
-        for given in self.observers:
-            artifact = Artifact.read(resolve(given))
-            system = system_of(artifact, self.system)
+        for given, artifact, system in read_observers(self.observers, self.system):
             name = Path(given).stem if given.endswith(".safetensors") else given
             with console.status(f"certifying {name}"):
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
@@ -83,7 +96,7 @@ class Certify:
                     motion=motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, levels, name, motion)
+                draw(self.out / f"{name}.png", artifact, system, name=name, levels=levels, motion=motion)
             found.append(certificate)
         console.print(table(found))
         write(self.out / "table.md", markdown(found))
@@ -92,7 +105,18 @@ class Certify:
 
 
 def lines(found: Certificate) -> list[dict[str, str]]:
-    """What a certificate says, in sections: label to value, the labels being the same for all."""
+    """What a certificate says, in sections: label to value.
+
+    Parameters
+    ----------
+    found : Certificate
+        Of any observer.
+
+    Returns
+    -------
+    list of dict
+        The sections, with the same labels for all observers.
+    """
     forward = found.forward
 
     def number(value: float | None) -> str:
@@ -146,7 +170,7 @@ def lines(found: Certificate) -> list[dict[str, str]]:
 
 
 def table(found: Sequence[Certificate]) -> Table:
-    """Certificates side by side."""
+    """Certificates side by side, one row for each label."""
     out = Table("", *(certificate.observer for certificate in found))
     for sections in zip(*map(lines, found), strict=True):
         for label in sections[0]:
@@ -156,7 +180,7 @@ def table(found: Sequence[Certificate]) -> Table:
 
 
 def markdown(found: Sequence[Certificate]) -> str:
-    """The same table for a page."""
+    """Certificates side by side in Markdown, with the noise that they were made for."""
     rows = [f"| | {' | '.join(certificate.observer for certificate in found)} |", "|---" * (1 + len(found)) + "|"]
     for sections in zip(*map(lines, found), strict=True):
         rows += [f"| {label} | {' | '.join(section[label] for section in sections)} |" for label in sections[0]]
@@ -169,9 +193,31 @@ def markdown(found: Sequence[Certificate]) -> str:
 
 
 def draw(
-    path: Path, artifact: Artifact, system: System, levels: tuple[float, float], name: str, motion: SettledTrajectories
+    path: Path,
+    artifact: Artifact,
+    system: System,
+    *,
+    name: str,
+    levels: tuple[float, float],
+    motion: SettledTrajectories,
 ) -> None:
-    """The PDE's residual over X, and along the motion the error that noise will make."""
+    """Draw the PDE's residual over X, and along the motion the error that noise will make.
+
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    name : str
+        For the title.
+    levels : tuple of float
+        Measurement noise and process noise.
+    motion : SettledTrajectories
+        Where the error is shown.
+    """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
@@ -189,6 +235,7 @@ def draw(
     axes[-1].set_title(f"error due to noise {levels[0]:g}, along the motion")
     axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     if artifact.forward is not None:
-        draw_residual(figure, axes[0], artifact, system)
+        draw_residual(axes[0], artifact, system)
     figure.suptitle(name)
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

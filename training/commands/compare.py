@@ -1,6 +1,5 @@
 """``kkl-gym agent compare``."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,12 +8,12 @@ import numpy as np
 import pandas as pd
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from observers.storage import write
-from training.agents.comparison import KNOWS, Knows, collect, interval, middle, normalised, planned, run_case
+from observers.storage import replacing, write
+from training.agents.comparison import COMPARED, Compared, collect, interval, middle, normalised, planned, run_case
 from training.agents.tasks import TASKS
 from training.jobs import run_all
+from training.progress import progress_bars
 
 LABELS = {
     "state": "full state",
@@ -37,43 +36,57 @@ class Compare:
     """
 
     systems: tuple[str, ...] = tuple(TASKS)
-    """Systems with a control task."""
-    knows: tuple[Knows, ...] = KNOWS
-    """What agents know."""
+    """Shipped systems."""
+    information: Annotated[tuple[Compared, ...], tyro.conf.arg(aliases=["--knows"])] = COMPARED
+    """What agents know: docs/agents.md explains each."""
     seeds: int = 5
-    """Agents of each kind; of the recurrent ones, which take longest, 3, and 1 where there is more or less noise."""
+    """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
     episodes: int = 100
-    """Evaluation episodes."""
-    timesteps: int | None = None
-    """Actions to learn from; default: the hyperparameters'."""
+    """Number of episodes that each agent is played on."""
+    timesteps: Annotated[
+        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
+    ] = None
+    """Actions to learn from, in all environments together."""
     more_noise: bool = True
-    """Also Van der Pol at noise 0.2 and Lorenz at 2."""
+    """Compare also at noise 0.2 on Van der Pol and at noise 2 on Lorenz."""
     jobs: int = 2
-    """Worker processes, of one thread each."""
-    out: Annotated[Path, tyro.conf.arg(help_behavior_hint="(default: agents/comparison)")] = Path("agents/comparison")
+    """Number of worker processes, of one thread each."""
+    out: Path = Path("runs/agents/comparison")
     """Folder of results."""
 
     def run(self, console: Console) -> None:
-        """Run what is missing, then report."""
+        """Run what is missing, then report.
+
+        Parameters
+        ----------
+        console : Console
+            Where progress is shown.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, the folder holds another comparison, or a training failed.
+        """
         if min(self.seeds, self.episodes, self.jobs) < 1:
-            raise ValueError("seeds, episodes and jobs must be positive")
-        for names in (self.systems, self.knows):
-            if not names or len(set(names)) < len(names):
-                raise ValueError(f"give systems and what agents know, each once; got {names}")
+            raise ValueError(
+                f"seeds, episodes and jobs must be positive, got {self.seeds}, {self.episodes} and {self.jobs}"
+            )
+        for names, known in ((self.systems, tuple(TASKS)), (self.information, COMPARED)):
+            if not names or len(set(names)) < len(names) or not set(names) <= set(known):
+                raise ValueError(f"give some of {', '.join(known)}, each once; got {', '.join(names) or 'none'}")
         cases = planned(
             self.out,
             systems=self.systems,
-            knows=self.knows,
+            information=self.information,
             seeds=self.seeds,
             episodes=self.episodes,
             timesteps=self.timesteps,
             more_noise=self.more_noise,
         )
         todo = [case for case in cases if not case.done]
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         failures = []
         try:
-            with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+            with progress_bars(console) as progress:
                 bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
                 for case, failure, _ in run_all(run_case, todo, min(self.jobs, max(1, len(todo)))):
                     if failure:
@@ -91,10 +104,16 @@ class Compare:
 
 
 def report(out: Path) -> None:
-    """Table and figure from results.csv alone."""
+    """Write table.md and scores.png from results.csv alone.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the comparison.
+    """
     results = pd.read_csv(out / "results.csv")
     kinds = ["system", "noise", "knows", "seed"]
-    plan = {(case.system, case.measurement_noise, case.knows, case.seed) for case in planned(out)}
+    plan = {(case.system, case.measurement_noise, case.information, case.seed) for case in planned(out)}
     missing = plan - set(results[kinds].itertuples(index=False, name=None))
     partial = f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
     tasks = list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
@@ -109,7 +128,7 @@ def report(out: Path) -> None:
         "|---" * (1 + len(tasks)) + "|",
     ]
     cells = _cells(results, tasks)
-    for knows in KNOWS:
+    for knows in COMPARED:
         row = []
         for task in tasks:
             cell = cells.get((*task, knows))
@@ -121,7 +140,7 @@ def report(out: Path) -> None:
             row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
         lines.append(f"| {LABELS[knows]} | " + " | ".join(row) + " |")
     minutes = results.groupby("knows").seconds.mean() / 60
-    spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in KNOWS if knows in minutes)
+    spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
     write(out / "table.md", "\n".join(lines) + "\n")
     _draw(out / "scores.png", results, tasks, partial)
@@ -155,7 +174,7 @@ def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], par
     axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
     cells = _cells(results, tasks)
     for ax, task in zip(axes, tasks, strict=True):
-        for place, knows in enumerate(reversed(KNOWS)):
+        for place, knows in enumerate(reversed(COMPARED)):
             cell = cells.get((*task, knows))
             if cell is not None:
                 found, low, high = cell["interval"]
@@ -164,8 +183,7 @@ def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], par
                 ax.plot(found, place, "o", color="C0")
         ax.axvline(1.0, color="0.8", lw=0.8)
         ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]:g}", xlabel="normalised score")
-        ax.set_yticks(range(len(KNOWS)), [LABELS[knows] for knows in reversed(KNOWS)])
+        ax.set_yticks(range(len(COMPARED)), [LABELS[knows] for knows in reversed(COMPARED)])
     figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
-    temporary = path.with_name(f".{path.name}.new.png")
-    figure.savefig(temporary, dpi=110)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

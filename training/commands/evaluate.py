@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+import pandas as pd
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from kkl_gym.system import System
-from kkl_gym.systems import system_of
-from observers import Artifact, shipped
-from observers.artifact import resolve
+from observers import Artifact
+from observers.storage import write
+from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.errors import Domain, errors, unseen_trajectories
 
 
@@ -25,77 +27,97 @@ class Evaluate:
     left out.
     """
 
-    observers: tyro.conf.Positional[tuple[str, ...]]
+    observers: Observers
     """Shipped maps, or .safetensors files."""
-    system: str | None = None
-    """For files of your own system: its class, as script.py:Class or module:Class."""
-    noise: tuple[float, ...] = (0.0, 0.5)
-    """Standard deviations of the measurement noise."""
+    system: OwnSystem = None
+    measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)
+    """Standard deviations of the noise on each sample of y, one table row for each."""
     process_noise: float = 0.0
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
     duration: float = 50.0
-    """Their length in seconds."""
+    """Length of each trajectory in seconds."""
     seed: int = 0
-    """Of the trajectories and the noise; never one that training draws."""
-    csv: Path | None = None
-    """Write the error of each trajectory to this file as well."""
+    """Seed of the trajectories and the noise; no seed gives any that training draws."""
+    csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
+    """File to which the errors of each trajectory are written as well."""
 
-    def run(self, console: Console) -> list[str]:
-        """Evaluate; returns the lines of the CSV file."""
-        if not self.observers:
-            raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
-        lines = ["observer,starts,noise,trajectory,smape,smape_late"]
-        for name in self.observers:
-            artifact = Artifact.read(resolve(name))
-            lines += self._evaluate(name, artifact, system_of(artifact, self.system), console)
+    def run(self, console: Console) -> pd.DataFrame:
+        """Evaluate.
+
+        Parameters
+        ----------
+        console : Console
+            Where the tables are printed.
+
+        Returns
+        -------
+        DataFrame
+            The rows of the CSV file, one for each observer, case and trajectory.
+
+        Raises
+        ------
+        ValueError
+            If an observer cannot be had, or a number makes no sense.
+        """
+        frames = []
+        for name, artifact, system in read_observers(self.observers, self.system):
+            with console.status(f"evaluating {name}"):
+                frames.append(self._evaluate(name, artifact, system, console))
+        found = pd.concat(frames, ignore_index=True)
         if self.csv:
-            self.csv.parent.mkdir(parents=True, exist_ok=True)
-            self.csv.write_text("\n".join(lines) + "\n")
+            write(self.csv, found.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
-        return lines
+        return found
 
-    def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> list[str]:
+    def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> pd.DataFrame:
         suffix = f", process noise {self.process_noise:g}" if self.process_noise else ""
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
-            cases.append(("X, driven", "X", True))
+            cases.append(("X", "X", True))
         table = Table(
             title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s{suffix}"
         )
         table.add_column("starts")
         for column in ("noise", "all steps", "after transient", "escaped"):
             table.add_column(column, justify="right")
-        lines = []
-        with console.status(f"evaluating {name}"):
-            for label, domain, driven in cases:
-                runs = unseen_trajectories(
+        frames = []
+        for starts, domain, driven in cases:
+            trajectories = unseen_trajectories(
+                system,
+                artifact.filter.dt,
+                n=self.trajectories,
+                duration=self.duration,
+                seed=self.seed,
+                domain=domain,
+                driven=driven,
+                process_noise=self.process_noise,
+            )
+            for level in self.measurement_noise:
+                found = errors(
+                    artifact,
                     system,
-                    artifact.filter.dt,
-                    n=self.trajectories,
-                    duration=self.duration,
+                    trajectories,
+                    measurement_noise=level,
                     seed=self.seed,
-                    domain=domain,
-                    driven=driven,
-                    process_noise=self.process_noise,
+                    skip=min(5.0, self.duration / 2) if driven else None,
                 )
-                for level in self.noise:
-                    found = errors(
-                        artifact,
-                        system,
-                        runs,
-                        measurement_noise=level,
-                        seed=self.seed,
-                        skip=min(5.0, self.duration / 2) if driven else None,
-                    )
-                    table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
-                    lines += [
-                        f'{name},"{label}{suffix}",{level:g},{i},{full:.6g},{late:.6g}'
-                        for i, (full, late) in enumerate(zip(found.full, found.late))
-                    ]
+                label = f"{starts}, driven" if driven else starts
+                table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
+                columns = {
+                    "observer": name,
+                    "starts": starts,
+                    "driven": driven,
+                    "process_noise": self.process_noise,
+                    "measurement_noise": level,
+                    "trajectory": np.arange(len(found.full)),
+                    "smape": found.full,
+                    "smape_late": found.late,
+                }
+                frames.append(pd.DataFrame(columns))
         console.print(table)
-        return lines
+        return pd.concat(frames, ignore_index=True)
 
 
 def spread(values: np.ndarray) -> str:

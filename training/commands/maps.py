@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -12,22 +13,31 @@ from training.config import current_names
 
 @dataclass(frozen=True)
 class Maps:
-    """List the maps that ship with the package."""
+    """List the maps that ship with the package.
+
+    The name in brackets, without a version, is that of the newest.
+    """
 
     def run(self, console: Console) -> None:
-        """Print the list."""
-        table = Table("name", "method", "inputs", "modes", "noise up to", "MB")
-        for name in shipped():
-            path = resolve(name)
+        """Print a row for each file."""
+        names = shipped()
+        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, caption="–: not told", caption_justify="left")
+        table.add_column("map", min_width=max(map(len, names)))  # which wraps between words only
+        table.add_column("pipeline", no_wrap=True)
+        for column in ("inputs", "modes", "measurement\nnoise up to", "process\nnoise\nup to", "MB"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for file in dict.fromkeys(names.values()):
+            path = resolve(file)
             artifact = Artifact.read(path)
+            newest = [name for name, meant in names.items() if meant == file != name]
+            told = artifact.inverse.features
             table.add_row(
-                name,
-                str(current_names(artifact.training).get("pipeline")),
+                file + "".join(f" ({name})" for name in newest),
+                str(current_names(artifact.training).get("pipeline", "–")),
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
-                f"{artifact.inverse.measurement_noise_max:g}"
-                if "measurement_noise" in artifact.inverse.features
-                else "not told",
+                f"{artifact.inverse.measurement_noise_max:g}" if "measurement_noise" in told else "–",
+                f"{artifact.process_noise_max:g}" if artifact.process_noise_max is not None else "–",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
         console.print(table)

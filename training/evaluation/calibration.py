@@ -18,7 +18,7 @@ LARGEST = 1.0  # for maps that are not told the noise
 WINDOW = 0.5  # s
 WARM_UP = 5.0  # s
 TRIES = 8
-MARGIN = 1.05  # on limits found among finitely many runs
+MARGIN = 1.05  # on limits found among finitely many trajectories
 
 
 def calibrate(
@@ -30,24 +30,36 @@ def calibrate(
     false_alarms: float = 0.01,
     seed: int = 0,
 ) -> Artifact:
-    """The same artifact with limits for a monitor.
+    """Find limits for an observer's monitor.
 
-    Sound runs are simulated from starts in X with the system's process noise, half of them under random inputs if the
-    map knows inputs, at several noise levels. Each limit is the one that a new run exceeds with a sixth of the
-    probability ``false_alarms`` (and of an output's share in it), with a margin for its being found among few runs.
+    Sound trajectories are simulated from starts in X with the system's process noise, half of them under random inputs
+    if the map knows inputs, at several noise levels. Each limit is the one that a new trajectory exceeds with a sixth
+    of the probability ``false_alarms`` (and of an output's share in it). A margin makes up for finding it among few.
 
     Parameters
     ----------
-    artifact : an observer of a linear output.
-    system : what it was made for.
-    trajectories : number of runs; None is as many as it takes to tell such rare events.
-    duration : of each, in seconds.
-    false_alarms : probability that a sound run of this length exceeds a limit.
-    seed : of everything random.
+    artifact : Artifact
+        An observer of a linear output.
+    system : System
+        What it was made for.
+    trajectories : int, optional
+        Number of trajectories; by default as many as it takes to tell such rare events.
+    duration : float
+        Length of each in seconds.
+    false_alarms : float
+        Probability that a sound trajectory of this length exceeds a limit.
+    seed : int
+        Seed of starts, inputs and noise.
+
+    Returns
+    -------
+    Artifact
+        The same with limits.
 
     Raises
     ------
-    ValueError : if the output is not linear, a number makes no sense, or the runs are too few to tell such rare events;
+    ValueError
+        If the output is not linear, a number makes no sense, or the trajectories are too few to tell such rare events;
         :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
@@ -60,7 +72,7 @@ def calibrate(
     share = false_alarms / (6 * system.ny)
     least = math.ceil(1 / share - 1e-9)
     if trajectories is not None and trajectories < least:
-        raise ValueError(f"{trajectories} runs are too few for {false_alarms:g}: take {least}")
+        raise ValueError(f"{trajectories} trajectories are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng)
     largest = artifact.inverse.measurement_noise_max
@@ -75,9 +87,34 @@ def calibrate(
 def sound_trajectories(
     artifact: Artifact, system: System, *, n: int, duration: float, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States (steps + 1, n, nx) and inputs (steps, n, nu) of runs; those that leave the bounds are drawn anew.
+    """Simulate trajectories with process noise, every other one under random inputs if the map knows inputs.
 
-    Raises ValueError if most of them do.
+    Those that leave the system's bounds are drawn anew.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        Observer, which gives the sampling interval.
+    system : System
+        What moves, from starts uniform in X, with its own level of process noise.
+    n : int
+        Number of trajectories.
+    duration : float
+        Length of each in seconds.
+    rng : numpy.random.Generator
+        From which starts, inputs and process noise are drawn.
+
+    Returns
+    -------
+    x : ndarray, shape (steps + 1, n, nx)
+        States.
+    u : ndarray, shape (steps, n, nu)
+        Inputs.
+
+    Raises
+    ------
+    ValueError
+        If most trajectories leave the bounds.
     """
     dt = artifact.filter.dt
     steps = round(duration / dt)
@@ -91,7 +128,7 @@ def sound_trajectories(
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))
         if len(kept) == TRIES:
-            raise ValueError(f"most runs of {duration:g} s leave bounds = {system.bounds}")
+            raise ValueError(f"most trajectories of {duration:g} s leave bounds = {system.bounds}")
     xs, us = zip(*kept, strict=True)
     return np.concatenate(xs, 1), np.concatenate(us, 1)
 

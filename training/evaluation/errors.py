@@ -13,8 +13,7 @@ from training.seeds import Stream, generator
 from training.trajectories.noise import draw_process_noise, noisy_output
 from training.trajectories.signals import random_inputs
 
-TRANSIENT = 0.2  # part of a run that is left out of the errors "after the transient"
-
+TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
 Domain = Literal["X", "1.5X", "2X"]
 
@@ -23,9 +22,14 @@ Domain = Literal["X", "1.5X", "2X"]
 class Errors:
     """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
 
-    full : over all steps (the paper's), (n,).
-    late : after the transient, (n,): what :func:`errors` was told to skip, else the first 20 % of the steps.
-    escaped : number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+    Parameters
+    ----------
+    full : ndarray, shape (n,)
+        Over all steps (the paper's).
+    late : ndarray, shape (n,)
+        After the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+    escaped : int
+        Number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
     """
 
     full: np.ndarray
@@ -37,10 +41,16 @@ class Errors:
 class UnseenTrajectories:
     """Test trajectories, measured without noise.
 
-    x : states, (steps + 1, n, nx).
-    u : inputs, (steps, n, nu).
-    inside : which of the trajectories drawn stayed within the system's declared bounds; the others are not in x and u.
-    process_noise : its level, as of the environments.
+    Parameters
+    ----------
+    x : ndarray, shape (steps + 1, n, nx)
+        States of the trajectories that stayed within the system's declared bounds.
+    u : ndarray, shape (steps, n, nu)
+        Their inputs.
+    inside : ndarray of bool, shape (drawn,)
+        Which of the trajectories drawn these are.
+    process_noise : float
+        Level of their process noise, in multiples of the system's scale per second.
     """
 
     x: np.ndarray
@@ -54,13 +64,43 @@ class UnseenTrajectories:
         return int((~self.inside).sum())
 
     def first(self, n: int) -> "UnseenTrajectories":
-        """The first n of those drawn. (Alone they might differ: rounding depends on the batch, and chaos on it.)"""
+        """Take the first of those drawn.
+
+        Drawn alone they might differ: rounding depends on the batch, and chaos on rounding.
+
+        Parameters
+        ----------
+        n : int
+            How many of those drawn, whether they stayed within bounds or not.
+
+        Returns
+        -------
+        UnseenTrajectories
+            Those of them that stayed.
+        """
         inside = self.inside[:n]
         return UnseenTrajectories(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside, self.process_noise)
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Starts (n, nx), uniform in the training box X, or in a multiple of X (as in the paper) without X itself."""
+    """Starts, uniform in the training box X, or in a multiple of X (as in the paper) without X itself.
+
+    Parameters
+    ----------
+    system : System
+        Whose X is meant.
+    domain : {"X", "1.5X", "2X"}
+        Where to start.
+    n : int
+        Number of starts.
+    rng : numpy.random.Generator
+        From which they are drawn.
+
+    Returns
+    -------
+    ndarray, shape (n, nx)
+        The starts.
+    """
     if domain == "X":
         return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
     low, high = system.box()
@@ -85,11 +125,38 @@ def unseen_trajectories(
     stream: Stream = Stream.EVALUATION,
     process_noise: float = 0.0,
 ) -> UnseenTrajectories:
-    """Test trajectories; driven ones alternate random bounded steps and sines.
+    """Simulate test trajectories, whose random numbers training never draws.
 
-    ``first`` is the first entry of the seed: of evaluation or of validation. ``process_noise`` is its level.
+    Parameters
+    ----------
+    system : System
+        What moves.
+    dt : float
+        Sampling interval in seconds.
+    n : int
+        Number of trajectories.
+    duration : float
+        Length of each in seconds.
+    seed : int
+        Seed of the starts, the inputs and the process noise.
+    domain : {"X", "1.5X", "2X"}
+        Where they start, see :func:`starts`.
+    driven : bool
+        Whether inputs act: random bounded steps and sines in turn.
+    stream : Stream
+        Random numbers to draw: those of evaluation or those of validation.
+    process_noise : float
+        Level of the process noise, in multiples of the system's scale per second.
 
-    Raises ValueError on an unknown domain, or unless n, duration, seed and level make sense.
+    Returns
+    -------
+    UnseenTrajectories
+        Those that stayed within the system's declared bounds, and which these are.
+
+    Raises
+    ------
+    ValueError
+        On an unknown domain, or unless n, duration, seed and level make sense.
     """
     if n < 1 or seed < 0 or not duration >= dt:
         raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
@@ -112,19 +179,37 @@ def unseen_trajectories(
 def errors(
     artifact: Artifact,
     system: System,
-    runs: UnseenTrajectories,
+    trajectories: UnseenTrajectories,
     *,
     measurement_noise: float,
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Errors of an observer on test trajectories, told the levels of noise.
+    """Errors of an observer on test trajectories. It is told the levels of noise.
 
-    skip : seconds left out of ``late``; None is a fifth of the run.
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    seed : int
+        Seed of the measurement noise.
+    skip : float, optional
+        Seconds left out of ``late``; by default a fifth of the trajectories' length.
+
+    Returns
+    -------
+    Errors
+        One for each trajectory.
     """
     rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(system, runs.x, measurement_noise, rng)
-    observer = KKLObserver(artifact, measurement_noise, process_noise=runs.process_noise)
-    x_hat = observer.estimate(y, runs.u if artifact.nu else None)
+    y = noisy_output(system, trajectories.x, measurement_noise, rng)
+    observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
+    x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
     first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
-    return Errors(smape(runs.x, x_hat), smape(runs.x, x_hat, first), runs.escaped)
+    return Errors(smape(trajectories.x, x_hat), smape(trajectories.x, x_hat, first), trajectories.escaped)

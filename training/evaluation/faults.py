@@ -12,35 +12,56 @@ from training.seeds import Stream, generator
 from training.systems import profile
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
-
-
 FAULTS: tuple[Fault, ...] = get_args(Fault)
-
-
 BIAS = 0.2  # of the output's range
 
 
 def deadline(system: System, duration: float) -> float:
-    """Seconds within which a fault should be noticed in runs of this length."""
+    """Seconds within which a fault should be noticed: what the system's profile says, else a fifth of the duration."""
     return profile(system).fault_deadline or duration / 5
 
 
 def simulate_faults(
-    artifact: Artifact, system: System, *, runs: int, duration: float, measurement_noise: float, seed: int
+    artifact: Artifact, system: System, *, trajectories: int, duration: float, measurement_noise: float, seed: int
 ) -> pd.DataFrame:
-    """One row for each run and fault: amplitude, the highest score, and the delay until it exceeded 1.
+    """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
-    ``score`` is the highest of the whole run where nothing is at fault, and within the deadline after the fault
-    elsewhere. ``delay`` is in seconds, infinite where the score never exceeds 1 within the run. ``amplitude`` is the
-    largest sound |y| after the middle of the run.
+    Parameters
+    ----------
+    artifact : Artifact
+        An observer with limits for its monitor.
+    system : System
+        What it was made for.
+    trajectories : int
+        Number of trajectories; each has every fault once.
+    duration : float
+        Length of each in seconds.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    seed : int
+        Seed of starts, inputs and noise.
+
+    Returns
+    -------
+    DataFrame
+        One row for each trajectory and fault. ``deadline``: seconds within which the fault should be noticed.
+        ``amplitude``: the largest sound |y| after the middle. ``score``: the monitor's highest within the deadline
+        after the fault, or of the whole trajectory where nothing is at fault. ``delay``: seconds until the score
+        exceeded 1, infinite where it never does.
+
+    Raises
+    ------
+    ValueError
+        If the artifact has no limits, or most trajectories leave the system's bounds.
     """
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    x, u = sound_trajectories(artifact, system, n=runs, duration=duration, rng=rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng)
     clean = system.output(x)
     y = clean + measurement_noise * rng.standard_normal(clean.shape)
     undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
     width = np.ptp(undriven, axis=(0, 1))
-    at, within = len(y) // 2, round(deadline(system, duration) / dt)
+    allowed = deadline(system, duration)
+    at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
     for fault in FAULTS:
@@ -60,7 +81,8 @@ def simulate_faults(
                 {
                     "system": system.name,
                     "fault": fault,
-                    "run": np.arange(runs),
+                    "deadline": allowed,
+                    "trajectory": np.arange(trajectories),
                     "amplitude": np.abs(clean[at:]).max((0, 2)),
                     "score": judged.max(0),
                     "delay": np.where(alarmed, (late > 1).argmax(0) * dt, np.inf),

@@ -1,6 +1,5 @@
 """Measures of an estimate against the truth, one for each trajectory.
 
-States and estimates have shape (steps, n, nx), results (n,). ``skip`` is the number of first steps left out.
 An estimate that is not finite counts as one infinitely far away.
 """
 
@@ -13,6 +12,23 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Symmetric mean absolute percentage error (paper, sec. 8.3), in percent, between 0 and 200.
 
     Mean over the steps of 2 |x - x_hat| / (|x| + |x_hat|) with Euclidean norms.
+
+    Parameters
+    ----------
+    x, x_hat : ndarray, shape (steps, n, nx)
+        States and estimates.
+    skip : int
+        Number of first steps left out.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Percent.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or no step is left.
     """
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
@@ -20,22 +36,75 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 
 
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """The same with absolute values of the components in place of norms, averaged over steps and components.
+    """SMAPE with absolute values of the components in place of norms, averaged over steps and components.
 
     This is what the notebooks released with the paper print, after the first 20 % of the steps.
+
+    Parameters
+    ----------
+    x, x_hat : ndarray, shape (steps, n, nx)
+        States and estimates.
+    skip : int
+        Number of first steps left out.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Percent.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or no step is left.
     """
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(_percentage(np.abs(x - x_hat), np.abs(x) + np.abs(x_hat)).mean((0, 2)))
 
 
 def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
-    """Root of the mean over the steps of |x - x_hat|^2, in units of the state."""
+    """Root of the mean over the steps of |x - x_hat|^2.
+
+    Parameters
+    ----------
+    x, x_hat : ndarray, shape (steps, n, nx)
+        States and estimates.
+    skip : int
+        Number of first steps left out.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In units of the state.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or no step is left.
+    """
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
 
 
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
-    """Time in seconds from which |x - x_hat| stays below a tenth of the root mean square of |x|; infinite if never."""
+    """Time from which |x - x_hat| stays below a tenth of the root mean square of |x|.
+
+    Parameters
+    ----------
+    x, x_hat : ndarray, shape (steps, n, nx)
+        States and estimates.
+    dt : float
+        Sampling interval in seconds.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Seconds; infinite where it never stays below.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ.
+    """
     x, x_hat = _compared(x, x_hat, 0)
     limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))
     outside = np.linalg.norm(x - x_hat, axis=-1) > limit

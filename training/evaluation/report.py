@@ -7,6 +7,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from observers.storage import replacing
 from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.maps.smooth import residual
@@ -15,21 +16,28 @@ from training.trajectories.noise import noisy_output
 
 
 def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
-    """Errors in training, PDE residual over the domain, estimate against truth.
+    """Draw the errors in training, the PDE residual over the domain, and estimates against the truth.
 
-    Where no T was learned, the error by noise level takes the place of the residual.
+    Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
+    unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
 
-    The trajectories shown are unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    result : Result
+        What the training made.
+    system : System
+        What it was made for.
+    seed : int
+        Seed of the trajectories and their noise.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     artifact = result.artifact
     seconds = min(20.0, artifact.training["duration"])
-    runs = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
-    figure = plt.figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
+    trajectories = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
+    figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
     for name, history in result.losses.items():
@@ -38,11 +46,11 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     losses.legend()
     right = figure.add_subplot(grid[0, 1])
     if artifact.forward is None:
-        _draw_noise_levels(right, result, system, runs, seed)
+        _draw_noise_levels(right, result, system, trajectories, seed)
     else:
-        draw_residual(figure, right, artifact, system)
+        draw_residual(right, artifact, system)
 
-    x = runs.x[:, :1]  # the first that stayed within the bounds, if any did
+    x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
     for column, noise in enumerate((0.0, 0.5)):
@@ -58,32 +66,51 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
                 ax.set_title(f"measurement noise {level:g}")
                 ax.legend(loc="upper right")
         ax.set_xlabel("t in s")
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
-def _draw_noise_levels(ax: Any, result: Result, system: System, runs: UnseenTrajectories, seed: int) -> None:
+def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: UnseenTrajectories, seed: int) -> None:
     artifact = result.artifact
-    if not runs.x.shape[1]:
+    if not trajectories.x.shape[1]:
         ax.set_title("every trajectory left the declared bounds")
         return
     levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
-    medians = [np.median(errors(artifact, system, runs, measurement_noise=level, seed=seed).late) for level in levels]
+    medians = [
+        np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels
+    ]
     ax.plot(range(len(levels)), medians, "o-")
     ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
-def draw_residual(figure: Any, ax: Any, artifact: Artifact, system: System, n: int = 150) -> None:
-    """Size of the PDE's residual over the plane of the phase portrait, the other states at the centre of X."""
+def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 150) -> None:
+    """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+        Where to draw; its figure gets a colour bar.
+    artifact : Artifact
+        An observer with a forward map.
+    system : System
+        What it was made for.
+    points : int
+        Along each axis.
+
+    Raises
+    ------
+    ValueError
+        If the artifact holds no forward map.
+    """
     from matplotlib.colors import LogNorm
 
     first, second = (i % system.nx for i in system.portrait)
-    x = np.tile(np.mean(system.X, axis=1), (n * n, 1))
-    grids = [np.linspace(*system.X[i], n) for i in (first, second)]
+    x = np.tile(np.mean(system.X, axis=1), (points**2, 1))
+    grids = [np.linspace(*system.X[i], points) for i in (first, second)]
     x[:, first], x[:, second] = (grid.ravel() for grid in np.meshgrid(*grids))
-    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(n, n)
+    size = np.linalg.norm(residual(artifact, system, x), axis=1).reshape(points, points)
     image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
-    figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
+    ax.figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
     ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

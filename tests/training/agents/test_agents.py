@@ -68,7 +68,7 @@ def test_a_saved_agent_plays_the_same(learned):
     assert read.fingerprint == fingerprint("van_der_pol-closed-loop")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
-    episodes = [play(one.make(4), one, TASK.steps, 0) for one in (agent, read)]
+    episodes = [play(one.make(4), one, steps=TASK.steps, seed=0) for one in (agent, read)]
     assert np.array_equal(episodes[0].x, episodes[1].x)
     assert episodes[0].x_hat.shape == episodes[0].x.shape == (TASK.steps + 1, 4, 2)
 
@@ -229,8 +229,10 @@ def test_hyperparameters():
     assert hyperparameters(TASKS["reverse_duffing"])[0] == "sac"
     assert hyperparameters(TASKS["lorenz"])[0] == "ppo"
     assert hyperparameters(TASKS["reverse_duffing"], "ppo")[0] == "ppo"
-    with pytest.raises(ValueError, match=r"sac\.yml has no settings for KKLLorenz-v0"):
-        hyperparameters(TASKS["lorenz"], "sac")
+    for algorithm in ("ppo", "sac", "ppo_lstm"):  # any of them for any system
+        for task in TASKS.values():
+            assert hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000
+    assert hyperparameters(TASKS["lorenz"], "sac") == hyperparameters(TASKS["reverse_duffing"])
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
         hyperparameters(TASKS["lorenz"], "dqn")
     with pytest.raises(ValueError, match="algorithm must be one of ppo, sac"):
@@ -240,7 +242,9 @@ def test_hyperparameters():
 
 
 def test_own_systems_get_the_defaults(script):
-    assert hyperparameters(ControlTask(f"{script}:Pendulum"))[0] == "ppo"
+    task = ControlTask(f"{script}:Pendulum")
+    assert hyperparameters(task)[0] == "ppo"
+    assert hyperparameters(task, "sac") == hyperparameters(TASKS["reverse_duffing"])
 
 
 def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
@@ -264,14 +268,14 @@ def test_an_agent_learns():
     task = TASKS["van_der_pol"]
     with tempfile.TemporaryDirectory() as folder:
         agent = learn(task, "state", Path(folder), timesteps=200_000)
-    x = play(agent.make(50), agent, task.steps, 0).x
+    x = play(agent.make(50), agent, steps=task.steps, seed=0).x
     assert scores(get_system(task.system), x).mean() > -0.25
 
 
 def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
-    folder = tmp_path / "agents" / "lorenz-y-0"
+    folder = tmp_path / "runs" / "agents" / "lorenz-y-0"
     assert Agent.read(folder / "agent.safetensors").information == "y"
     with pytest.raises(SystemExit, match="holds an agent already"):
         main(["agent", "train", "lorenz", "--information", "y", "--timesteps", "1"])
@@ -281,7 +285,7 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
         assert animation.n_frames > 20
     with Image.open(tmp_path / "pictures" / "lorenz-y-0.5-0.png") as figure:
         assert figure.size[0] > 200
-    with pytest.raises(SystemExit, match="episodes must be positive"):
+    with pytest.raises(SystemExit, match="episodes from 1 to 10000; got 0 and 0"):
         main(["agent", "evaluate", str(folder / "agent.safetensors"), "--episodes", "0"])
     own = replace(Agent.read(folder / "agent.safetensors"), task=ControlTask("some.py:Evil"))
     own.save("own.safetensors")
@@ -305,6 +309,6 @@ def test_shipped_agents_act_on_estimates(name, least):
     agent = Agent.read(find(name))
     assert (agent.information, agent.observer) == ("x_hat", versioned(observer_of(get_system(name))))
     assert agent.task == TASKS[name]
-    system, episodes = get_system(name), play(agent.make(20), agent, agent.task.steps, 0)
+    system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
     assert not episodes.escaped.any()

@@ -13,8 +13,9 @@ from rich.console import Console
 import training.agents.comparison
 import training.agents.learn
 import training.commands.compare
-from training.agents.comparison import KNOWS, MORE_NOISE, interval, middle, normalised, planned, run_case
+from training.agents.comparison import COMPARED, MORE_NOISE, interval, middle, normalised, planned, run_case
 from training.commands.compare import Compare, report
+from training.jobs import locked
 from training.systems import PROFILES
 
 
@@ -23,13 +24,15 @@ def toy(out, **options):
     return Compare(out=out, **{**settings, **options})
 
 
-def toy_cases(out, *knows):
-    return planned(out, systems=("lorenz",), knows=knows, seeds=1, episodes=3, timesteps=1, more_noise=False)
+def toy_cases(out, *information):
+    return planned(
+        out, systems=("lorenz",), information=information, seeds=1, episodes=3, timesteps=1, more_noise=False
+    )
 
 
 def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
     out = tmp_path / "a"
-    toy(out, knows=("state", "y")).run(Console())
+    toy(out, information=("state", "y")).run(Console())
     results = pd.read_csv(out / "results.csv")
     assert len(results) == 4
     assert (results.score <= 0).all()
@@ -39,13 +42,13 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
     assert (out / "scores.png").stat().st_size > 1000
     before = {path: path.stat().st_mtime_ns for path in out.glob("jobs/**/result.json")}
     shutil.rmtree(out / "jobs" / "lorenz-0.5" / "y" / "1")
-    toy(out, knows=("y",)).run(Console())  # a narrower run reports all that is there
+    toy(out, information=("y",)).run(Console())  # a narrower run reports all that is there
     again = pd.read_csv(out / "results.csv")
     assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all is seeded
     changed = [path for path in before if path.stat().st_mtime_ns != before[path]]
     assert [path.parts[-3:-1] for path in changed] == [("y", "1")]
-    with pytest.raises(ValueError, match="of another comparison: episodes = 3, not 4"):
-        toy(out, knows=("y",), episodes=4).run(Console())
+    with pytest.raises(ValueError, match="of another comparison: episodes = 3 there, 4 here"):
+        toy(out, information=("y",), episodes=4).run(Console())
 
 
 def test_table_and_figure_from_the_results_alone(tmp_path):
@@ -95,7 +98,7 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
 
     monkeypatch.setattr(training.commands.compare, "run_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        toy(tmp_path, knows=("state", "y")).run(Console())
+        toy(tmp_path, information=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1
     assert "Partial: 207 of 208 agents are missing" in (tmp_path / "table.md").read_text()
 
@@ -112,7 +115,7 @@ def test_cases():
     assert len(cases) == 6 * 6 * 5 + 4 * 2 * 3 + 2 * 2
     assert len({case.folder for case in cases}) == len(cases)
     assert {(case.system, case.measurement_noise) for case in cases} >= set(MORE_NOISE.items())
-    assert {case.knows for case in cases} == set(KNOWS)
+    assert {case.information for case in cases} == set(COMPARED)
 
 
 def test_normalised_scores_by_hand():
@@ -136,6 +139,31 @@ def test_interquartile_means_and_intervals():
 def test_wrong_numbers(tmp_path):
     with pytest.raises(ValueError, match="must be positive"):
         toy(tmp_path, seeds=0).run(Console())
-    for wrong in ({"systems": ("lorenz", "lorenz")}, {"knows": ("y", "y")}, {"knows": ()}):
+    for wrong in (
+        {"systems": ("lorenz", "lorenz")},
+        {"systems": ("mine.py:Mine",)},  # whose agents the report would leave out
+        {"information": ("y", "y")},
+        {"information": ()},
+    ):
         with pytest.raises(ValueError, match="each once"):
             toy(tmp_path, **wrong).run(Console())
+
+
+def test_a_result_of_which_nobody_knows_what_it_is_of_is_no_result(tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    case.folder.mkdir(parents=True)
+    (case.folder / "result.json").write_text("{}")
+    assert not case.done
+
+
+def test_one_agent_is_not_trained_twice_at_a_time(tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    with locked(case.folder), pytest.raises(ValueError, match="another process is at work"):
+        run_case(case)
+
+
+def test_the_published_table_follows_from_the_published_results(tmp_path):
+    published = Path(__file__).parents[3] / "docs" / "results" / "agents"
+    shutil.copy(published / "results.csv", tmp_path)
+    report(tmp_path)
+    assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from linear_system import Oscillator
 
 from kkl_gym import SYSTEMS, VanDerPol, get_system
 from observers import load
@@ -43,7 +44,7 @@ def test_observations_are_finite_and_of_the_size_of_one(name, information):
 @pytest.mark.parametrize("information", INFORMATION)
 def test_last_observations_of_episodes_and_first_ones_of_the_next(information):
     """Against the same environment that leaves resets to us."""
-    ours, bare = make(TASK, information, N), make(TASK, information, N, "Disabled")
+    ours, bare = make(TASK, information, N), make(TASK, information, N, autoreset_mode="Disabled")
     assert (ours.reset(seed=1)[0] == bare.reset(seed=1)[0]).all()
     ends = 0
     for action in actions(25):
@@ -95,6 +96,11 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
 def test_agents_keep_the_version_of_their_map_whatever_ships_later(name):
     fitted_in_closed_loop = "-closed-loop" if name in ("reverse_duffing", "van_der_pol") else ""
     assert observer_of(get_system(name)) == f"{name}{fitted_in_closed_loop}-v1"
+
+
+def test_no_observer_ships_for_a_system_of_ones_own():
+    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
+        observer_of(Oscillator())
 
 
 def test_an_output_that_is_flat_at_the_target():
@@ -150,7 +156,7 @@ def test_kalman_filters_follow_a_driven_state():
 
 
 def test_rows_that_have_ended_stay_as_they_are():
-    env = make(TASK, "stacked", N, "Disabled")
+    env = make(TASK, "stacked", N, autoreset_mode="Disabled")
     env.reset(seed=0)
     for action in actions(TASK.steps):
         obs, _, _, truncated, _ = env.step(action)

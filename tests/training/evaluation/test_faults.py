@@ -1,12 +1,13 @@
 """Sensor faults, on a small scale."""
 
 import dataclasses
+from pathlib import Path
 
+import linear_system
 import numpy as np
 import pandas as pd
 import pytest
 
-import training.commands.faults
 import training.evaluation.calibration
 import training.evaluation.certificates.certificate
 import training.evaluation.faults
@@ -35,7 +36,7 @@ def found():
     from kkl_gym import get_system
 
     return simulate_faults(
-        with_limits("lorenz"), get_system("lorenz"), runs=12, duration=16.0, measurement_noise=0.5, seed=0
+        with_limits("lorenz"), get_system("lorenz"), trajectories=12, duration=16.0, measurement_noise=0.5, seed=0
     )
 
 
@@ -62,7 +63,7 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
     calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
     assert set(told) == {0.12}
     told.clear()
-    simulate_faults(calibrated, system, runs=2, duration=12.0, measurement_noise=0.5, seed=0)
+    simulate_faults(calibrated, system, trajectories=2, duration=12.0, measurement_noise=0.5, seed=0)
     assert set(told) == {0.12}
     told.clear()
     monkeypatch.setattr(training.evaluation.certificates.certificate, "decoder", spy)
@@ -86,7 +87,7 @@ def test_one_row_for_each_run_and_fault(found):
 
 
 def test_report_from_the_file_alone(found, tmp_path):
-    found.to_csv(tmp_path / "faults.csv", index=False)
+    found.assign(observer="lorenz").to_csv(tmp_path / "faults.csv", index=False)
     report(tmp_path)
     table = (tmp_path / "table.md").read_text()
     assert "| lorenz |" in table
@@ -95,19 +96,55 @@ def test_report_from_the_file_alone(found, tmp_path):
 
 
 def test_duffing_is_reported_by_amplitude(tmp_path):
-    rows = [("reverse_duffing", fault, i, float(i), 2.0 if i > 4 else 0.5, 1.0) for fault in FAULTS for i in range(9)]
-    columns = ["system", "fault", "run", "amplitude", "score", "delay"]
+    rows = [
+        ("mine", "reverse_duffing", fault, 10.0, i, float(i), 2.0 if i > 4 else 0.5, 1.0)
+        for fault in FAULTS
+        for i in range(9)
+    ]
+    columns = ["observer", "system", "fault", "deadline", "trajectory", "amplitude", "score", "delay"]
     pd.DataFrame(rows, columns=columns).to_csv(tmp_path / "faults.csv", index=False)
     report(tmp_path)
-    assert "| bias | 0 % | 0 % | 100 % | 100 % |" in (tmp_path / "table.md").read_text()
+    table = (tmp_path / "table.md").read_text()
+    assert "mine by amplitude" in table
+    assert "| bias | 0 % | 0 % | 100 % | 100 % |" in table
 
 
 def test_command(tmp_path, monkeypatch, capsys):
     artifact = with_limits("lorenz")
-    monkeypatch.setattr(training.commands.faults.Artifact, "read", lambda path: artifact)
-    main(["faults", "--systems", "lorenz", "--runs", "4", "--duration", "12", "--out", str(tmp_path)])
+    monkeypatch.setattr(Artifact, "read", lambda path: artifact)
+    main(["faults", "lorenz", "--runs", "4", "--duration", "12", "--out", str(tmp_path)])
     assert "noticed" in capsys.readouterr().out
-    assert len(pd.read_csv(tmp_path / "faults.csv")) == 16
-    for wrong in (["--systems", "pendulum"], ["--runs", "1"]):
+    found = pd.read_csv(tmp_path / "faults.csv")
+    assert found.groupby(["observer", "system"]).size().to_dict() == {("lorenz", "lorenz"): 16}
+    assert set(found.deadline) == {2.0}
+    for wrong in (["pendulum"], ["--trajectories", "1"], ["lorenz", "lorenz"]):
         with pytest.raises(SystemExit, match="kkl-gym: "):
             main(["faults", *wrong, "--out", str(tmp_path)])
+
+
+def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path):
+    system = f"{linear_system.__file__}:Oscillator"
+    limits = Limits(
+        np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
+    )
+    path = str(tmp_path / "mine.safetensors")
+    dataclasses.replace(make_artifact(system=system), C=np.array([[1.0, 0.0]]), limits=limits).save(path)
+    with pytest.raises(SystemExit, match="name its class with --system"):
+        main(["faults", path])
+    options = ["--system", system, "--trajectories", "4", "--duration", "12", "--out", str(tmp_path / "out")]
+    main(["faults", path, *options])
+    found = pd.read_csv(tmp_path / "out" / "faults.csv")
+    assert found.groupby(["observer", "system", "fault"]).size().to_dict() == {
+        (path, "oscillator", fault): 4 for fault in FAULTS
+    }
+    assert set(found.deadline) == {2.4}  # a fifth of the duration
+    assert (tmp_path / "out" / "roc.png").stat().st_size > 5_000
+
+
+def test_published_faults_have_the_columns_that_the_command_writes(found, tmp_path):
+    published = Path(__file__).parents[3] / "docs" / "results" / "faults"
+    faults = pd.read_csv(published / "faults.csv")
+    assert list(faults.columns) == ["observer", *found.columns]
+    faults.to_csv(tmp_path / "faults.csv", index=False)
+    report(tmp_path)
+    assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()

@@ -43,8 +43,8 @@ def test_the_linear_quadratic_regulator_stabilises_the_target(name):
 @everyone
 def test_the_state_feedback_succeeds_where_nothing_fails(name):
     task, n = TASKS[name], 20
-    episodes = play(task.make(n, autoreset_mode="Disabled"), controller(get_system(name)), task.steps, 0)
-    idle = play(task.make(n, autoreset_mode="Disabled"), nothing, task.steps, 0)
+    episodes = play(task.make(n, autoreset_mode="Disabled"), controller(get_system(name)), steps=task.steps, seed=0)
+    idle = play(task.make(n, autoreset_mode="Disabled"), nothing, steps=task.steps, seed=0)
     assert (episodes.x[0] == idle.x[0]).all()
     assert episodes.x.shape == (task.steps + 1, n, get_system(name).nx)
     assert episodes.u.shape == (task.steps, n, 1)
@@ -93,7 +93,7 @@ def test_impossible_tasks(wrong):
 
 def test_play_refuses_environments_that_reset_by_themselves():
     with pytest.raises(ValueError, match='autoreset_mode="Disabled"'):
-        play(TASKS["lorenz"].make(2), nothing, 3, 0)
+        play(TASKS["lorenz"].make(2), nothing, steps=3, seed=0)
 
 
 def test_finding_tasks():

@@ -1,0 +1,63 @@
+"""``kkl-gym agent``: episodes, intervals, and systems of one's own."""
+
+import linear_system
+import numpy as np
+import pytest
+
+import training.agents.picture
+from training.agents.agent import Agent
+from training.cli import main
+from training.commands.agent import Evaluate, interval
+from training.seeds import AGENT_EVALUATION_SEED, agent_evaluation_seed
+
+OWN = f"{linear_system.__file__}:Oscillator"
+
+
+def test_seeds_of_the_evaluation_share_no_episode():
+    assert agent_evaluation_seed(0, 100) == AGENT_EVALUATION_SEED  # on which published results rest
+    first, second = (range(start, start + 10_000) for start in (agent_evaluation_seed(seed, 10_000) for seed in (0, 1)))
+    assert not set(first) & set(second)
+    for seed, episodes in ((-1, 1), (0, 0), (0, 10_001)):
+        with pytest.raises(ValueError, match=f"got {seed} and {episodes}"):
+            agent_evaluation_seed(seed, episodes)
+
+
+def test_intervals_over_episodes():
+    values = np.random.default_rng(0).normal(size=500)
+    mean, low, high = interval(values)
+    assert mean == pytest.approx(values.mean())
+    error = values.std() / np.sqrt(500)
+    assert (mean - low, high - mean) == pytest.approx((1.96 * error, 1.96 * error), rel=0.1)
+    assert interval(np.ones(10)) == (1.0, 1.0, 1.0)  # all hold the target
+    assert np.isnan(interval(np.ones(1))[1:]).all()
+
+
+def test_an_agent_is_played_on_the_episodes_of_a_seed(tmp_path, capsys, monkeypatch):
+    for name in ("draw", "animate"):  # which take most of the time
+        monkeypatch.setattr(training.agents.picture, name, lambda task, episodes, path: None)
+    assert Evaluate("lorenz").episodes == 500
+    told = []
+    for seed in ("0", "0", "1"):
+        main(["agent", "evaluate", "lorenz", "--episodes", "5", "--seed", seed, "--out", str(tmp_path)])
+        told.append(capsys.readouterr().out)
+    assert "[" in told[0]
+    assert told[0] == told[1] != told[2]
+    with pytest.raises(SystemExit, match="kkl-gym: seed must not be negative"):
+        main(["agent", "evaluate", "lorenz", "--seed", "-1"])
+
+
+def test_an_agent_for_a_system_of_ones_own(tmp_path, saved, script, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    observer = saved(system=OWN)
+    with pytest.raises(SystemExit, match=r"no observer ships for 'oscillator': name a \.safetensors file"):
+        main(["agent", "train", OWN, "--timesteps", "1"])
+    main(["agent", "train", OWN, "--observer", observer, "--timesteps", "1"])
+    path = tmp_path / "runs" / "agents" / "oscillator-x_hat-0" / "agent.safetensors"
+    agent = Agent.read(path)
+    assert (agent.observer, agent.training["algorithm"]) == (observer, "ppo")
+    with pytest.raises(SystemExit, match="if you trust that, give --system"):
+        main(["agent", "evaluate", str(path), "--episodes", "2"])
+    main(["agent", "evaluate", str(path), "--episodes", "2", "--system", OWN])
+    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.5-0.gif").exists()
+    with pytest.raises(SystemExit, match="Pendulum has no inputs"):
+        main(["agent", "train", f"{script}:Pendulum", "--information", "y"])

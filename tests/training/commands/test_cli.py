@@ -1,0 +1,133 @@
+"""The command line as a whole: help, errors and interruptions."""
+
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+import pytest
+
+import training.cli
+from training.cli import COMMANDS, EXTRAS, main
+
+ROOT = Path(__file__).parents[3]
+
+
+def python(code):
+    return subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+
+
+def test_help_names_every_command_and_imports_none():
+    done = python(
+        "import sys\nfrom training.cli import main\n"
+        "assert not {'tyro', 'rich', 'numpy'} & set(sys.modules)\n"  # nothing that may be missing or takes time
+        "try:\n    main(['--help'])\nexcept SystemExit as end:\n    assert not end.code\n"
+        "print(*sorted({'torch', 'pandas', 'scipy', 'numpy'} & set(sys.modules)), file=sys.stderr)"
+    )
+    assert done.returncode == 0
+    assert done.stderr.strip() == ""
+    for name in COMMANDS:
+        assert f" {name} " in done.stdout
+    assert "List the maps that ship with the package." in done.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_of_its_own(name, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([name, "--help"])
+    assert not end.value.code
+    shown = capsys.readouterr().out
+    assert f"usage: kkl-gym {name}" in shown
+    assert "{None}|" not in shown or name in ("train", "benchmark", "tune", "speed")
+
+
+def test_wrong_settings_are_said_in_a_line_each():
+    with pytest.raises(SystemExit) as end:
+        main(["train", "lorenz", "--dt", "0", "--batch", "65", "--no-monitor"])
+    assert end.value.code == "kkl-gym: dt = 0.0: should be greater than 0\nbatch = 65: should be a multiple of 32"
+    with pytest.raises(SystemExit) as end:
+        main(["train", "lorenz", "--forward-steps", "5", "--no-monitor"])
+    assert end.value.code.startswith("kkl-gym: pipeline 'input-aware' does not go with forward_steps = 5")
+    assert "\n" not in end.value.code
+
+
+@pytest.mark.parametrize(
+    ("missing", "arguments", "extra"),
+    [
+        ("tyro", ["maps"], "train"),
+        ("torch", ["train", "lorenz"], "train"),
+        ("stable_baselines3", ["agent", "train", "lorenz"], "agents"),
+        ("PIL", ["agent", "evaluate", "lorenz"], "plots"),
+        ("matplotlib", ["demo", "--duration", "0.1"], "plots"),
+    ],
+)
+def test_the_extra_that_brings_a_missing_module_is_named(missing, arguments, extra):
+    done = python(f"import sys\nsys.modules[{missing!r}] = None\nfrom training.cli import main\nmain({arguments})")
+    assert done.returncode == 1
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("kkl-gym: ")
+    assert missing in line
+    assert line.endswith(f'pip install "kkl-gym[{extra}]"')
+
+
+def test_extras_are_those_of_the_package():
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+    def of(extra):
+        names = [text.partition(">")[0].lower().replace("_", "-") for text in declared[extra]]
+        return {name for name in names if not name.startswith("kkl-gym")}
+
+    for name, distributions in packages_distributions().items():
+        its = {entry.lower().replace("_", "-") for entry in distributions}
+        for extra, modules in EXTRAS.items():
+            if name in modules and name != "PIL":  # which matplotlib brings, whatever else does
+                assert its & of(extra), name
+    modules = set().union(*EXTRAS.values())
+    assert modules <= set(packages_distributions())
+    assert len(modules) == sum(map(len, EXTRAS.values()))
+
+
+def test_a_module_of_ones_own_that_is_missing_gets_no_hint(monkeypatch):
+    def missing(name):
+        raise ModuleNotFoundError("No module named 'mine'", name="mine")
+
+    monkeypatch.setattr(training.cli, "import_module", missing)
+    with pytest.raises(SystemExit) as end:
+        main(["maps"])
+    assert end.value.code == "kkl-gym: No module named 'mine'"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint"),
+        (["benchmark"], "kkl-gym: interrupted; the same command goes on"),
+        (["agent", "compare"], "kkl-gym: interrupted; the same command goes on"),
+        (["agent", "evaluate", "lorenz"], "kkl-gym: interrupted"),
+        (["maps"], "kkl-gym: interrupted"),
+    ],
+)
+def test_interruptions_while_modules_are_imported(arguments, said, monkeypatch):
+    def interrupted(name):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training.cli, "import_module", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == said
+
+
+def test_the_package_says_what_it_lacks():
+    done = python("import sys\nsys.modules['torch'] = None\nimport training\ntraining.train")
+    assert done.stderr.splitlines()[-1].endswith('training.train needs pip install "kkl-gym[train]"')
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        training.nothing  # noqa: B018
+    assert all(callable(getattr(training, name)) for name in training.__all__)
+
+
+def test_figures_leave_the_users_matplotlib_alone():
+    for folder in ("commands", "evaluation", "agents"):
+        for path in (ROOT / "training" / folder).rglob("*.py"):
+            assert "pyplot" not in path.read_text(), path
+            assert "matplotlib.use" not in path.read_text(), path
