@@ -3,34 +3,32 @@
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import torch
 import tyro
 from rich.console import Console
 
 from kkl_gym.systems import get_system
-from training.config import FORMER_NAMES, Config, Pipeline, override, read_changes, setting_types
+from training.config import Config, Pipeline, override, read_changes, setting_types
 from training.presets import CLOSED_LOOP, Preset, preset
 
 
 def _options() -> type[Any]:
     """A class of all settings of a configuration, each None unless it is given, with Config's own descriptions."""
-    former = {now: before for before, now in FORMER_NAMES.items()}
     described = Config.__pydantic_fields__  # type: ignore[attr-defined]
-    entries = []
+    options = []
     for name, kind in setting_types().items():
         if name == "pipeline":
             continue
+        plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
         argument = tyro.conf.arg(
             help=" ".join((described[name].description or "").split()),
             help_behavior_hint="(default: the preset's)",
-            aliases=[f"--{former[name].replace('_', '-')}"]
-            if name in former and name != "closed_loop_trajectories"
-            else None,
+            metavar=plain.__name__.upper() if isinstance(plain, type) and get_origin(plain) is None else None,
         )
-        entries.append((name, Annotated[kind | None, argument], None))
-    return dataclasses.make_dataclass("Settings", entries, frozen=True)
+        options.append((name, Annotated[kind | None, argument], None))
+    return dataclasses.make_dataclass("Settings", options, frozen=True)
 
 
 if TYPE_CHECKING:

@@ -114,8 +114,6 @@ def optimise(
                 for name, value in terms.items():
                     log(f"{stage.name}/{name}", float(value.detach()), step + 1)
             progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
-            if not progress.console.is_terminal and not progress.disable and (step + 1) % (20 * LOG_EVERY) == 0:
-                progress.console.print(f"{stage.name}: {step + 1} of {stage.steps} batches, error {mean:.3g}")
             if time.monotonic() - saved_at > CHECKPOINT_SECONDS or last:
                 course.step, course.seconds = step + 1, seconds()
                 _save(stage, parts, generator, course)
