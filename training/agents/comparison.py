@@ -19,7 +19,7 @@ from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
-from training.jobs import check_identity, locked
+from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
 
@@ -31,6 +31,7 @@ MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if fo
 RECURRENT_SEEDS = 3
 MORE_NOISE_RECURRENT_SEEDS = 1
 MANY = 1000  # seeds, more than anyone trains
+OTHER = "an agent of another comparison"
 PROTOCOL = 1  # changes where results must not be mixed with earlier ones
 
 
@@ -53,7 +54,7 @@ class Case:
     timesteps : int or None
         Actions to learn from; None takes what the hyperparameters say.
     folder : Path
-        Receives job.json, result.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
+        Receives job.json, scores.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
     """
 
     system: str
@@ -77,7 +78,7 @@ class Case:
         task = get_task(self.system, self.measurement_noise)
         recurrent = self.information.startswith("recurrent")
         named = versioned(observer_of(get_system(task.system))) if self.information in ("x_hat", "z") else None
-        described = {
+        return {
             "protocol": PROTOCOL,
             "episodes": self.episodes,
             "timesteps": self.timesteps,
@@ -87,15 +88,13 @@ class Case:
             "observer": None if named is None else [named, fingerprint(named)],
             "version": kkl_gym.__version__,
         }
-        return dict(json.loads(json.dumps(described)))
 
     @property
     def done(self) -> bool:
         """Whether its result is there; raises ValueError if the folder holds an agent of another comparison."""
-        paths = [self.folder / name for name in ("job.json", "result.json")]
-        if not all(path.exists() for path in paths):
+        if not (self.folder / "scores.json").exists():
             return False
-        check_identity(paths[0], self.identity, "an agent of another comparison")
+        check_identity(self.folder / "job.json", self.identity, OTHER)
         return True
 
 
@@ -112,9 +111,8 @@ def run_case(case: Case) -> None:
     ValueError
         If another process is at work on it, or its folder holds an agent of another comparison.
     """
-    with locked(case.folder):
+    with claimed_job(case.folder, case.identity, OTHER):
         if not case.done:
-            write(case.folder / "job.json", json.dumps(case.identity, indent=2) + "\n")
             _run(case)
 
 
@@ -140,7 +138,7 @@ def _run(case: Case) -> None:
         "successes": successes(task, x).tolist(),
         "seconds": round(seconds, 1),
     }
-    write(case.folder / "result.json", json.dumps(result) + "\n")
+    write(case.folder / "scores.json", json.dumps(result) + "\n")
 
 
 def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
@@ -254,7 +252,7 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
         key = (case.system, case.measurement_noise)
         if key not in idle_scores:
             idle_scores[key] = float(idle(*key, case.episodes).mean())
-        result = json.loads((case.folder / "result.json").read_text())
+        result = json.loads((case.folder / "scores.json").read_text())
         rows.append(
             {
                 "system": case.system,

@@ -14,6 +14,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import replacing, write
+from training import markdown
 from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.certificates.certificate import (
     QUANTILES,
@@ -99,7 +100,7 @@ class Certify:
                 draw(self.out / f"{name}.png", artifact, system, name=name, levels=levels, motion=motion)
             found.append(certificate)
         console.print(table(found))
-        write(self.out / "table.md", markdown(found))
+        write(self.out / "table.md", page(found))
         console.print(f"wrote table.md, JSON and figures in {self.out}")
         return found
 
@@ -179,17 +180,19 @@ def table(found: Sequence[Certificate]) -> Table:
     return out
 
 
-def markdown(found: Sequence[Certificate]) -> str:
+def page(found: Sequence[Certificate]) -> str:
     """Certificates side by side in Markdown, with the noise that they were made for."""
-    rows = [f"| | {' | '.join(certificate.observer for certificate in found)} |", "|---" * (1 + len(found)) + "|"]
-    for sections in zip(*map(lines, found), strict=True):
-        rows += [f"| {label} | {' | '.join(section[label] for section in sections)} |" for label in sections[0]]
+    rows = [
+        [label, *(section[label] for section in sections)]
+        for sections in zip(*map(lines, found), strict=True)
+        for label in sections[0]
+    ]
     first = found[0]
     head = (
         f"Measurement noise {first.measurement_noise:g}, cut at {first.noise_bound:g} for the bounds; "
         f"{first.samples} samples along the motion of the first.\n\n"
     )
-    return head + "\n".join(rows) + "\n"
+    return head + "\n".join(markdown.table(["", *(certificate.observer for certificate in found)], rows)) + "\n"
 
 
 def draw(

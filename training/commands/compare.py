@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from observers.storage import replacing, write
+from training import markdown
 from training.agents.comparison import COMPARED, Compared, collect, interval, middle, normalised, planned, run_case
 from training.agents.tasks import TASKS
 from training.jobs import run_all
@@ -124,12 +125,11 @@ def report(out: Path) -> None:
         "Interquartile mean over agents [bootstrap 95 % interval], success rate in %, number of agents. Observers see "
         f"every sample of y; agents on y see it once for each action.{partial}",
         "",
-        "| | " + " | ".join(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks) + " |",
-        "|---" * (1 + len(tasks)) + "|",
     ]
     cells = _cells(results, tasks)
+    rows = []
     for knows in COMPARED:
-        row = []
+        row = [LABELS[knows]]
         for task in tasks:
             cell = cells.get((*task, knows))
             if cell is None:
@@ -138,7 +138,8 @@ def report(out: Path) -> None:
             found, low, high = cell["interval"]
             spread = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
             row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
-        lines.append(f"| {LABELS[knows]} | " + " | ".join(row) + " |")
+        rows.append(row)
+    lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks)], rows)
     minutes = results.groupby("knows").seconds.mean() / 60
     spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]

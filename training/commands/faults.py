@@ -12,6 +12,7 @@ from rich.table import Column, Table
 
 from kkl_gym import SYSTEMS
 from observers.storage import replacing, write
+from training import markdown
 from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.faults import FAULTS, simulate_faults
 
@@ -99,21 +100,18 @@ def report(out: Path) -> Table:
         To be printed.
     """
     found = pd.read_csv(out / "faults.csv")
-    shown = Table(
-        Column("observer", overflow="fold"), "false alarms", "fault", "noticed in time", "delay in s: median", "95 %"
-    )
-    lines = [
-        "| | false alarms | fault | within | noticed in time | median delay in s | 95 % |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    header = ["false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %"]
+    rows = []
     for observer, group in found.groupby("observer", sort=False):
         false = f"{100 * (group[group.fault == 'none'].score > 1).mean():.1f} %"
-        for fault, rows in group[group.fault != "none"].groupby("fault", sort=False):
-            low, high = np.quantile(rows.delay, [0.5, 0.95], method="higher")
-            cells = (f"{100 * (rows.score > 1).mean():.1f} %", f"{low:.2f}", f"{high:.2f}")
-            shown.add_row(str(observer), false, str(fault), *cells)
-            deadline = f"{rows.deadline.iloc[0]:g} s"
-            lines.append(f"| {observer} | {false} | {fault} | {deadline} | {' | '.join(cells)} |")
+        for fault, faulty in group[group.fault != "none"].groupby("fault", sort=False):
+            noticed = f"{100 * (faulty.score > 1).mean():.1f} %"
+            delays = (f"{delay:.2f}" for delay in np.quantile(faulty.delay, [0.5, 0.95], method="higher"))
+            rows.append([str(observer), false, str(fault), f"{faulty.deadline.iloc[0]:g} s", noticed, *delays])
+    lines = markdown.table(["", *header], rows)
+    shown = Table(Column("observer", overflow="fold"), *header)
+    for row in rows:
+        shown.add_row(*row)
     duffing = found[(found.system == "reverse_duffing") & (found.fault != "none")]
     for observer, group in duffing.groupby("observer", sort=False):
         lines += ["", f"{observer} by amplitude of the output, noticed in time:", "", *_by_amplitude(group)]
@@ -126,11 +124,11 @@ def _by_amplitude(duffing: pd.DataFrame) -> list[str]:
     edges = np.quantile(duffing.amplitude, [0.0, 0.25, 0.5, 0.75, 1.0])
     quarter = pd.cut(duffing.amplitude, edges, include_lowest=True, labels=False)
     names = [f"{low:.1f} to {high:.1f}" for low, high in zip(edges, edges[1:])]  # noqa: RUF007
-    lines = ["| fault | " + " | ".join(names) + " |", "|---" * 5 + "|"]
-    for fault, rows in duffing.groupby("fault", sort=False):
-        shares = [f"{100 * (rows[quarter[rows.index] == i].score > 1).mean():.0f} %" for i in range(4)]
-        lines.append(f"| {fault} | " + " | ".join(shares) + " |")
-    return lines
+    rows = []
+    for fault, faulty in duffing.groupby("fault", sort=False):
+        shares = [f"{100 * (faulty[quarter[faulty.index] == i].score > 1).mean():.0f} %" for i in range(4)]
+        rows.append([str(fault), *shares])
+    return markdown.table(["fault", *names], rows)
 
 
 def _draw(path: Path, found: pd.DataFrame) -> None:

@@ -40,7 +40,7 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
     table = (out / "table.md").read_text()
     assert "Partial: 204 of 208 agents are missing" in table
     assert (out / "scores.png").stat().st_size > 1000
-    before = {path: path.stat().st_mtime_ns for path in out.glob("jobs/**/result.json")}
+    before = {path: path.stat().st_mtime_ns for path in out.glob("jobs/**/scores.json")}
     shutil.rmtree(out / "jobs" / "lorenz-0.5" / "y" / "1")
     toy(out, information=("y",)).run(Console())  # a narrower run reports all that is there
     again = pd.read_csv(out / "results.csv")
@@ -107,7 +107,7 @@ def test_a_recurrent_agent_is_a_case_like_others(tmp_path):
     (case,) = toy_cases(tmp_path, "recurrent")
     run_case(case)
     assert case.done
-    assert len(json.loads((case.folder / "result.json").read_text())["scores"]) == 3
+    assert len(json.loads((case.folder / "scores.json").read_text())["scores"]) == 3
 
 
 def test_cases():
@@ -149,11 +149,20 @@ def test_wrong_numbers(tmp_path):
             toy(tmp_path, **wrong).run(Console())
 
 
-def test_a_result_of_which_nobody_knows_what_it_is_of_is_no_result(tmp_path):
+def test_an_interrupted_training_is_of_one_comparison_as_well(tmp_path, monkeypatch):
+    def interrupted(case):
+        raise KeyboardInterrupt
+
     (case,) = toy_cases(tmp_path, "y")
-    case.folder.mkdir(parents=True)
-    (case.folder / "result.json").write_text("{}")
+    with monkeypatch.context() as patch:
+        patch.setattr(training.agents.comparison, "_run", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run_case(case)
     assert not case.done
+    with pytest.raises(ValueError, match="of another comparison: episodes = 3 there, 4 here"):
+        run_case(replace(case, episodes=4))
+    run_case(case)
+    assert case.done
 
 
 def test_one_agent_is_not_trained_twice_at_a_time(tmp_path):
