@@ -72,9 +72,12 @@ class LinearFilter:
         def function_of_A(values: np.ndarray) -> np.ndarray:
             return np.real((V * values) @ np.linalg.inv(V))
 
-        s = poles * dt
-        hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
-        late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
+        with np.errstate(all="ignore"):
+            s = poles * dt
+            hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
+            late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
+        if not (np.isfinite(hold).all() and np.isfinite(late).all()):
+            raise ValueError(f"dt = {dt!r} and the eigenvalues of A, {poles}, lead beyond the range of floats")
         nz, ny = B.shape
         blocks = 1 + nu
 

@@ -189,6 +189,12 @@ def test_wrong_dt_raises(dt):
         LinearFilter(DIAGONAL, np.ones((3, 1)), dt)
 
 
+@pytest.mark.parametrize(("A", "dt"), [(DIAGONAL, 1e308), (-1e-320 * np.eye(3), DT)])
+def test_sampling_intervals_beyond_floats(A, dt):
+    with pytest.raises(ValueError, match="beyond the range of floats"):
+        LinearFilter(A, np.ones((3, 1)), dt)
+
+
 @pytest.mark.parametrize("nu", [-1, 65, 10**9, 1.0, True, "1", None])
 def test_wrong_numbers_of_inputs_raise(nu):
     with pytest.raises(ValueError, match=f"number of inputs must be whole, from 0 to 64, got {nu!r}"):
