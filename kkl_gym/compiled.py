@@ -137,7 +137,7 @@ def _clipping() -> Callable[..., None] | None:
     except ImportError:
         return None
 
-    @numba.njit  # type: ignore[untyped-decorator]
+    @numba.njit
     def kernel(values: np.ndarray, low: np.ndarray, high: np.ndarray, out: np.ndarray) -> None:
         n, width = values.shape
         for row in range(n):
@@ -145,7 +145,7 @@ def _clipping() -> Callable[..., None] | None:
                 value = np.float32(values[row, i])
                 out[row, i] = low[i] if value < low[i] else high[i] if value > high[i] else value
 
-    return kernel  # type: ignore[no-any-return]
+    return kernel
 
 
 def _trials(system: System) -> tuple[np.ndarray, np.ndarray]:

@@ -153,7 +153,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             cost += weight * (xi - target) * (xi - target)
         return self._observation(), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
         return self.draw()
 
@@ -167,7 +167,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             from kkl_gym.rendering import Canvas
 
             self._canvas = Canvas(self.system, bool(estimates))
-        return self._canvas.draw(self._trail, estimates, self._u)  # type: ignore[no-any-return]
+        return self._canvas.draw(self._trail, estimates, self._u)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew

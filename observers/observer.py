@@ -293,7 +293,7 @@ class KKLObserver:
             return self._y
         y = self._invert(z, self._age * linear.dt) @ C.T
         z_next = linear.advance(z, self._y, u, y)
-        return np.asarray(self._invert(z_next, (self._age + 1) * linear.dt) @ C.T)
+        return self._invert(z_next, (self._age + 1) * linear.dt) @ C.T
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
@@ -406,7 +406,7 @@ class _Decoder:
             inputs[..., :width] = modes
             for i, condition in enumerate(conditions):
                 inputs[..., width + i] = condition
-        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)  # type: ignore[no-any-return]
+        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
 
 
 def _finite(values: np.ndarray) -> bool:

@@ -74,7 +74,7 @@ class SparseUpdate:
 def _kernel() -> Callable[..., None]:
     import numba
 
-    @numba.njit  # type: ignore[untyped-decorator]
+    @numba.njit
     def update(
         z: np.ndarray,
         terms: np.ndarray,
@@ -97,4 +97,4 @@ def _kernel() -> Callable[..., None]:
             for k in range(len(rows)):
                 z_next[row, rows[k]] += mixing[k] * z[row, columns[k]]
 
-    return update  # type: ignore[no-any-return]
+    return update

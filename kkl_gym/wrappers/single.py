@@ -97,7 +97,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._sample += 1
         return self._show(x_hat, info), float(reward), terminated, truncated, info
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """The phase portrait with state and estimate as an RGB image, or None without ``render_mode``."""
         base: KKLEnv = self.unwrapped  # type: ignore[assignment]
         return base.draw(self._trail)

@@ -46,7 +46,7 @@ class VectorEstimate(VectorWrapper):
         self._ended = np.zeros(env.num_envs, dtype=bool)
         self._sample = np.zeros(env.num_envs, dtype=int)
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
@@ -204,7 +204,7 @@ class VectorActionRepeat(VectorWrapper):
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
         self._ended = np.zeros(env.num_envs, dtype=bool)
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset the environments, or the rows of ``options["reset_mask"]``."""

@@ -50,7 +50,7 @@ class SB3VecEnv(VecEnv):
             raise ValueError("a vector environment takes the same options for all rows: set_options(a dictionary)")
         obs, info = self.env.reset(seed=seeds, options=dict(options[0]) or None)
         self.reset_infos = [_row(info, row, self._info_keys) for row in range(self.num_envs)]
-        return deepcopy(obs)  # type: ignore[no-any-return]
+        return deepcopy(obs)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions for :meth:`step_wait`."""

@@ -63,7 +63,7 @@ class Features(VectorWrapper):
         self._history = np.empty((env.num_envs, stacked, 0))
         self._still = np.zeros(env.num_envs, dtype=bool)  # rows whose episodes have ended, where nobody resets them
 
-    def reset(  # type: ignore[override]
+    def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
         """Reset the environments and what is remembered of them."""
