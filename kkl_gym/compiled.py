@@ -6,9 +6,10 @@ process.
 """
 
 import functools
-import importlib.util
+import logging
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,35 +20,104 @@ from observers.sparse import MANY_ROWS
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
 
+logger = logging.getLogger("kkl_gym")
+
 Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
 """(x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance_batch`."""
 
 
-def batch_step(system: System) -> Step:
+@dataclass(frozen=True)
+class BatchStep:
+    """One sampling interval of a batch, called as ``step(x, u, w, dt)``.
+
+    Parameters
+    ----------
+    advance : callable
+        Takes the step, as :func:`kkl_gym.simulate.advance_batch` does.
+    obstacle : str, optional
+        Why NumPy takes the step; None where compiled code does.
+    """
+
+    advance: Step
+    obstacle: str | None = None
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+        """Take the step.
+
+        Parameters
+        ----------
+        x : ndarray, shape (nx, n)
+            States, component first.
+        u : ndarray, shape (nu, n)
+            Inputs, held over the interval.
+        w : ndarray, shape (nx, n)
+            Process noise, held over the interval.
+        dt : float
+            Length of the interval in seconds.
+
+        Returns
+        -------
+        ndarray, shape (nx, n)
+            The next states; columns that escape are not finite.
+        """
+        return self.advance(x, u, w, dt)
+
+
+def batch_step(system: System) -> BatchStep:
     """One sampling interval of a batch: compiled if Numba and sympy are there and take the equations, else NumPy.
 
     The two agree to rounding. Equations that sympy cannot read, such as those with NumPy functions or ``if``, go on
-    with NumPy, and so do those with which the two disagree anywhere they are compared; :mod:`kkl_gym.elementary` has
-    functions that serve both. The equations must depend on nothing but state, input and parameters.
+    with NumPy. So do those with which the two disagree anywhere they are compared. :mod:`kkl_gym.elementary` has
+    functions that serve both. The equations must depend on nothing but state, input and parameters. The logger
+    ``kkl_gym`` says at level INFO, once for each system, that NumPy goes on and why.
+
+    Parameters
+    ----------
+    system : System
+        Whose equations are taken.
+
+    Returns
+    -------
+    BatchStep
+        The step, and why it is not compiled where it is not.
     """
     return _shared_step(type(system), tuple(system.parameters.items()))  # type: ignore[arg-type]
 
 
 @functools.lru_cache(maxsize=64)
-def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...]) -> Step:
+def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...]) -> BatchStep:
     system = kind(**dict(parameters))
-    if importlib.util.find_spec("numba") and importlib.util.find_spec("sympy"):
-        try:
-            return compiled_step(system)
-        except Exception:  # anything may come out of running a user's equations on symbols and compiling the result
-            pass
-    return functools.partial(advance_batch, system)
+    try:
+        return BatchStep(compiled_step(system))
+    # Anything may come out of a user's equations on symbols, or of Numba. NumPy then takes the equations as they are,
+    # and raises by itself what is wrong with them on numbers, too.
+    except Exception as error:
+        obstacle = f"{type(error).__name__}: {error}"
+        logger.info("%s goes on with NumPy, not compiled: %s", system.name, obstacle)
+        return BatchStep(functools.partial(advance_batch, system), obstacle)
 
 
 def compiled_step(system: System) -> Step:
-    """The compiled step of :func:`batch_step`; raises what sympy or Numba raise if they cannot take the equations.
+    """The compiled step of :func:`batch_step`.
 
-    ValueError if they are too long to compile in seconds, or the result is not what NumPy makes of them.
+    Parameters
+    ----------
+    system : System
+        Whose equations are taken.
+
+    Returns
+    -------
+    callable
+        From (x, u, w, dt) to the next states, as :class:`BatchStep`.
+
+    Raises
+    ------
+    ImportError
+        If Numba or sympy is not installed.
+    ValueError
+        If the equations are too long to compile in seconds, or the result is not what NumPy makes of them.
+    Exception
+        What sympy or Numba raise if they cannot take the equations.
     """
     import numba
     import sympy
@@ -117,11 +187,24 @@ def compiled_step(system: System) -> Step:
 
 
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Values, (..., width), as float32 within bounds, (width,)."""
+    """Values as float32 within bounds.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., width)
+        What is to be shown.
+    low, high : ndarray of float32, shape (width,)
+        The bounds.
+
+    Returns
+    -------
+    ndarray of float32, shape (..., width)
+        A copy.
+    """
     many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
     kernel = _clipping() if many else None
     if kernel is None:
-        out: np.ndarray = values.astype(np.float32)
+        out = values.astype(np.float32)
         np.maximum(out, low, out=out)
         np.minimum(out, high, out=out)
         return out

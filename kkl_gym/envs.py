@@ -2,20 +2,21 @@
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
 from kkl_gym.plant import Plant
+from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
 from kkl_gym.simulate import advance
 from kkl_gym.system import Box, System
 
-TRAIL = 1000  # samples that a rendered phase portrait shows
+_INTEGER = np.dtype(np.int64)
 
 
 class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
-    """One system, seen through noise.
+    r"""One system, seen through noise.
 
     x' = f(x) + g(x) u + w, y_k = h(x(t_k)) + v_k, simulated with the input and the process noise held over each
     sampling interval (paper, sec. 7, eq. sys-noisy).
@@ -30,8 +31,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     clipped to the system's declared bounds (for y, to the outputs that those bounds allow, widened by six standard
     deviations of the noise).
 
-    **Info.** ``y`` the noisy output, ``x`` the true state and, after a step, ``u`` the physical input that acted;
-    float64, never clipped. ``sample`` counts the sampling intervals since reset.
+    **Info.** ``y`` the noisy output, ``x`` the true state and ``u`` the physical input that acted, which is zero after
+    reset; float64, never clipped. ``sample``, an integer array of shape (), counts the sampling intervals since reset.
+    ``escaped`` says whether the state has left its declared bounds.
 
     **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
 
@@ -40,26 +42,44 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
     Parameters
     ----------
-    system : a name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
-    dt : sampling interval in seconds.
-    process_noise : bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
-        \\|w_i\\| <= process_noise * scale_i; None takes the system's own default.
-    measurement_noise : standard deviation of the Gaussian noise v on each sample of each output.
-    observe : "state" or "output".
-    parameters : physical parameters of the system, by name, where they differ from its defaults.
-    start_box : (low, high) of each state, where episodes start; None is the system's training box.
-    render_mode : None or "rgb_array".
+    system : str or System
+        A name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
+    dt : float
+        Sampling interval in seconds.
+    process_noise : float, optional
+        Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
+        \|w_i\| <= process_noise * scale_i. None takes the system's own default.
+    measurement_noise : float
+        Standard deviation of the Gaussian noise v on each sample of each output.
+    observe : {"state", "output"}
+        What the agent sees.
+    parameters : mapping of str to float, optional
+        Physical parameters of the system, by name, where they differ from its defaults.
+    start_box : tuple of (float, float), length nx, optional
+        (low, high) of each state, where episodes start; None is the system's training box.
+    render_mode : {None, "rgb_array"}
+        Whether :meth:`render` draws.
 
     Raises
     ------
-    ValueError : on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a
-        ``start_box`` that does not lie within the declared bounds.
+    ValueError
+        On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe`` or ``render_mode``,
+        and a ``start_box`` that does not lie within the declared bounds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kkl_gym import KKLEnv
+    >>> env = KKLEnv("lorenz", dt=0.02, observe="output")
+    >>> obs, info = env.reset(seed=0)
+    >>> obs.shape, info["x"].shape
+    ((1,), (3,))
+    >>> obs, reward, terminated, truncated, info = env.step(np.array([0.5]))
+    >>> info["u"], info["sample"]
+    (array([5.]), array(1))
     """
 
-    metadata: ClassVar[dict[str, Any]] = {  # type: ignore[misc]  # gymnasium declares it without ClassVar
-        "render_modes": ["rgb_array"],
-        "render_fps": 50,
-    }
+    metadata = render_metadata(0.01)
 
     def __init__(
         self,
@@ -82,9 +102,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             parameters=parameters,
             start_box=start_box,
         )
-        if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
-        self.render_mode = render_mode
+        check_render_mode(render_mode)
+        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt)
         self.system, self.dt, self.observe = self.plant.system, self.plant.dt, observe
         self.process_noise, self.measurement_noise = self.plant.process_noise, self.plant.measurement_noise
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
@@ -98,15 +117,32 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
-        self._canvas: Any = None
+        self._canvas: Canvas | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode, from ``options["x0"]`` (nx numbers) or uniformly in ``start_box``.
+        """Start an episode.
 
-        Raises ValueError if x0 has the wrong shape, is not finite, lies outside the declared bounds, or if
-        ``options`` holds an unknown key.
+        Parameters
+        ----------
+        seed : int, optional
+            Of starts and noise; None goes on with the generator as it is.
+        options : dict, optional
+            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            As described above.
+        info : dict
+            As described above.
+
+        Raises
+        ------
+        ValueError
+            If x0 has the wrong shape, is not finite, lies outside the declared bounds, or if ``options`` holds an
+            unknown key.
         """
         super().reset(seed=seed)
         if seed is not None:
@@ -124,10 +160,36 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._u = None
         self._trail.clear()
         self._trail.append(self._x)
-        return self._observation(), {"y": np.array(self._y), "x": np.array(self._x), "sample": 0}
+        return self._observation(), self._info([0.0] * self._nu, False)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Hold the input over one sampling interval; raises ValueError on an action of wrong shape or with NaN."""
+        """Hold the input over one sampling interval.
+
+        Parameters
+        ----------
+        action : array_like, shape (nu,)
+            Inputs over their bounds; values outside [-1, 1] are clipped.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            As described above.
+        reward : float
+            As described above.
+        terminated : bool
+            Whether the state left its declared bounds.
+        truncated : bool
+            False; a time limit is a wrapper's.
+        info : dict
+            As described above.
+
+        Raises
+        ------
+        ValueError
+            If the action has the wrong shape or holds NaN.
+        gymnasium.error.ResetNeeded
+            Before :meth:`reset`.
+        """
         if self._x is None:
             raise gym.error.ResetNeeded("call reset() before step()")
         u = self._input(action)
@@ -138,34 +200,49 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             self._x = tuple(x)
             self._y = self._measure(v)
         self._sample += 1
-        info = {
-            "y": np.array(self._y),
-            "x": np.array(self._x),
-            "u": np.array(u),
-            "sample": self._sample,
-            "escaped": escaped,
-        }
         if self.render_mode is not None:
             self._trail.append(self._x)
             self._u = u
         cost = 0.0
         for xi, (target, weight) in zip(self._x, self._goal):
             cost += weight * (xi - target) * (xi - target)
-        return self._observation(), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
+        return self._observation(), 1.0 / (1.0 + 4.0 * cost), escaped, False, self._info(u, escaped)
 
     def render(self) -> np.ndarray | None:
-        """The phase portrait so far as an RGB image (height, width, 3), or None without ``render_mode``."""
+        """Draw the phase portrait so far.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3), or None
+            An RGB image; None without ``render_mode``.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before :meth:`reset`.
+        ImportError
+            If matplotlib (the extra ``plots``) is not installed.
+        """
         return self.draw()
 
     def draw(self, estimates: Collection[Sequence[float]] = ()) -> np.ndarray | None:
-        """:meth:`render` with estimated states, (nx,) each, beside the true ones."""
+        """Draw the phase portrait with estimated states beside the true ones.
+
+        Parameters
+        ----------
+        estimates : collection of sequences of float, length nx
+            Estimates so far, the latest last.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3), or None
+            As :meth:`render`, and the same exceptions are raised.
+        """
         if self.render_mode is None:
             return None
         if self._x is None:
             raise gym.error.ResetNeeded("call reset() before render()")
         if self._canvas is None or self._canvas.estimates != bool(estimates):
-            from kkl_gym.rendering import Canvas
-
             self._canvas = Canvas(self.system, bool(estimates))
         return self._canvas.draw(self._trail, estimates, self._u)
 
@@ -196,6 +273,15 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.observe == "state":  # within the bounds by construction
             return np.array(self._x, dtype=np.float32)
         return np.array([max(low, min(high, y)) for y, (low, high) in zip(self._y, self._limits)], dtype=np.float32)
+
+    def _info(self, u: list[float], escaped: bool) -> dict[str, Any]:
+        return {
+            "y": np.array(self._y),
+            "x": np.array(self._x),
+            "u": np.array(u),
+            "sample": np.array(self._sample, _INTEGER),
+            "escaped": escaped,
+        }
 
     def _next_noise(self) -> tuple[list[float], list[float]]:
         """One sample of (w, v)."""

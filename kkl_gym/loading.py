@@ -14,9 +14,24 @@ Class = TypeVar("Class")
 
 
 def load_class(name: str, base: type[Class]) -> type[Class]:
-    """The subclass of ``base`` named ``"package.module:Class"`` or ``"path/to/script.py:Class"``.
+    """Find a subclass by where it is written.
 
-    Raises ValueError if it cannot be found or is no subclass of ``base``.
+    Parameters
+    ----------
+    name : str
+        ``"package.module:Class"`` or ``"path/to/script.py:Class"``.
+    base : type
+        What it must be a subclass of.
+
+    Returns
+    -------
+    type
+        The class.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be found or is not a subclass of ``base``.
     """
     where, _, class_name = name.rpartition(":")
     try:

@@ -16,19 +16,52 @@ NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single 
 
 
 class Plant:
-    """A system, its sampling interval, its noise and the spaces that follow; parameters are those of :class:`KKLEnv`.
+    """A system, its sampling interval, its noise and the spaces that follow.
+
+    Parameters
+    ----------
+    system : str or System
+        A name, ``"module:Class"``, ``"script.py:Class"``, or a system.
+    dt : float
+        Sampling interval in seconds.
+    process_noise : float or None
+        Bound of the uniform process noise as a multiple of the system's ``scale`` per second; None takes the system's
+        own default.
+    measurement_noise : float
+        Standard deviation of the Gaussian noise on each sample of each output.
+    observe : {"state", "output"}
+        What the observation space is of.
+    parameters : mapping of str to float or None
+        Physical parameters of the system, by name, where they differ from its defaults.
+    start_box : tuple of (float, float), length nx, or None
+        (low, high) of each state, where episodes start; None is the system's training box.
 
     Attributes
     ----------
-    system, dt, process_noise, measurement_noise, observe : as given, with defaults filled in.
-    start_box : low and high corner, each (nx,), of where episodes start.
-    state_space, output_space : boxes of the states within the declared bounds and of the outputs that they allow.
-    observation_space : that of the two which ``observe`` names.
-    action_space : ``Box(-1, 1, (nu,))``.
-    weights : of the squared deviations from the target in the reward's cost, (nx,).
+    system : System
+        The system, with its parameters.
+    dt, process_noise, measurement_noise : float
+        As given, with defaults filled in.
+    observe : str
+        As given.
+    start_box : (ndarray, ndarray), shape (nx,) each
+        Low and high corner of where episodes start.
+    state_space : gymnasium.spaces.Box, shape (nx,)
+        States within the declared bounds.
+    output_space : gymnasium.spaces.Box, shape (ny,)
+        Outputs that those bounds allow, widened by six standard deviations of the noise.
+    observation_space : gymnasium.spaces.Box
+        Which of the two ``observe`` names.
+    action_space : gymnasium.spaces.Box, shape (nu,)
+        ``Box(-1, 1)``.
+    weights : ndarray, shape (nx,)
+        Weights of the squared deviations from the target in the reward's cost.
 
-    Raises ValueError on an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a
-    ``start_box`` that does not lie within the declared bounds.
+    Raises
+    ------
+    ValueError
+        On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a ``start_box``
+        that does not lie within the declared bounds.
     """
 
     def __init__(
@@ -65,21 +98,69 @@ class Plant:
     def draw_noise(
         self, rng: np.random.Generator, w: np.ndarray | None = None, v: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """``NOISE_BLOCK`` samples for :meth:`noise` to scale, (samples, nx) and (samples, ny); in w and v, if given."""
+        """Draw ``NOISE_BLOCK`` samples, which :meth:`noise` scales.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Draws them.
+        w : ndarray, shape (NOISE_BLOCK, nx), optional
+            Takes the samples of the process noise.
+        v : ndarray, shape (NOISE_BLOCK, ny), optional
+            Takes the samples of the measurement noise.
+
+        Returns
+        -------
+        w : ndarray, shape (NOISE_BLOCK, nx)
+            Uniform in [0, 1).
+        v : ndarray, shape (NOISE_BLOCK, ny)
+            Standard normal.
+        """
         n, nx, ny = NOISE_BLOCK, self.system.nx, self.system.ny
         return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Process noise w and measurement noise v of what was drawn, (..., nx) and (..., ny)."""
+        """Scale what was drawn.
+
+        Parameters
+        ----------
+        drawn_w : ndarray, shape (..., nx)
+            Uniform in [0, 1).
+        drawn_v : ndarray, shape (..., ny)
+            Standard normal.
+
+        Returns
+        -------
+        w : ndarray, shape (..., nx)
+            Process noise, in units of the state per second.
+        v : ndarray, shape (..., ny)
+            Measurement noise, in units of the output.
+        """
         return (drawn_w - 0.5) * self._w_range, drawn_v * self.measurement_noise
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
-        """A start uniform in ``start_box``, (nx,)."""
+        """A start drawn uniformly in ``start_box``, shape (nx,)."""
         low, high = self.start_box
         return rng.uniform(low, high)
 
     def start(self, x0: Any) -> np.ndarray:
-        """The start that a user asks for, (nx,); raises ValueError if it is no state within the declared bounds."""
+        """The start that a user asks for.
+
+        Parameters
+        ----------
+        x0 : array_like, shape (nx,)
+            What the user passed.
+
+        Returns
+        -------
+        ndarray, shape (nx,)
+            The start.
+
+        Raises
+        ------
+        ValueError
+            If it is no state within the declared bounds.
+        """
         start = np.asarray(x0, dtype=float)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
@@ -98,14 +179,25 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 
 
 def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """Low and high, each (ny,), of h over the declared bounds, widened by ``margin``.
+    """Bounds of the output h(x) over the declared bounds of the state.
 
     Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    margin : float
+        How much wider the bounds shall be on either side.
+
+    Returns
+    -------
+    low, high : ndarray, shape (ny,)
+        The bounds.
     """
     ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
-    points = np.array(np.meshgrid(*ends, indexing="ij")).reshape(system.nx, -1)
-    y = np.array([np.broadcast_to(yi, points.shape[1:]) for yi in system.h(points)])
-    return y.min(1) - margin, y.max(1) + margin
+    y = system.output(np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, system.nx))
+    return y.min(0) - margin, y.max(0) + margin
 
 
 def _float32_box(low: Any, high: Any) -> gym.spaces.Box:

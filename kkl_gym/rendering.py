@@ -1,5 +1,6 @@
 """The phase portrait that ``render_mode="rgb_array"`` shows."""
 
+from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -8,19 +9,95 @@ import numpy as np
 from kkl_gym.system import Box, System
 
 STATE, ESTIMATE, TARGET = "0.2", "C3", "C2"
+TRAIL = 1000  # samples that a phase portrait shows
+FRAMES = 100  # a second at most, about what players and screens keep up with
+
+
+def render_metadata(dt: float) -> dict[str, Any]:
+    """What environments say of their rendering: the modes, and the frames a second that show a motion as it is.
+
+    Parameters
+    ----------
+    dt : float
+        Seconds between two frames.
+
+    Returns
+    -------
+    dict
+        ``render_modes`` and ``render_fps``. Motions sampled faster than ``FRAMES`` times a second are shown slower.
+    """
+    return {"render_modes": ["rgb_array"], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
+
+
+def check_render_mode(render_mode: str | None) -> None:
+    """Raise an error unless ``render_mode`` is one that environments offer.
+
+    Parameters
+    ----------
+    render_mode : str, optional
+        The mode, or None.
+
+    Raises
+    ------
+    ValueError
+        If the mode is unknown.
+    """
+    modes = render_metadata(1.0)["render_modes"]
+    if render_mode not in (None, *modes):
+        raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
+
+
+class Trails:
+    """The last ``TRAIL`` states of each row of a vector environment, since its episode began.
+
+    Parameters
+    ----------
+    num_envs : int
+        How many rows there are.
+
+    Attributes
+    ----------
+    rows : list of deque
+        For each row its states, a list of nx numbers each, the latest last.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.rows: list[deque[list[float]]] = [deque(maxlen=TRAIL) for _ in range(num_envs)]
+
+    def add(self, states: np.ndarray, samples: np.ndarray) -> None:
+        """Take in one state of each row; sample 0 begins a trail.
+
+        Parameters
+        ----------
+        states : ndarray, shape (num_envs, nx)
+            States, or estimates of them.
+        samples : ndarray of int, shape (num_envs,)
+            Samples since the episode began.
+        """
+        for trail, state, sample in zip(self.rows, states.tolist(), samples.tolist(), strict=True):
+            if sample == 0:
+                trail.clear()
+            trail.append(state)
 
 
 class Canvas:
     """A phase portrait of two of a system's states: target, true trail, estimates, and the input as a bar.
 
     What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
+
     Parameters
     ----------
-    system : whose states.
-    estimates : whether there are any.
-    box : of the states to show, with a margin; None is the training box.
+    system : System
+        Whose states are shown.
+    estimates : bool
+        Whether there are estimates to show.
+    box : tuple of (float, float), length nx, optional
+        (low, high) of each state to show, with a margin; None is the training box.
 
-    Raises ImportError with the remedy if matplotlib (the extra ``plots``) is not estimator.
+    Raises
+    ------
+    ImportError
+        If matplotlib (the extra ``plots``) is not installed.
     """
 
     def __init__(self, system: System, estimates: bool = False, box: Box | None = None) -> None:
@@ -59,11 +136,23 @@ class Canvas:
         self,
         trail: Iterable[Sequence[float]],
         estimates: Iterable[Sequence[float]] = (),
-        u: Sequence[float] | None = None,
+        u: Sequence[float] | np.ndarray | None = None,
     ) -> np.ndarray:
-        """The portrait as an RGB image, uint8, (height, width, 3).
+        """Draw one frame.
 
-        trail, estimates : true and estimated states so far, the latest last; u : the input that acts, or None.
+        Parameters
+        ----------
+        trail : iterable of sequences of float, length nx
+            True states so far, the latest last.
+        estimates : iterable of sequences of float, length nx
+            Estimated states so far, the latest last.
+        u : sequence of float, length nu, optional
+            The input that acts; None is zero.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3)
+            The portrait as an RGB image.
         """
         self._canvas.restore_region(self._still)
         for states, artists in zip((trail, estimates), self._lines, strict=True):

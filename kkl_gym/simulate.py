@@ -15,7 +15,7 @@ import numpy as np
 from kkl_gym.system import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
-# motion's size from anywhere in twice its training box (tests/test_simulate.py); it is half of that.
+# motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
 RATE_STEP = 0.4
 # A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
@@ -43,9 +43,19 @@ VectorField = Callable[[Any], Any]
 def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, int], tuple[Any, ...]]:
     """The Runge–Kutta step of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
 
-    The function returned, ``integrate(f, x, d, h, n)``, makes ``n`` steps of length ``h`` of x' = f(x) + d with d
-    constant, all components Python floats. Written out (as :mod:`dataclasses` writes ``__init__``) it is several times
-    as fast as loops over stages and components.
+    Written out (as :mod:`dataclasses` writes ``__init__``) it is several times as fast as loops over stages and
+    components.
+
+    Parameters
+    ----------
+    nx : int
+        Number of components.
+
+    Returns
+    -------
+    callable
+        ``integrate(f, x, d, h, n)`` makes ``n`` steps of length ``h`` of x' = f(x) + d with d constant. All components
+        are Python floats.
     """
     components = range(nx)
 
@@ -67,12 +77,28 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
     lines += [f"    return {unpacked('x')}"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
-    integrate: Callable[..., tuple[Any, ...]] = namespace["integrate"]
-    return integrate
+    return namespace["integrate"]
 
 
 def forced(system: System, u: Components, w: Components) -> tuple[VectorField, Components]:
-    """The vector field of x' = f(x) + g(x) u + w with u and w held, split into (field, constant part)."""
+    """Split x' = f(x) + g(x) u + w, with u and w held, into a vector field and a constant part.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    u : sequence of length nu
+        Input.
+    w : sequence of length nx
+        Process noise.
+
+    Returns
+    -------
+    field : callable
+        From components of the state to components of a derivative.
+    constant : sequence of length nx
+        What is added to it: g u + w where g is constant, else w.
+    """
     if type(system).g is System.g:
         if len(u) == 0:
             return system.f, w
@@ -96,10 +122,21 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Parameters
     ----------
-    x, u, w : nx, nu and nx floats; u and w are held over the interval.
-    dt : its length in seconds.
+    system : System
+        The system.
+    x : sequence of float, length nx
+        State at the start of the interval.
+    u : sequence of float, length nu
+        Input, held over the interval.
+    w : sequence of float, length nx
+        Process noise, held over the interval.
+    dt : float
+        Length of the interval in seconds.
 
-    Returns the nx components of the next state, which may be infinite or NaN if the motion escapes.
+    Returns
+    -------
+    sequence of float, length nx
+        State at the end. It may be infinite or NaN if the motion escapes.
     """
     try:
         need = system.rate(x) * dt * PER_RATE
@@ -119,10 +156,21 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Parameters
     ----------
-    x, u, w : component-first arrays, shapes (nx, n), (nu, n) and (nx, n).
-    dt : length of the interval in seconds.
+    system : System
+        The system.
+    x : ndarray, shape (nx, n)
+        States at the start of the interval, component first.
+    u : ndarray, shape (nu, n)
+        Inputs, held over the interval.
+    w : ndarray, shape (nx, n)
+        Process noise, held over the interval.
+    dt : float
+        Length of the interval in seconds.
 
-    Returns the next states, shape (nx, n); rows that escape are NaN.
+    Returns
+    -------
+    ndarray, shape (nx, n)
+        States at the end; columns that escape are NaN.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
@@ -172,21 +220,29 @@ def simulate(
 
     Parameters
     ----------
-    system : the system.
-    x0 : starts, shape (n, nx).
-    steps : number of sampling intervals.
-    dt : their length in seconds.
-    u, w : input and process noise held over each interval, shapes (steps, n, nu) and (steps, n, nx);
-        None is zero.
+    system : System
+        The system.
+    x0 : ndarray, shape (n, nx)
+        Starts.
+    steps : int
+        Number of sampling intervals.
+    dt : float
+        Length of an interval in seconds.
+    u : ndarray, shape (steps, n, nu), optional
+        Inputs, held over each interval; None is zero.
+    w : ndarray, shape (steps, n, nx), optional
+        Process noise, held over each interval; None is zero.
 
     Returns
     -------
-    States at t = 0, dt, ..., steps * dt, shape (steps + 1, n, nx). A trajectory that leaves the declared bounds
-    of its system is NaN from there on.
+    ndarray, shape (steps + 1, n, nx)
+        States at t = 0, dt, ..., steps * dt. A trajectory that leaves the declared bounds of its system is NaN from
+        there on.
 
     Raises
     ------
-    ValueError : if a shape is wrong, dt is not positive, or a start is not finite.
+    ValueError
+        If a shape is wrong, dt is not positive, or a start is not finite.
     """
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
@@ -215,6 +271,17 @@ def simulate(
 
 
 def check_dt(dt: float) -> None:
-    """Raise ValueError unless ``dt`` is a positive, finite number of seconds."""
+    """Raise an error unless ``dt`` is a sampling interval.
+
+    Parameters
+    ----------
+    dt : float
+        Sampling interval in seconds.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive, finite number.
+    """
     if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
         raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")

@@ -4,6 +4,7 @@ Every equation is written once, on components, in plain arithmetic. The same met
 floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) and sympy symbols (formulas).
 """
 
+import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -26,17 +27,39 @@ class System:
     A subclass is decorated with ``@dataclass(frozen=True)``, sets the class variables below and defines
     :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one.
 
-    Class variables
-    ---------------
-    name : identifies the system in artifacts and error messages.
-    state_names : names of the states with their units, for plots and documentation.
-    X : training box, (low, high) of each state: where starts are drawn and observers are trained.
-    bounds : declared bounds, (low, high) of each state: an episode ends where the state leaves them.
-    u_max : bound of each input; the default, none, makes an autonomous system.
-    G : constant input matrix, ``nx`` rows of ``nu`` numbers; override :meth:`g` where it depends on the state.
-    scale : typical size of each state, for the reward and the process noise; default: the training box's half-width.
-    portrait : the two states that a phase portrait shows, by index; default: the first and the last.
-    process_noise : default bound of the process noise as a multiple of ``scale`` per second.
+    Parameters
+    ----------
+    **parameters : float
+        Physical parameters, by the names that the subclass gives them.
+
+    Attributes
+    ----------
+    name : str
+        Identifies the system in artifacts and error messages.
+    state_names : tuple of str, length nx
+        Names of the states with their units, for plots and documentation. The default is x1, x2, ...
+    X : tuple of (float, float), length nx
+        Training box, (low, high) of each state: where starts are drawn and observers are trained.
+    bounds : tuple of (float, float), length nx
+        Declared bounds, (low, high) of each state: an episode ends where the state leaves them.
+    u_max : tuple of float, length nu
+        Bound of each input. The default, none, makes an autonomous system.
+    G : tuple of tuple of float, shape (nx, nu)
+        Constant input matrix. Override :meth:`g` where it depends on the state.
+    scale : tuple of float, length nx
+        Typical size of each state, for the reward and the process noise. The default is the training box's half-width.
+    portrait : (int, int)
+        The two states that a phase portrait shows, by index. The default is the first and the last.
+    process_noise : float
+        Default bound of the process noise as a multiple of ``scale`` per second.
+
+    Raises
+    ------
+    TypeError
+        If a class variable is missing or does not fit the others, as soon as the subclass is defined. If the subclass
+        has parameters and lacks ``@dataclass(frozen=True)``, when an instance is made.
+    ValueError
+        If a parameter is not a finite number.
     """
 
     name: ClassVar[str]
@@ -76,7 +99,7 @@ class System:
             raise TypeError(f"{cls.__name__}: state_names = {cls.state_names} must name {nx} states")
 
     def __post_init__(self) -> None:
-        for name, kind in vars(type(self)).get("__annotations__", {}).items():
+        for name, kind in inspect.get_annotations(type(self)).items():
             if name not in self.parameters and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
@@ -111,33 +134,108 @@ class System:
 
     @property
     def target(self) -> tuple[float, ...]:
-        """The equilibrium that a controller should hold, shape (nx,); default: the origin."""
+        """The equilibrium that a controller should hold, nx numbers; default: the origin."""
         return (0.0,) * self.nx
 
     def f(self, x: Components) -> Components:
-        """Drift: ``nx`` components of the state in, ``nx`` components of f(x) out."""
+        """Drift f(x).
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state: floats, arrays, tensors or symbols.
+
+        Returns
+        -------
+        sequence of length nx
+            Components of f(x), each of the kind that the components of ``x`` are, or a number.
+
+        Raises
+        ------
+        NotImplementedError
+            If the subclass does not define it.
+        """
         raise NotImplementedError(f"{type(self).__name__} does not define f")
 
     def g(self, x: Components) -> Sequence[Components]:
-        """Input matrix g(x): ``nx`` rows of ``nu`` entries; default: the constant ``G``."""
+        """Input matrix g(x); default: the constant ``G``.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state.
+
+        Returns
+        -------
+        sequence of sequences, shape (nx, nu)
+            Rows of g(x).
+        """
         return self.G or ((),) * self.nx
 
     def h(self, x: Components) -> Components:
-        """Output map: ``ny`` components of h(x)."""
+        """Output map h(x).
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state.
+
+        Returns
+        -------
+        sequence of length ny
+            Components of h(x).
+
+        Raises
+        ------
+        NotImplementedError
+            If the subclass does not define it.
+        """
         raise NotImplementedError(f"{type(self).__name__} does not define h")
 
     def output(self, x: np.ndarray) -> np.ndarray:
-        """h on states of shape (..., nx), as (..., ny)."""
+        """Outputs h(x) of many states.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., nx)
+            States.
+
+        Returns
+        -------
+        ndarray, shape (..., ny)
+            Outputs without noise.
+        """
         return on_states(self.h, x)
 
     def drift(self, x: np.ndarray) -> np.ndarray:
-        """f on states of shape (..., nx), as (..., nx)."""
+        """Drift f(x) of many states.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., nx)
+            States.
+
+        Returns
+        -------
+        ndarray, shape (..., nx)
+            Their derivatives without input and noise.
+        """
         return on_states(self.f, x)
 
     def rate(self, x: Components) -> Any:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
 
-        The default differentiates f numerically; override it with a formula where single steps must be fast.
+        The default differentiates f numerically. Override it with a formula where single steps must be fast.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state.
+
+        Returns
+        -------
+        float, or of the kind that the components of ``x`` are
+            The rate in 1/s.
         """
         fx, eps = self.f(x), 1e-6
         total = 0.0
@@ -147,12 +245,39 @@ class System:
         return total**0.5
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Low and high corner, each (nx,), of the training box multiplied by ``factor``."""
+        """Corners of the training box.
+
+        Parameters
+        ----------
+        factor : float
+            What both corners are multiplied with.
+
+        Returns
+        -------
+        low, high : ndarray, shape (nx,)
+            The corners.
+        """
         low, high = np.array(self.X).T * factor
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
-        """The same system with some parameters changed; raises ValueError on an unknown name."""
+        """The same system with some parameters changed.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float
+            New values by name.
+
+        Returns
+        -------
+        System
+            An instance of the same class.
+
+        Raises
+        ------
+        ValueError
+            If a name is unknown or a value is not a finite number.
+        """
         known = self.parameters
         for name in parameters:
             if name not in known:
@@ -161,7 +286,20 @@ class System:
 
 
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
-    """A system's f or h, which take and give components, on an array of states (..., nx), as (..., components)."""
+    """Evaluate a system's f or h, which take and give components, on an array of states.
+
+    Parameters
+    ----------
+    equations : callable
+        From a sequence of nx components to a sequence of m components.
+    x : ndarray, shape (..., nx)
+        States.
+
+    Returns
+    -------
+    ndarray, shape (..., m)
+        The values. Components that do not depend on the state are repeated.
+    """
     return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in equations(np.moveaxis(x, -1, 0))], axis=-1)
 
 

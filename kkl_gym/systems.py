@@ -45,6 +45,11 @@ class VanDerPol(System):
 
     x1' = x2, x2' = mu (1 - x1^2) x2 - x1 + u. Dimensionless; the origin is unstable and every other motion tends
     to the limit cycle. Stiff far from it: d(x2')/d(x2) = -297 at x1 = 10.
+
+    Parameters
+    ----------
+    mu : float
+        Strength of the damping, which is negative where x1^2 < 1.
     """
 
     mu: float = 3.0
@@ -75,6 +80,15 @@ class Rossler(System):
     x1' = -x2 - x3 + u, x2' = x1 + a x2, x3' = b + x3 (x1 - c). Dimensionless; chaotic at the default parameters.
     Some starts outside the training box escape to infinity. The target is the inner equilibrium, which no static
     gain on y stabilises through this input.
+
+    Parameters
+    ----------
+    a : float
+        Growth of x2.
+    b : float
+        Constant part of x3'.
+    c : float
+        The x1 above which x3 grows.
     """
 
     a: float = 0.2
@@ -117,6 +131,15 @@ class Lorenz(System):
     x1' = sigma (x2 - x1), x2' = x1 (rho - x3) - x2 + u, x3' = x1 x2 - beta x3. Dimensionless; chaotic at the default
     parameters. The paper prints the first two parameters swapped (p = 28, q = 10), with which the motion settles on
     an equilibrium; ``Lorenz(sigma=28, rho=10)`` is that system. The target is the equilibrium C+.
+
+    Parameters
+    ----------
+    sigma : float
+        Prandtl number.
+    rho : float
+        Rayleigh number over its critical value.
+    beta : float
+        Geometric factor of the convection cells.
     """
 
     sigma: float = 10.0
@@ -157,13 +180,21 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
 
     Parameters
     ----------
-    system : a shipped name (``"van_der_pol"``), a class of the user's as ``"package.module:Class"`` or
+    system : str, System or type of System
+        A shipped name (``"van_der_pol"``), a class of the user's as ``"package.module:Class"`` or
         ``"path/to/script.py:Class"``, or a :class:`System` (class or instance) itself.
-    parameters : physical parameters by name.
+    parameters : mapping of str to float, optional
+        Physical parameters by name.
+
+    Returns
+    -------
+    System
+        An instance with these parameters.
 
     Raises
     ------
-    ValueError : if the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
+    ValueError
+        If the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
     """
     if isinstance(system, str):
         system = _find(system)
@@ -184,11 +215,28 @@ def _find(name: str) -> type[System]:
     return load_class(name, System)
 
 
-__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system"]
-
-
 def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it."""
+    """The system that an artifact was made for, checked against it.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        What was learned.
+    given : str, optional
+        Where the system is to be found, as for :func:`get_system`; None stands for a shipped system.
+
+    Returns
+    -------
+    System
+        An instance with the artifact's parameters.
+
+    Raises
+    ------
+    ValueError
+        If ``given`` is None and the system is not a shipped one, or if ``given`` cannot be found.
+    observers.ArtifactError
+        If the artifact was made for another system.
+    """
     if given is None and artifact.system not in SYSTEMS:
         raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
     base = get_system(given or artifact.system)
@@ -196,3 +244,6 @@ def system_of(artifact: Artifact, given: str | None) -> System:
         base = base.replace(artifact.parameters)
     artifact.check(base.name, base.parameters, dt=artifact.filter.dt, ny=base.ny, nu=base.nu)
     return base
+
+
+__all__ = ["SYSTEMS", "Lorenz", "ReverseDuffing", "Rossler", "System", "VanDerPol", "get_system", "system_of"]

@@ -12,6 +12,7 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import batch_step
 from kkl_gym.plant import NOISE_BLOCK, Plant
+from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.system import Box, System
 
 Infos = dict[str, Any]
@@ -28,18 +29,49 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     **Autoreset modes.** ``NEXT_STEP``: the step after an episode's end ignores that row's action and resets it.
     ``SAME_STEP``: the row is reset at once, the episode's last observation and info are in ``info["final_obs"]`` and
     ``info["final_info"]``. ``DISABLED``: a row that has ended stays as it is, with reward 0 and its flags still set,
-    until ``reset(options={"reset_mask": mask})``.
+    until ``reset(options={"reset_mask": mask})``. Its ``u`` and ``escaped`` are then not reported.
 
     Parameters
     ----------
-    system, dt, process_noise, measurement_noise, observe, parameters, start_box : as for :class:`KKLEnv`.
-    num_envs : how many.
-    max_episode_steps : steps after which an episode is truncated; ``gym.make_vec`` passes what is registered.
-    autoreset_mode : one of Gymnasium's, see above.
+    system : str or System
+        As for :class:`KKLEnv`.
+    num_envs : int
+        How many.
+    dt : float
+        Sampling interval in seconds.
+    process_noise : float, optional
+        As for :class:`KKLEnv`.
+    measurement_noise : float
+        As for :class:`KKLEnv`.
+    observe : {"state", "output"}
+        What the agent sees.
+    parameters : mapping of str to float, optional
+        As for :class:`KKLEnv`.
+    start_box : tuple of (float, float), length nx, optional
+        As for :class:`KKLEnv`.
+    render_mode : {None, "rgb_array"}
+        Whether :meth:`render` draws.
+    max_episode_steps : int, optional
+        Steps after which an episode is truncated; ``gym.make_vec`` passes what is registered.
+    autoreset_mode : str or gymnasium.vector.AutoresetMode
+        One of Gymnasium's, see above.
 
     Raises
     ------
-    ValueError : as :class:`KKLEnv`, and if ``num_envs`` or ``max_episode_steps`` is not a positive integer.
+    ValueError
+        As :class:`KKLEnv`, and if ``num_envs`` or ``max_episode_steps`` is not a positive integer.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kkl_gym import KKLVectorEnv
+    >>> envs = KKLVectorEnv("van_der_pol", 3, max_episode_steps=100)
+    >>> obs, info = envs.reset(seed=0)
+    >>> obs.shape, info["y"].shape
+    ((3, 2), (3, 1))
+    >>> obs, reward, terminated, truncated, info = envs.step(np.ones((3, 1)))
+    >>> info["u"].tolist(), info["sample"].tolist()
+    ([[5.0], [5.0], [5.0]], [1, 1, 1])
     """
 
     def __init__(
@@ -53,6 +85,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,
+        render_mode: str | None = None,
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
@@ -71,7 +104,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {"autoreset_mode": self.autoreset_mode}
+        check_render_mode(render_mode)
+        self.render_mode = render_mode
+        self.metadata = {**render_metadata(self.plant.dt), "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = self.plant.observation_space
         self.single_action_space = self.plant.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -90,9 +125,21 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._everyone = np.arange(num_envs)
         self._x = np.full((nx, num_envs), np.nan)  # component first, as everything inside
         self._y = np.full((ny, num_envs), np.nan)
-        self._sample = np.zeros(num_envs, dtype=int)
+        self._sample = np.zeros(num_envs, dtype=np.int64)
         self._terminated, self._truncated = np.zeros((2, num_envs), dtype=bool)
         self._ready = False
+        self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
+        self._trails = None if render_mode is None else Trails(self.num_envs)
+        self._canvas: Canvas | None = None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether steps run as compiled code (the extra ``fast``); compiles them if no step has done so.
+
+        Where they do not, the logger ``kkl_gym`` has said why at level INFO, and
+        ``kkl_gym.compiled.batch_step(env.system).obstacle`` says it again.
+        """
+        return batch_step(self.system).obstacle is None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -101,11 +148,25 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         Parameters
         ----------
-        seed : for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
-        options : ``"x0"``: starts, (nx,) for all or (num_envs, nx), otherwise uniform in ``start_box``;
-            ``"reset_mask"``: boolean (num_envs,), the rows to reset, otherwise all.
+        seed : int or sequence of int or None, length num_envs, optional
+            One for each row, or one number n for n, n + 1, ...; None goes on with the generators as they are.
+        options : mapping, optional
+            ``"x0"`` is the start, shape (nx,) for all or (num_envs, nx), which is otherwise uniform in ``start_box``.
+            ``"reset_mask"``, boolean of shape (num_envs,), says which rows to reset, otherwise all.
 
-        Raises ValueError on unknown options, wrong shapes and starts outside the declared bounds.
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Of all rows.
+        info : dict
+            Of all rows, with masks of those that were reset.
+
+        Raises
+        ------
+        ValueError
+            On unknown options, wrong shapes, wrong seeds and starts outside the declared bounds.
+        gymnasium.error.ResetNeeded
+            If some rows are to be reset before all have been.
         """
         given, mask = with_mask(options, self.num_envs)
         x0 = (given or {}).get("x0")
@@ -130,14 +191,41 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._used[row] = NOISE_BLOCK
         self._begin(np.array(rows), starts)
         self._ready = True
+        self._trace()
         return self._observation(), self._info(mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Hold the inputs, (num_envs, nu), over one sampling interval; raises ValueError on a wrong shape or NaN."""
+        """Hold the inputs over one sampling interval.
+
+        Parameters
+        ----------
+        actions : array_like, shape (num_envs, nu)
+            Inputs over their bounds; values outside [-1, 1] are clipped.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Of all rows.
+        rewards : ndarray, shape (num_envs,)
+            0 in rows that began anew instead, or stay at their end.
+        terminated, truncated : ndarray of bool, shape (num_envs,)
+            Whether a row's state left its declared bounds, or its time is over.
+        info : dict
+            Of all rows, with masks of those that reported it.
+
+        Raises
+        ------
+        ValueError
+            On a wrong shape or NaN.
+        gymnasium.error.ResetNeeded
+            Before :meth:`reset`.
+        """
         if not self._ready:
             raise gym.error.ResetNeeded("call reset() before step()")
         u = self._inputs(actions)
+        self._u = u
         over = self._terminated | self._truncated
+        info: Infos = {}
         if not over.any():
             reward = self._move(self._everyone, u)
         else:
@@ -145,15 +233,63 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             reward = np.zeros(self.num_envs)
             if len(rows):
                 reward[rows] = self._move(rows, u[:, rows])
+            u[:, over] = 0.0
             if self.autoreset_mode is AutoresetMode.NEXT_STEP:
                 self._begin(np.flatnonzero(over))
+            else:
+                info = {"_u": ~over, "_escaped": ~over}
         terminated, truncated = self._terminated.copy(), self._truncated.copy()
-        info = self._info(np.ones(self.num_envs, dtype=bool))
-        info |= {"u": u.T * ~over[:, None], "_u": ~over, "escaped": terminated.copy(), "_escaped": ~over}
+        info = self._info(np.ones(self.num_envs, dtype=bool)) | info
         ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and ended.any():
-            info = self._restart(ended, info)
+            final = last_of_episodes(self._observation(), info, ended)
+            self._begin(np.flatnonzero(ended))
+            info = self._info(np.ones(self.num_envs, dtype=bool)) | final
+        self._trace()
         return self._observation(), reward, terminated, truncated, info
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw the phase portrait of each row so far.
+
+        Returns
+        -------
+        tuple of ndarray of uint8, shape (height, width, 3), length num_envs, or None
+            RGB images; None without ``render_mode``.
+
+        Raises
+        ------
+        gymnasium.error.ResetNeeded
+            Before :meth:`reset`.
+        ImportError
+            If matplotlib (the extra ``plots``) is not installed.
+        """
+        return self.draw()
+
+    def draw(self, estimates: Trails | None = None) -> tuple[np.ndarray, ...] | None:
+        """Draw the phase portraits with estimated states beside the true ones.
+
+        Parameters
+        ----------
+        estimates : Trails, optional
+            Estimates of each row's states.
+
+        Returns
+        -------
+        tuple of ndarray of uint8, shape (height, width, 3), length num_envs, or None
+            As :meth:`render`, and the same exceptions are raised.
+        """
+        if self._trails is None:
+            return None
+        if not self._ready:
+            raise gym.error.ResetNeeded("call reset() before render()")
+        estimated = estimates is not None and any(estimates.rows)
+        if self._canvas is None or self._canvas.estimates != estimated:
+            self._canvas = Canvas(self.system, estimated)
+        guesses = [()] * self.num_envs if estimates is None else estimates.rows
+        return tuple(self._canvas.draw(*row) for row in zip(self._trails.rows, guesses, self._u.T))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
 
     @property  # type: ignore[override]
     def np_random(self) -> tuple[np.random.Generator, ...]:
@@ -197,6 +333,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             starts = np.array([self.plant.draw_start(self._rng(row)) for row in rows.tolist()])
         self._x[:, rows] = starts.T
         self._y[:, rows] = self._measure(self._x[:, rows], self._noise(rows)[1])
+        self._u[:, rows] = 0.0
         self._sample[rows] = 0
         self._terminated[rows] = self._truncated[rows] = False
 
@@ -222,19 +359,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
             self._terminated[rows], self._truncated[rows] = ~inside, truncated
         deviation = x - self._target
-        reward: np.ndarray = 1.0 / (1.0 + 4.0 * (self.plant.weights @ (deviation * deviation)))
-        return reward
-
-    def _restart(self, ended: np.ndarray, info: Infos) -> Infos:
-        """SAME_STEP: begin anew where an episode ended; its last observation and info are kept beside the new ones."""
-        final = last_of_episodes(self._observation(), info, ended)
-        self._begin(np.flatnonzero(ended))
-        new = self._info(np.ones(self.num_envs, dtype=bool))
-        for key in ("u", "escaped"):
-            values = info[key]
-            values[ended] = 0
-            new |= {key: values, f"_{key}": ~ended}
-        return new | final
+        return 1.0 / (1.0 + 4.0 * (self.plant.weights @ (deviation * deviation)))
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = np.asarray(actions, dtype=float)
@@ -284,13 +409,38 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _info(self, rows: np.ndarray) -> Infos:
         info: Infos = {}
-        for key, values in (("y", self._y.T), ("x", self._x.T), ("sample", self._sample)):
+        arrays = {"y": self._y.T, "x": self._x.T, "u": self._u.T, "sample": self._sample, "escaped": self._terminated}
+        for key, values in arrays.items():
             info |= {key: values.copy(), f"_{key}": rows.copy()}
         return info
 
+    def _trace(self) -> None:
+        if self._trails is not None:
+            self._trails.add(self._x.T, self._sample)
+
 
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
-    """A copy of reset options, out of which some environments take the mask, and the rows to reset, boolean (n,)."""
+    """A copy of reset options, out of which some environments take the mask, and the mask.
+
+    Parameters
+    ----------
+    options : mapping, optional
+        As a user passes them to ``reset``.
+    n : int
+        Number of rows.
+
+    Returns
+    -------
+    options : dict or None
+        The copy.
+    mask : ndarray of bool, shape (n,)
+        The rows to reset.
+
+    Raises
+    ------
+    ValueError
+        If ``options["reset_mask"]`` is no such array, or holds no True.
+    """
     if options is None or options.get("reset_mask") is None:
         return None if options is None else dict(options), np.ones(n, dtype=bool)
     mask = np.asarray(options["reset_mask"])
@@ -300,7 +450,22 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
-    """``final_obs`` and ``final_info`` with their masks, as Gymnasium's vector environments report them."""
+    """``final_obs`` and ``final_info`` with their masks, as Gymnasium's vector environments report them.
+
+    Parameters
+    ----------
+    obs : ndarray, shape (n, width)
+        The last observations.
+    info : dict
+        Of the same step.
+    ended : ndarray of bool, shape (n,)
+        The rows whose episodes ended.
+
+    Returns
+    -------
+    dict
+        What ``info`` gains.
+    """
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):
         final_obs[row] = obs[row].copy()

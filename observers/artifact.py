@@ -87,7 +87,7 @@ class ForwardMap:
             Filter states.
         """
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
-        return np.asarray(self.z_offset + self.z_scale * z)
+        return self.z_offset + self.z_scale * z
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class InverseMap:
 
     def gain(self, measurement_noise: float) -> np.ndarray:
         """What the whitened modes are multiplied with at this standard deviation of the noise, shape (modes,)."""
-        return np.asarray(1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2))
+        return 1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2)
 
     def measurement_noise_feature(self, measurement_noise: Any) -> Any:
         """The network's input for a standard deviation of the noise; for an array, as many inputs."""

@@ -108,8 +108,7 @@ class LinearFilter:
         ndarray, shape (..., size)
             The state.
         """
-        z: np.ndarray = y0 @ self.equilibrium.T
-        return z
+        return y0 @ self.equilibrium.T
 
     def advance(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """Return the state one sample later.
@@ -139,8 +138,7 @@ class LinearFilter:
         """
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._sparse is not None:
             return self._sparse(z, y, u, y_next)
-        z_next: np.ndarray = np.concatenate((z, y, u, y_next), axis=-1) @ self._update
-        return z_next
+        return np.concatenate((z, y, u, y_next), axis=-1) @ self._update
 
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
         """Return the states at some samples of a record.

@@ -13,40 +13,116 @@ from observers import KKLObserver, load, shipped
 
 
 class Estimator(Protocol):
-    """A batch of observers, as :class:`VectorEstimate` drives them."""
+    """A batch of observers, as :class:`VectorEstimate` drives them.
+
+    Attributes
+    ----------
+    space : gymnasium.spaces.Box
+        Of one row's observation.
+    """
 
     space: gym.spaces.Box
-    """Of one row's observation."""
 
     def reset(self, y0: np.ndarray) -> object:
-        """Take in the first samples, (n, ny)."""
+        """Forget the past and take in the first samples.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (n, ny)
+            First samples.
+        """
         ...
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin anew in some rows, boolean (n,), from their first samples, (number of rows, ny)."""
+        """Forget the past in some rows and take in their first samples.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (number of True in rows, ny)
+            First samples.
+        rows : ndarray of bool, shape (n,)
+            Which rows begin anew.
+        """
         ...
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in the samples y, (n, ny), that followed the inputs u, (n, nu), None being zero; in some rows only."""
+        """Take in one sample and the input that led to it.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n, ny)
+            Samples.
+        u : ndarray, shape (n, nu), or None
+            Inputs held before them; None is zero.
+        rows : ndarray of bool, shape (n,), optional
+            Which rows take them in; None is all.
+        """
         ...
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """What ``info`` gains, a row for each of the n rows or of ``rows``."""
+        """What ``info`` gains.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (n,), optional
+            Of which rows; None is all.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (number of rows, ...)
+            Values by their key in ``info``; ``x_hat`` are estimated states.
+        """
         ...
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What is shown of a report."""
+        """What of a report is the observation.
+
+        Parameters
+        ----------
+        report : mapping of str to ndarray
+            As :meth:`report` returns it.
+
+        Returns
+        -------
+        ndarray, shape (number of rows, width)
+            Values for ``space``, not yet clipped.
+        """
         ...
 
 
 class KKLEstimator:
-    """An observer for a plant, and the space of what it shows; the parameters are those of :class:`KKLObservation`.
+    """A learned observer for a plant, one sample or a batch at a time, and the space of what it shows.
+
+    Parameters
+    ----------
+    plant : Plant
+        What is observed.
+    observer : str or path or None
+        A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the plant's system.
+    estimate : {"x", "z"}
+        Whether the state estimate is shown, or the filter's state.
+    measurement_noise : float or None
+        The noise level that the observer assumes; None takes the plant's.
+    ignore_input : bool
+        Whether to use a map that knows no inputs although the agent acts.
+    monitor : bool
+        Whether to keep the score.
 
     Attributes
     ----------
-    observer : the observer, its noise level set.
-    estimate : "x" or "z".
-    space : of the estimate shown.
+    observer : KKLObserver
+        The observer, its noise levels set.
+    estimate : str
+        As given.
+    space : gymnasium.spaces.Box
+        Of the estimate shown.
+
+    Raises
+    ------
+    ValueError
+        If ``estimate`` is unknown, no map ships for the system, or the noise level is beyond the map's range.
+    observers.ArtifactError
+        If the file is missing or damaged, or was made for another system, other parameters or another dt.
     """
 
     def __init__(
@@ -78,7 +154,23 @@ class KKLEstimator:
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
-        """The input as far as the map knows it; raises ValueError if the agent acts on a map that knows none."""
+        """The input as far as the map knows it.
+
+        Parameters
+        ----------
+        u : ndarray, shape (..., nu)
+            What the environment applied.
+
+        Returns
+        -------
+        ndarray, shape (..., nu), or None
+            The same; None if the map knows no inputs.
+
+        Raises
+        ------
+        ValueError
+            If the agent acts on a map that knows no inputs, and ``ignore_input`` is false.
+        """
         if not self._blind:
             return u
         if not self._ignore_input and u.any():
@@ -89,19 +181,60 @@ class KKLEstimator:
         return None
 
     def reset(self, y0: np.ndarray) -> None:
-        """Take in the first samples, (..., ny)."""
+        """Forget the past and take in the first samples.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (..., ny)
+            First samples, whose leading shape is the batch's.
+        """
         self.observer.reset(y0)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin anew in some rows of a batch."""
+        """Forget the past in some rows and take in their first samples.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (number of True in rows, ny)
+            First samples.
+        rows : ndarray of bool, shape (n,)
+            Which rows begin anew.
+        """
         self.observer.restart(y0, rows)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
-        """Take in samples and the inputs that led to them; raises ValueError as :meth:`known`."""
+        """Take in samples and the inputs that led to them.
+
+        Parameters
+        ----------
+        y : ndarray, shape (..., ny)
+            Samples.
+        u : ndarray, shape (..., nu), or None
+            Inputs held before them; None is zero.
+        rows : ndarray of bool, shape (...,), optional
+            Which rows take them in; None is all.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`known`.
+        """
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
-        """z and, unless only z is shown, x_hat; the score, if it is kept; of all rows or of some."""
+        """What ``info`` gains.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (...,), optional
+            Of which rows; None is all.
+
+        Returns
+        -------
+        dict of str to ndarray
+            ``z``, and ``x_hat`` if it is shown: with ``estimate="z"`` the network is not evaluated. ``score`` with a
+            monitor, which evaluates the network in any case.
+        """
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
@@ -110,12 +243,36 @@ class KKLEstimator:
         return found
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What is shown of a report: x_hat or z."""
+        """What of a report is the observation.
+
+        Parameters
+        ----------
+        report : mapping of str to ndarray
+            As :meth:`report` returns it.
+
+        Returns
+        -------
+        ndarray, shape (..., width)
+            x_hat or z, not yet clipped.
+        """
         return report["x_hat" if self.estimate == "x" else "z"]
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
-    """Values, one row or many, (..., width), as observations of a row's space: float32, within its bounds."""
+    """Values as observations: float32, within the bounds of their space.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., width)
+        One row or many.
+    space : gymnasium.spaces.Box, shape (width,)
+        Of one row.
+
+    Returns
+    -------
+    ndarray of float32, shape (..., width)
+        A copy.
+    """
     return clipped(values, space.low, space.high)
 
 

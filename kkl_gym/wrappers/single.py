@@ -8,7 +8,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from kkl_gym.envs import TRAIL, KKLEnv
+from kkl_gym.envs import KKLEnv
+from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, observation
 
 
@@ -16,26 +17,60 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     """Shows a learned observer's estimate in place of the state.
 
     The observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment applied. ``info`` gains
-    ``x_hat`` (nx,) and ``z``, the filter's state, both float64, and with ``monitor`` ``score``, above 1 where the
-    samples do not fit the estimates (a faulty sensor, states that the map was not made for).
+    ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With
+    ``monitor`` it gains ``score`` too, above 1 where the samples do not fit the estimates (a faulty sensor, states that
+    the map was not made for).
+
+    With ``estimate="z"`` the network is not evaluated, unless there is a monitor. There is then no ``x_hat``, and
+    :meth:`render` shows no estimate.
 
     Parameters
     ----------
-    env : a :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone.
-    observer : a shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the
-        environment's system.
-    estimate : "x" shows the state estimate, clipped to the system's declared bounds; "z" the filter's state
-        [z_y, z_u], within the bounds that bounded outputs and inputs imply.
-    measurement_noise : the noise level that the observer assumes; None takes the environment's. (Process noise is
-        taken from the environment always, by maps that ask for it.)
-    ignore_input : use a map that knows no inputs (the paper's) although the agent acts.
-    monitor : whether to keep the score, see :attr:`observers.KKLObserver.score`.
+    env : gymnasium.Env
+        A :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    observer : str or path, optional
+        A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
+        system.
+    estimate : {"x", "z"}
+        "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
+        within the bounds that bounded outputs and inputs imply.
+    measurement_noise : float, optional
+        The noise level that the observer assumes; None takes the environment's. (Process noise is always taken from
+        the environment, by maps that ask for it.)
+    ignore_input : bool
+        Whether to use a map that knows no inputs (the paper's) although the agent acts.
+    monitor : bool
+        Whether to keep the score, see :attr:`observers.KKLObserver.score`.
+
+    Attributes
+    ----------
+    observer : KKLObserver
+        The observer.
+    estimate : str
+        As given.
 
     Raises
     ------
-    ValueError : (ArtifactError where the file is at fault) if the observer does not exist, was made for another
-        system, other parameters, another dt, or not for this noise level; or, at a step, if the agent acts on a map
-        that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
+    ValueError
+        If the environment is not one of ours, ``estimate`` is unknown, no map ships for the system, or the noise level
+        is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and ``ignore_input`` is
+        false, or a wrapper inside hides samples from the observer.
+    observers.ArtifactError
+        If the file is missing or damaged, or was made for another system, other parameters or another dt. It is a
+        ValueError.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from kkl_gym import KKLObservation
+    >>> env = KKLObservation(gym.make("KKLLorenz-v0"))
+    >>> x_hat, info = env.reset(seed=0)
+    >>> x_hat.shape, info["x_hat"].shape
+    ((3,), (3,))
+    >>> for _ in range(500):
+    ...     x_hat, reward, terminated, truncated, info = env.step([0.0])
+    >>> bool((abs(x_hat - info["x"]) < 3).all())
+    True
     """
 
     def __init__(
@@ -71,52 +106,117 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         )
         self.observer = self._estimator.observer
         self.estimate = estimate
-        self._monitor = monitor
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
         self.observation_space = self._estimator.space
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Reset the environment, and the observer to its first sample."""
+        """Reset the environment, and the observer to its first sample.
+
+        Parameters
+        ----------
+        seed : int, optional
+            As for the environment.
+        options : dict, optional
+            As for the environment.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            The first estimate.
+        info : dict
+            The environment's, with what the observer adds.
+        """
         _, info = self.env.reset(seed=seed, options=options)
-        self._sample = info["sample"]
+        self._sample = int(info["sample"])
         self._trail.clear()
-        return self._show(self.observer.reset(info["y"]), info), info
+        self._estimator.reset(info["y"])
+        return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Step the environment, and the observer with the new sample and the input that led to it."""
+        """Step the environment, and the observer with the new sample and the input that led to it.
+
+        Parameters
+        ----------
+        action : array_like, shape (nu,)
+            As for the environment.
+
+        Returns
+        -------
+        observation : ndarray of float32
+            The estimate after the new sample.
+        reward : float
+            The environment's.
+        terminated, truncated : bool
+            The environment's.
+        info : dict
+            The environment's, with what the observer adds.
+
+        Raises
+        ------
+        ValueError
+            As described above.
+        """
         _, reward, terminated, truncated, info = self.env.step(action)
-        if info["sample"] != self._sample + 1:
+        sample = int(info["sample"])
+        if sample != self._sample + 1:
             raise ValueError(
-                f"the observer was to see sample {self._sample + 1} and was shown sample {info['sample']}: put "
+                f"the observer was to see sample {self._sample + 1} and was shown sample {sample}: put "
                 "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
                 "reset after an error"
             )
-        x_hat = self.observer.step(info["y"], self._estimator.known(info["u"]))
-        self._sample += 1
-        return self._show(x_hat, info), float(reward), terminated, truncated, info
+        self._estimator.advance(info["y"], info["u"])
+        self._sample = sample
+        return self._show(info), float(reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """The phase portrait with state and estimate as an RGB image, or None without ``render_mode``."""
+        """Draw the phase portrait with states and estimates so far.
+
+        Returns
+        -------
+        ndarray of uint8, shape (height, width, 3), or None
+            An RGB image; None without ``render_mode``.
+        """
         base: KKLEnv = self.unwrapped  # type: ignore[assignment]
         return base.draw(self._trail)
 
-    def _show(self, x_hat: np.ndarray, info: dict[str, Any]) -> np.ndarray:
-        z = self.observer.z
-        info["x_hat"], info["z"] = x_hat, z
-        if self._monitor:
-            info["score"] = float(self.observer.score)
-        if self.render_mode is not None:
-            self._trail.append(x_hat.tolist())
-        return observation(self._estimator.shown(info), self._estimator.space)
+    def _show(self, info: dict[str, Any]) -> np.ndarray:
+        report = self._estimator.report()
+        info.update(report)
+        if "score" in report:
+            info["score"] = float(report["score"])
+        if self.render_mode is not None and "x_hat" in report:
+            self._trail.append(report["x_hat"].tolist())
+        return observation(self._estimator.shown(report), self._estimator.space)
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Holds each action for ``repeat`` steps and sums their rewards; put it outside :class:`KKLObservation`.
 
     The observer then sees every sample while the agent acts more slowly. Stops early where the episode ends.
-    Raises ValueError unless ``repeat`` is a positive integer.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        The environment.
+    repeat : int
+        How many steps an action is held.
+
+    Raises
+    ------
+    ValueError
+        Unless ``repeat`` is a positive integer.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from kkl_gym import ActionRepeat, KKLObservation
+    >>> env = ActionRepeat(KKLObservation(gym.make("KKLVanDerPol-v0")), 5)
+    >>> obs, info = env.reset(seed=0)
+    >>> obs, reward, terminated, truncated, info = env.step([0.2])
+    >>> info["sample"]
+    array(5)
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], repeat: int) -> None:
@@ -125,9 +225,28 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
         if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
             raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
         self.repeat = repeat
+        frames = env.metadata.get("render_fps", 30)  # a second, as Gymnasium assumes
+        self.metadata = {**env.metadata, "render_fps": max(1, round(frames / repeat))}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply ``action`` for ``repeat`` steps; the observation and info are those of the last one."""
+        """Hold an action for ``repeat`` steps.
+
+        Parameters
+        ----------
+        action : array_like, shape (nu,)
+            As for the environment.
+
+        Returns
+        -------
+        observation : ndarray
+            Of the last step.
+        reward : float
+            Sum over the steps.
+        terminated, truncated : bool
+            Of the last step.
+        info : dict
+            Of the last step.
+        """
         total = 0.0
         for _ in range(self.repeat):
             obs, reward, terminated, truncated, info = self.env.step(action)

@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import gymnasium as gym
 import numpy as np
@@ -10,15 +10,15 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.plant import Plant
+from kkl_gym.rendering import Trails
 from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes, with_mask
 from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
-
-
-VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-
-
+if TYPE_CHECKING:
+    VectorWrapper = gym.vector.VectorWrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+else:  # no generic class before gymnasium 1.4
+    VectorWrapper = gym.vector.VectorWrapper
 Step = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]
 
 
@@ -30,26 +30,53 @@ class VectorEstimate(VectorWrapper):
 
     Parameters
     ----------
-    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
-    estimator : the observers.
+    env : gymnasium.vector.VectorEnv
+        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    estimator : Estimator
+        The observers.
 
-    Raises ValueError if the environment does not say its autoreset mode, and, at a step, if a wrapper inside hides
-    samples from the observers.
+    Attributes
+    ----------
+    autoreset_mode : gymnasium.vector.AutoresetMode
+        The environment's.
+
+    Raises
+    ------
+    ValueError
+        If the environment does not say its autoreset mode. At a step, if a wrapper inside hides samples from the
+        observers.
     """
 
     def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
         super().__init__(env)
-        self._mode = _autoreset_mode(env)
+        self.autoreset_mode = _autoreset_mode(env)
         self._estimator = estimator
         self.single_observation_space: gym.spaces.Box = estimator.space
         self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
         self._ended = np.zeros(env.num_envs, dtype=bool)
-        self._sample = np.zeros(env.num_envs, dtype=int)
+        self._sample = np.zeros(env.num_envs, dtype=np.int64)
+        rendering = isinstance(env.unwrapped, KKLVectorEnv) and env.render_mode is not None
+        self._trails = Trails(env.num_envs) if rendering else None  # of estimates
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset environments and observers, all or the rows of ``options["reset_mask"]``."""
+        """Reset environments and observers, all or the rows of ``options["reset_mask"]``.
+
+        Parameters
+        ----------
+        seed : int or sequence of int or None, length num_envs, optional
+            As for the environment.
+        options : mapping, optional
+            As for the environment.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Estimates in all rows.
+        info : dict
+            The environment's, with what the observers add.
+        """
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if mask.all():
@@ -58,23 +85,46 @@ class VectorEstimate(VectorWrapper):
             self._estimator.restart(info["y"][mask], mask)
         self._ended = self._ended & ~mask
         self._sample = np.where(mask, info["sample"], self._sample)
-        return self._show(info, mask), info
+        obs = self._show(info, mask)
+        self._trace(info)
+        return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Step the environments, and the observers with the new samples and the inputs that led to them."""
+        """Step the environments, and the observers with the new samples and the inputs that led to them.
+
+        Parameters
+        ----------
+        actions : array_like, shape (num_envs, nu)
+            As for the environment.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Estimates after the new samples.
+        rewards : ndarray, shape (num_envs,)
+            The environment's.
+        terminated, truncated : ndarray of bool, shape (num_envs,)
+            The environment's.
+        info : dict
+            The environment's, with what the observers add.
+
+        Raises
+        ------
+        ValueError
+            As described above.
+        """
         _, reward, terminated, truncated, info = self.env.step(actions)
         before, ended = self._ended, terminated | truncated
-        if self._mode is not AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is not AutoresetMode.SAME_STEP:
             self._ended = ended
         elif ended.any():
             return self._show_and_restart(info, ended), reward, terminated, truncated, info
-        y, u = info["y"], info.get("u")  # no u: every row was reset
-        disabled = self._mode is AutoresetMode.DISABLED
+        y, u = info["y"], info["u"]
+        disabled = self.autoreset_mode is AutoresetMode.DISABLED
         expected = self._sample + 1
         over = bool(before.any())
         if over:  # rows that this step has reset, or that stay at their end
             expected[before] = self._sample[before] if disabled else 0
-            u = None if u is None else np.where(before[:, None], 0.0, u)
         self._check(expected, info["sample"], before)
         if over and disabled:
             self._estimator.advance(y, u, ~before)
@@ -83,15 +133,17 @@ class VectorEstimate(VectorWrapper):
             if over:
                 self._estimator.restart(y[before], before)
         self._sample = expected
-        return self._show(info, np.ones_like(ended)), reward, terminated, truncated, info
+        obs = self._show(info, np.ones_like(ended))
+        self._trace(info)
+        return obs, reward, terminated, truncated, info
 
     def _show_and_restart(self, info: Infos, ended: np.ndarray) -> np.ndarray:
         """SAME_STEP: the last samples of the episodes that ended come first, then the first ones of the next."""
         final = info["final_info"]
         expected = self._sample + 1
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
-        u = np.where(ended[:, None], final["u"], info.get("u", final["u"]))
-        self._estimator.advance(np.where(ended[:, None], final["y"], info["y"]), u)
+        y, u = (np.where(ended[:, None], final[key], info[key]) for key in ("y", "u"))
+        self._estimator.advance(y, u)
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
@@ -102,7 +154,26 @@ class VectorEstimate(VectorWrapper):
             final |= {key: info[key] * column(ended, info[key]), f"_{key}": ended.copy()}
             info[key][ended] = values
         shown[ended] = observation(self._estimator.shown(first), self.single_observation_space)
+        self._trace(info)
         return shown
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw the phase portrait of each row with states and estimates so far.
+
+        Estimates are drawn on :class:`kkl_gym.KKLVectorEnv`, where the observers report ``x_hat``. For Sync and Async
+        vectors put :class:`kkl_gym.KKLObservation` into each environment.
+
+        Returns
+        -------
+        tuple of ndarray of uint8, shape (height, width, 3), length num_envs, or None
+            RGB images; None without ``render_mode``.
+        """
+        env: Any = self.env
+        return env.render() if self._trails is None else env.unwrapped.draw(self._trails)
+
+    def _trace(self, info: Infos) -> None:
+        if self._trails is not None and "x_hat" in info:
+            self._trails.add(info["x_hat"], info["sample"])
 
     def _check(self, expected: np.ndarray, seen: np.ndarray, ended: np.ndarray) -> None:
         if (seen != expected).any():
@@ -132,14 +203,44 @@ class KKLVectorObservation(VectorEstimate):
 
     Parameters
     ----------
-    env : a vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
-    observer, estimate, measurement_noise, ignore_input, monitor : as for :class:`kkl_gym.KKLObservation`; with "z" the
-        network is not evaluated, unless there is a monitor.
+    env : gymnasium.vector.VectorEnv
+        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+    observer : str or path, optional
+        As for :class:`kkl_gym.KKLObservation`.
+    estimate : {"x", "z"}
+        As for :class:`kkl_gym.KKLObservation`; with "z" the network is not evaluated, unless there is a monitor.
+    measurement_noise : float, optional
+        The noise level that the observer assumes; None takes the environment's.
+    ignore_input : bool
+        Whether to use a map that knows no inputs although the agent acts.
+    monitor : bool
+        Whether to keep the score.
+
+    Attributes
+    ----------
+    observer : KKLObserver
+        The observer of all rows.
+    estimate : str
+        As given.
+    autoreset_mode : gymnasium.vector.AutoresetMode
+        The environment's.
 
     Raises
     ------
-    ValueError : as :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what
-        the observer must know (process noise only if the map asks for it).
+    ValueError
+        As :class:`kkl_gym.KKLObservation`, and if the environments of a Sync or Async vector differ in what the
+        observer must know (process noise only if the map asks for it).
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> import numpy as np
+    >>> from kkl_gym import KKLVectorObservation
+    >>> envs = KKLVectorObservation(gym.make_vec("KKLRossler-v0", num_envs=4, autoreset_mode="SameStep"))
+    >>> x_hat, info = envs.reset(seed=0)
+    >>> x_hat.shape, info["x_hat"].shape
+    ((4, 3), (4, 3))
+    >>> x_hat, reward, terminated, truncated, info = envs.step(np.zeros((4, 1)))
     """
 
     def __init__(
@@ -176,13 +277,27 @@ class VectorActionRepeat(VectorWrapper):
 
     Parameters
     ----------
-    env : the vector environment, with ``autoreset_mode`` DISABLED.
-    repeat : a positive integer.
-    autoreset_mode : the mode that this wrapper offers.
+    env : gymnasium.vector.VectorEnv
+        The vector environment, with ``autoreset_mode`` DISABLED.
+    repeat : int
+        How many steps an action is held.
+    autoreset_mode : str or gymnasium.vector.AutoresetMode
+        The mode that this wrapper offers.
 
     Raises
     ------
-    ValueError : if ``repeat`` is not a positive integer or the environment resets by itself.
+    ValueError
+        If ``repeat`` is not a positive integer, or the environment resets by itself.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kkl_gym import KKLVectorEnv, VectorActionRepeat
+    >>> envs = VectorActionRepeat(KKLVectorEnv("lorenz", 2, autoreset_mode="Disabled"), 5)
+    >>> obs, info = envs.reset(seed=0)
+    >>> obs, reward, terminated, truncated, info = envs.step(np.zeros((2, 1)))
+    >>> info["sample"].tolist()
+    [5, 5]
     """
 
     def __init__(
@@ -201,20 +316,53 @@ class VectorActionRepeat(VectorWrapper):
             )
         self.repeat = repeat
         self.autoreset_mode = AutoresetMode(autoreset_mode)
-        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode}
+        frames = max(1, round(env.metadata["render_fps"] / repeat))
+        self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": frames}
         self._ended = np.zeros(env.num_envs, dtype=bool)
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[np.ndarray, Infos]:
-        """Reset the environments, or the rows of ``options["reset_mask"]``."""
+        """Reset the environments, or the rows of ``options["reset_mask"]``.
+
+        Parameters
+        ----------
+        seed : int or sequence of int or None, length num_envs, optional
+            As for the environment.
+        options : mapping, optional
+            As for the environment.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Of all rows.
+        info : dict
+            The environment's.
+        """
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended = self._ended & ~mask
         return obs, info
 
     def step(self, actions: np.ndarray) -> Step:
-        """Apply ``actions`` for ``repeat`` steps; observations and infos are those of each row's last one."""
+        """Hold actions for ``repeat`` steps.
+
+        Parameters
+        ----------
+        actions : array_like, shape (num_envs, nu)
+            As for the environment.
+
+        Returns
+        -------
+        observations : ndarray of float32, shape (num_envs, width)
+            Of each row's last step.
+        rewards : ndarray, shape (num_envs,)
+            Sums over each row's steps.
+        terminated, truncated : ndarray of bool, shape (num_envs,)
+            Of each row's last step.
+        info : dict
+            Of each row's last step.
+        """
         waiting = self._ended  # since an earlier step; they stay as they are in this one
         total, info = np.zeros(self.num_envs), Infos()
         for _ in range(self.repeat):
@@ -233,9 +381,6 @@ class VectorActionRepeat(VectorWrapper):
             final = last_of_episodes(obs, info, ended)
             obs, new = self.reset(options={"reset_mask": ended})
             info = _merged(info, new) | final
-            for key in ("u", "escaped"):
-                info[key] = info[key] * column(~ended, info[key])
-                info[f"_{key}"] = info[f"_{key}"] & ~ended
         return obs, total, terminated, truncated, info
 
 
@@ -253,7 +398,20 @@ def _merged(old: Infos, new: Infos) -> Infos:
 
 
 def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A mask over rows, (n,), shaped to go with values, (n, ...)."""
+    """Shape a mask over rows to go with values.
+
+    Parameters
+    ----------
+    mask : ndarray of bool, shape (n,)
+        The mask.
+    values : ndarray, shape (n, ...)
+        What it is to be combined with.
+
+    Returns
+    -------
+    ndarray of bool, shape (n, 1, ...)
+        With as many axes as the values.
+    """
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
@@ -265,9 +423,24 @@ def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """What the rows of a vector environment have in common; raises ValueError if they are not ours or differ.
+    """What the rows of a vector environment have in common.
 
-    also : attributes of a plant in which they must agree as well.
+    Parameters
+    ----------
+    env : gymnasium.vector.VectorEnv
+        The vector environment.
+    *also : str
+        Attributes of a plant in which the rows must agree, beside system, dt and measurement noise.
+
+    Returns
+    -------
+    Plant
+        Of the first row.
+
+    Raises
+    ------
+    ValueError
+        If the rows are not environments of ours, or differ.
     """
     base: Any = env.unwrapped
     if isinstance(base, KKLVectorEnv):

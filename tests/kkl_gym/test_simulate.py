@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
 from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.elementary import exp, sin
@@ -15,6 +14,10 @@ from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance, advance_batch, che
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 DT = 0.01
+
+
+def solve_ivp(*arguments, **options):
+    return pytest.importorskip("scipy.integrate").solve_ivp(*arguments, **options)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import kkl_gym.wrappers.estimator
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
@@ -36,8 +35,17 @@ def wrapped(saved, name, estimate="x", env=None, **options):
 def test_checkers_are_content(name, observe, estimate, saved):
     env = wrapped(saved, name, estimate, {"observe": observe})
     check_env(env, skip_render_check=True)
-    check_env_sb3(env)
     assert env.observation_space.shape == ((env.unwrapped.system.nx,) if estimate == "x" else env.observer.z.shape)
+
+
+@everyone
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_sb3s_checker_is_content(name, estimate, saved):
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    env = wrapped(saved, name, estimate)
+    sb3.check_env(env)
+    sb3.check_env(ActionRepeat(env, 4))
+    sb3.check_env(ActionRepeat(env.env, 4))
 
 
 @everyone
@@ -101,6 +109,31 @@ def test_estimate_z_shows_the_filter(saved):
         assert np.allclose(obs, info["z"], rtol=1e-6)
         assert np.array_equal(info["z"], env.observer.z)
         obs, *_, info = env.step(action)
+
+
+def test_estimate_z_does_without_the_network(saved, monkeypatch):
+    """Unless there is a monitor, which needs it; info has no x_hat in any case."""
+    asked = []
+    decode = KKLObserver.decode
+    monkeypatch.setattr(KKLObserver, "decode", lambda self, rows=None: asked.append(rows) or decode(self, rows))
+    for estimate, watched, calls in (("x", False, 5), ("z", False, 0), ("z", True, 5)):
+        environment = {"measurement_noise": 0.5} if watched else {}
+        env = KKLObservation(KKLEnv("lorenz", **environment), estimate=estimate, monitor=watched)
+        _, info = env.reset(seed=0)
+        asked.clear()
+        for action in actions(5):
+            assert set(info) == {"y", "x", "u", "sample", "escaped", "z", "x_hat" if estimate == "x" else "z"} | (
+                {"score"} if watched else set()
+            )
+            *_, info = env.step(action)
+        assert len(asked) == calls
+
+
+def test_specs_of_before_the_wrappers_had_rooms_of_their_own(saved):
+    env = KKLObservation(gym.make("KKLLorenz-v0"), saved(system="lorenz"))
+    text = env.spec.to_json().replace("kkl_gym.wrappers.single:", "kkl_gym.wrappers:")
+    assert '"kkl_gym.wrappers:KKLObservation"' in text
+    assert isinstance(gym.make(EnvSpec.from_json(text)), KKLObservation)
 
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
@@ -273,7 +306,6 @@ def test_escape_under_the_wrapper(saved):
 def test_action_repeat_passes_the_checkers(name, saved):
     for env in (ActionRepeat(gym.make(ENV_IDS[name]), 4), ActionRepeat(wrapped(saved, name), 4)):
         check_env(env, skip_render_check=True)
-        check_env_sb3(env)
 
 
 def test_action_repeat_sums_rewards(saved):
@@ -337,6 +369,7 @@ def test_a_wrapper_inside_that_skips_samples_is_noticed(saved):
 
 
 def test_render_shows_the_estimate_and_the_input(saved):
+    pytest.importorskip("matplotlib")
     env = wrapped(saved, "van_der_pol", env={"render_mode": "rgb_array"})
     env.reset(seed=0)
     for _ in range(30):
@@ -353,6 +386,9 @@ def test_render_shows_the_estimate_and_the_input(saved):
     bare = wrapped(saved, "van_der_pol")
     bare.reset(seed=0)
     assert bare.render() is None
+    of_z = wrapped(saved, "van_der_pol", "z", env={"render_mode": "rgb_array"})
+    of_z.reset(seed=0)
+    assert (of_z.render() == of_z.unwrapped.render()).all()  # which has no estimate of the state
 
 
 def test_a_system_without_shipped_map_says_so():
