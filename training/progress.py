@@ -51,7 +51,7 @@ class _Progress(Progress):
         self._last_line = self.get_time()
         super().start()
 
-    def update(self, task_id: TaskID, **changes: Any) -> None:  # type: ignore[override]
+    def update(self, task_id: TaskID, **changes: Any) -> None:
         super().update(task_id, **changes)
         self._say(task_id)
 
