@@ -104,7 +104,8 @@ def test_any_memory_layout_and_no_rows():
     x, u, w = batch(system, 5)
     expected = batch_step(system)(x, u, w, DT)
     assert (batch_step(system)(*map(np.asfortranarray, (x, u, w)), DT) == expected).all()
-    assert (batch_step(system)(x[:, ::2], u[:, ::2], w[:, ::2], DT) == expected[:, ::2]).all()
+    some = batch_step(system)(x[:, ::2], u[:, ::2], w[:, ::2], DT)
+    assert np.allclose(some, expected[:, ::2], rtol=1e-13, atol=1e-13)
     assert batch_step(system)(x[:, :0], u[:, :0], w[:, :0], DT).shape == (3, 0)
 
 
@@ -118,7 +119,7 @@ def test_lost_rows_are_nan_without_warning_and_leave_the_others(system):
             warnings.simplefilter("error")
             got = batch_step(system)(x, u, w, DT)
         assert not np.isfinite(got[:, 1]).all()
-        assert (got[:, [0, 2, 3]] == expected[:, [0, 2, 3]]).all()
+        assert np.allclose(got[:, [0, 2, 3]], expected[:, [0, 2, 3]], rtol=1e-13, atol=1e-13)
 
 
 @compiles
