@@ -17,7 +17,7 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
-from training.kalman import ExtendedKalmanFilter, UnscentedFilters, unknown_start
+from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.methods import ABLATION, METHODS, Budget, Task, get_method
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.autoencoder import bessel_filter
@@ -194,7 +194,7 @@ def kalman(dt, Q, R, x0, P0):
     return one
 
 
-@pytest.mark.parametrize("filters", [ExtendedKalmanFilter, UnscentedFilters])
+@pytest.mark.parametrize("filters", [ExtendedKalmanFilter, UnscentedKalmanFilter])
 def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters):
     dt, Q, R = 0.02, np.diag([0.01, 0.02]), np.array([[0.3]])
     x0, P0 = np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])
@@ -253,7 +253,7 @@ def test_sensitivity_is_the_derivative_of_the_flow(name):
 def test_a_filter_that_leaves_the_bounds_starts_anew():
     system = get_system("van_der_pol")
     x0, P0 = unknown_start(system)
-    for filters in (ExtendedKalmanFilter, UnscentedFilters):
+    for filters in (ExtendedKalmanFilter, UnscentedKalmanFilter):
         observer = filters(system, 0.01, Q=np.eye(2), R=0.01 * np.eye(1), start=(x0, P0))
         observer.reset(np.array([[1.0]]))
         for value in (1e9, 1e-9, 1e12, 0.5):
@@ -301,7 +301,7 @@ def test_kalman_filters_are_told_the_noise(name):
     method, system = get_method(name), get_system("van_der_pol")
     y0 = np.array([[3.0]])
     moved = [
-        method.observer({"process_noise": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0]
+        method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0]
         for noise in (0.0, 50.0)
     ]
     assert moved[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
@@ -388,7 +388,7 @@ def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
 
 
 def test_a_file_of_another_method_is_refused(tmp_path):
-    get_method("ekf").save({"process_noise": np.ones(1)}, tmp_path / "one.safetensors")
+    get_method("ekf").save({"diffusion": np.ones(1)}, tmp_path / "one.safetensors")
     with pytest.raises(ValueError, match="'ekf', not 'gru'"):
         get_method("gru").load(tmp_path / "one.safetensors")
 
