@@ -9,12 +9,7 @@ from torch import nn
 from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
 from training.maps.networks import Network, tensor
-
-
-def on_tensors(function: object, x: torch.Tensor) -> torch.Tensor:
-    """A system's f or h on states (n, nx)."""
-    values = function(x.unbind(-1))  # type: ignore[operator]
-    return torch.stack([torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(len(x)) for value in values], -1)
+from training.maps.pde import on_tensors, residual
 
 
 def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
@@ -80,14 +75,9 @@ class ForwardProblem(nn.Module):
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
-        f = on_tensors(self.system.f, x) / self._xs
-        scaled = (x - self._xo) / self._xs
-        value, derivative = torch.func.jvp(self.network, (scaled,), (f,))  # type: ignore[misc]
-        T = self._zo + self._zs * value
-        h = on_tensors(self.system.h, x)
-        return self._zs * derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
+        f, h = on_tensors(self.system.f, x), on_tensors(self.system.h, x)
+        return residual(self.T, x, f=f, h=h, A=self._A, B=self._B), (f / self._xs).norm(dim=-1)
 
-    @torch.no_grad()
     def T(self, x: torch.Tensor) -> torch.Tensor:
         """The learned map at states (n, nx), (n, nz)."""
         z: torch.Tensor = self._zo + self._zs * self.network((x - self._xo) / self._xs)

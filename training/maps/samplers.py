@@ -243,7 +243,8 @@ class ForwardMapSampler:
         self._points = None if points is None else tensor(points, device)
         self._forward, self._batch = forward, batch
         x = self._draw(torch.Generator(device).manual_seed(0), 100_000)
-        z = forward(x).cpu().numpy().astype(float)
+        with torch.no_grad():
+            z = forward(x).cpu().numpy().astype(float)
         self.coordinates = coordinates(z, error.T @ error / len(error))
         self.x_offset, self.x_scale = (low + high) / 2, (high - low) / 2
         self._offset, self._scale = tensor(self.x_offset, device), tensor(self.x_scale, device)
@@ -257,6 +258,7 @@ class ForwardMapSampler:
             return self._points[rows]
         return self._low + self._span * torch.rand((n, len(self._low)), generator=generator, device=generator.device)
 
+    @torch.no_grad()
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""
         x = self._draw(generator, self._batch)

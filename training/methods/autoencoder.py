@@ -10,8 +10,8 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
-from training.maps.forward import on_tensors
 from training.maps.networks import Network, tensor
+from training.maps.pde import along, on_tensors
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
 from training.spectrum import bessel_spectrum
@@ -144,11 +144,7 @@ class _Problem(nn.Module):
         position = torch.rand((BATCH, 1), generator=generator, device=x.device)
         w = self.slowest * (self.fastest / self.slowest) ** position
         scaled, f = (x - self._xo) / self._xs, on_tensors(self.system.f, x) / self._xs
-
-        def at(s: torch.Tensor) -> torch.Tensor:
-            return self.encode(s, w)
-
-        z, derivative = torch.func.jvp(at, (scaled,), (f,))  # type: ignore[misc]
+        z, derivative = along(lambda s: self.encode(s, w), scaled, f)
         h = on_tensors(self.system.h, x)
         steady = (self.z_offset + self.z_scale * z) @ self._D.T + h @ self._F.T
         residual = (derivative - w * steady / self.z_scale) / (f.norm(dim=-1, keepdim=True) + w)

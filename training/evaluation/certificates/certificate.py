@@ -331,7 +331,7 @@ def _forward(
         reconstruction = float(_squared(motion.x - T_inv(T(motion.x))).mean())
         return 2 * (2 * reconstruction + 2 * constant**2 * physics_risk)
 
-    same = all((a == b).all() for a, b in zip((*quiet.weights, *quiet.biases), (*told.weights, *told.biases)))
+    same = all((a == b).all() for a, b in zip((*quiet.mlp.weights, *quiet.mlp.biases), (*told.mlp.weights, *told.mlp.biases)))
     dimension = pseudo_dimension_bound(artifact.forward.mlp)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
     return Forward(

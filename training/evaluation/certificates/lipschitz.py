@@ -31,10 +31,10 @@ def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
     (ECLipsE, NeurIPS 2024) layer by layer; here the diagonals of all layers are found together by gradients, so that no
     solver of such programs is needed. Every choice of them is sound; a good one is less than the product of norms.
     """
-    if len(network.weights) == 1 or norm_product(network) == 0.0:
+    if len(network.mlp.weights) == 1 or norm_product(network) == 0.0:
         return norm_product(network)
-    low, high = SLOPES[network.activation]
-    weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in network.weights]
+    low, high = SLOPES[network.mlp.activation]
+    weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in network.mlp.weights]
     # D is a shape about the diagonal of M, times the least factor with D >= M, times 1 + e^margin: always admissible.
     # Zeros are a good start: for diagonal M they give D = 2 M, with which nothing is lost.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
@@ -69,7 +69,7 @@ def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
 
 def norm_product(network: Smooth) -> float:
     """The product of the layers' spectral norms and the activations' largest slope, what is known without work."""
-    slope = max(abs(value) for value in SLOPES[network.activation])
-    return float(np.prod([np.linalg.norm(weight, 2) for weight in network.weights])) * slope ** (
-        len(network.weights) - 1
+    slope = max(abs(value) for value in SLOPES[network.mlp.activation])
+    return float(np.prod([np.linalg.norm(weight, 2) for weight in network.mlp.weights])) * slope ** (
+        len(network.mlp.weights) - 1
     )
