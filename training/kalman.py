@@ -128,7 +128,8 @@ class KalmanFilter(ABC):
         return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))
 
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
-        return np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+        inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+        return inside
 
     @abstractmethod
     def _predicted(self, u: np.ndarray) -> Gaussian:
@@ -177,10 +178,10 @@ class ExtendedKalmanFilter(KalmanFilter):
 class UnscentedKalmanFilter(KalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
 
-    Van der Merwe's scaled sigma points with alpha = 1, beta = 2 and kappa = 3 - nx, a Cholesky factor as the root of the
-    covariance: x and x +- sqrt(3) times each column of the factor. They are drawn anew between prediction and
-    correction. A filter starts anew if its corrected mean leaves the system's declared bounds, or its covariance is no
-    longer positive definite. Parameters are those of :class:`KalmanFilter`.
+    The sigma points are van der Merwe's scaled ones with alpha = 1, beta = 2 and kappa = 3 - nx: the mean, and the mean
+    +- sqrt(3) times each column of the covariance's Cholesky factor. They are drawn anew between prediction and
+    correction. A filter starts anew if its corrected mean leaves the system's declared bounds, or if its covariance is
+    no longer positive definite. Parameters are those of :class:`KalmanFilter`.
     """
 
     def __init__(
@@ -189,7 +190,7 @@ class UnscentedKalmanFilter(KalmanFilter):
         super().__init__(system, dt, Q=Q, R=R, start=start)
         nx = system.nx
         self._mean_weights = np.array([(3 - nx) / 3, *[1 / 6] * (2 * nx)])
-        self._weights = self._mean_weights + [2.0, *[0.0] * (2 * nx)]
+        self._weights = self._mean_weights + np.array([2.0, *[0.0] * (2 * nx)])
 
     @np.errstate(over="ignore", invalid="ignore")
     def _predicted(self, u: np.ndarray) -> Gaussian:
@@ -228,4 +229,5 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     def _covariance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """Weighted sum over points of outer products of (2 nx + 1, n, k) and (2 nx + 1, n, l), as (n, k, l)."""
-        return np.einsum("s,snk,snl->nkl", self._weights, a, b)
+        products: np.ndarray = np.einsum("s,snk,snl->nkl", self._weights, a, b)
+        return products

@@ -301,8 +301,7 @@ def test_kalman_filters_are_told_the_noise(name):
     method, system = get_method(name), get_system("van_der_pol")
     y0 = np.array([[3.0]])
     moved = [
-        method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0]
-        for noise in (0.0, 50.0)
+        method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0] for noise in (0.0, 50.0)
     ]
     assert moved[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
     assert moved[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
