@@ -63,14 +63,29 @@ class Certify:
             name = Path(given).stem if given.endswith(".safetensors") else given
             with console.status(f"certifying {name}"):
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
-                noise: dict[str, Any] = {"measurement_noise": self.measurement_noise, "process_noise": process_noise}
-                drawn: dict[str, Any] = {"trajectories": self.trajectories, "seed": self.seed}
-                recorded = record_settled(artifact, system, **noise, **drawn)
+                levels = (self.measurement_noise, process_noise)
+                motion = record_settled(
+                    artifact,
+                    system,
+                    measurement_noise=self.measurement_noise,
+                    process_noise=process_noise,
+                    trajectories=self.trajectories,
+                    seed=self.seed,
+                )
                 certificate = certify(
-                    artifact, system, **noise, **drawn, psi=self.psi, delta=self.delta, name=name, recorded=recorded
+                    artifact,
+                    system,
+                    measurement_noise=self.measurement_noise,
+                    process_noise=process_noise,
+                    psi=self.psi,
+                    trajectories=self.trajectories,
+                    delta=self.delta,
+                    seed=self.seed,
+                    name=name,
+                    recorded=motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, recorded=recorded, name=name, **noise)
+                draw(self.out / f"{name}.png", artifact, system, levels, name, motion)
             found.append(certificate)
         console.print(table(found))
         write(self.out / "table.md", markdown(found))
@@ -156,14 +171,7 @@ def markdown(found: Sequence[Certificate]) -> str:
 
 
 def draw(
-    path: Path,
-    artifact: Artifact,
-    system: System,
-    *,
-    recorded: SettledTrajectories,
-    name: str,
-    measurement_noise: float,
-    process_noise: float,
+    path: Path, artifact: Artifact, system: System, levels: tuple[float, float], name: str, motion: SettledTrajectories
 ) -> None:
     """The PDE's residual over X, and along the motion the error that noise will make."""
     from matplotlib.colors import LogNorm
@@ -173,17 +181,15 @@ def draw(
     figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]
     first, second = (i % system.nx for i in system.portrait)
-    shown = np.random.default_rng(0).permutation(len(recorded.x))[:SHOWN]
-    variance = noise_variance(
-        artifact, recorded.z[shown], measurement_noise=measurement_noise, process_noise=process_noise
-    )
-    x, size = recorded.x[shown], np.sqrt(variance)
+    shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
+    variance = noise_variance(artifact, motion.z[shown], measurement_noise=levels[0], process_noise=levels[1])
+    x, size = motion.x[shown], np.sqrt(variance)
     order = size.argsort()
     points: Any = axes[-1].scatter(
         x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
     )
     figure.colorbar(points, ax=axes[-1], label="predicted rms error")
-    axes[-1].set_title(f"error due to noise {measurement_noise:g}, along the motion")
+    axes[-1].set_title(f"error due to noise {levels[0]:g}, along the motion")
     axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     if artifact.forward is not None:
         draw_residual(figure, axes[0], artifact, system)

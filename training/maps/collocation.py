@@ -10,7 +10,7 @@ MOTION = 20.0  # s
 SAMPLES = 400  # points along a motion
 
 
-def collocation(system: System, n: int, box_factor: float, rng: np.random.Generator) -> np.ndarray:
+def collocation(system: System, n: int, *, box_factor: float, rng: np.random.Generator) -> np.ndarray:
     """n states along motions from ``box_factor`` times X, more of them from X itself.
 
     Raises ValueError if motions leave the system's bounds too soon.

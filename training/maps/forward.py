@@ -95,7 +95,7 @@ class ForwardProblem(nn.Module):
         return ForwardMap(self.network.export(), self.x_offset, self.x_scale, self.z_offset, self.z_scale)
 
 
-def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:
+def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float) -> int:
     """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
     x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())

@@ -40,7 +40,7 @@ def solve_forward(
     """
     if np.count_nonzero(linear.A - np.diag(linear.A.diagonal())):
         raise ValueError("solving for T component by component needs a diagonal A")
-    x = collocation(system, POINTS * features, box_factor, rng)
+    x = collocation(system, POINTS * features, box_factor=box_factor, rng=rng)
     f, offset, scale = system.drift(x), x.mean(0), x.std(0)
     q = (x - offset) / scale
     centres = q[rng.integers(len(q), size=features)]

@@ -38,7 +38,22 @@ class Smooth:
 
 
 def decoder(artifact: Artifact, measurement_noise: float, process_noise: float = 0.0) -> Smooth:
-    """T_inv of free motion, long after reset, at given noise: filter states, (n, size), to estimates, (n, nx)."""
+    """T_inv of free motion long after reset, in physical units.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    measurement_noise : float
+        Standard deviation of v that the map is told.
+    process_noise : float, default 0
+        Level of w that the map is told, in multiples of the system's scale per second.
+
+    Returns
+    -------
+    Smooth
+        Filter states, (n, size), to estimates, (n, nx).
+    """
     inverse = artifact.free_inverse or artifact.inverse
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = inverse.noise_features(measurement_noise, process_noise)
@@ -49,25 +64,44 @@ def decoder(artifact: Artifact, measurement_noise: float, process_noise: float =
     bias = inverse.mlp.biases[0] - first[:, :modes] @ whiten @ inverse.z_offset + first[:, modes:] @ np.array(told)
     filtered = np.zeros((len(first), artifact.filter.size))  # the part of z that holds inputs is 0
     filtered[:, : whiten.shape[1]] = first[:, :modes] @ whiten
-    return _scaled(inverse.mlp, filtered, bias, inverse.x_scale, inverse.x_offset)
+    return _scaled(inverse.mlp, filtered, bias, scale=inverse.x_scale, offset=inverse.x_offset)
 
 
 def encoder(forward: ForwardMap) -> Smooth:
-    """T: states (n, nx) to (n, nz)."""
+    """T in physical units: states (n, nx) to (n, nz)."""
     first = forward.mlp.weights[0] / forward.x_scale
-    return _scaled(
-        forward.mlp, first, forward.mlp.biases[0] - first @ forward.x_offset, forward.z_scale, forward.z_offset
-    )
+    bias = forward.mlp.biases[0] - first @ forward.x_offset
+    return _scaled(forward.mlp, first, bias, scale=forward.z_scale, offset=forward.z_offset)
 
 
-def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, scale: np.ndarray, offset: np.ndarray) -> Smooth:
+def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, *, scale: np.ndarray, offset: np.ndarray) -> Smooth:
     weights, biases = [first, *mlp.weights[1:]], [bias, *mlp.biases[1:]]
     weights[-1], biases[-1] = scale[:, None] * weights[-1], offset + scale * biases[-1]
     return Smooth(MLP(weights, biases, mlp.activation))
 
 
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """P(x) = dT/dx f(x) - A T(x) - B h(x) at states (n, nx), (n, nz); needs a learned T."""
+    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x).
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer that holds it.
+    system : System
+        What it was made for.
+    x : ndarray, shape (n, nx)
+        Where.
+
+    Returns
+    -------
+    ndarray, shape (n, nz)
+        P in units of z per second.
+
+    Raises
+    ------
+    ValueError
+        If the observer holds no T.
+    """
     if artifact.forward is None:
         raise ValueError("this observer holds no forward map T")
     at, A, B = (torch.as_tensor(values) for values in (x, artifact.filter.A, artifact.filter.B))

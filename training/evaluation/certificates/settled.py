@@ -102,7 +102,7 @@ def record_settled(
     x0 = rng.uniform(*system.box(), (trajectories, system.nx))
     x = noisy_x = simulate(system, x0, steps, dt)
     if process_noise:
-        w = draw_process_noise(system, process_noise, trajectories, steps, rng)
+        w = draw_process_noise(system, process_noise, n=trajectories, steps=steps, rng=rng)
         noisy_x = simulate(system, x0, steps, dt, w=w)
     inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
     if 2 * inside.sum() < trajectories:
