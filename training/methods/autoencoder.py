@@ -14,7 +14,7 @@ from training.maps.networks import Network, tensor
 from training.maps.pde import along, on_tensors
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
-from training.spectrum import bessel_spectrum
+from training.spectrum import bessel_spectrum, typical_rate
 from training.trajectories.derivatives import output_matrix
 
 BATCH = 512
@@ -50,8 +50,7 @@ class AE(KKLMethod):
         """Learn for every cutoff, choose one, learn for it; the first two only where the cutoff is not settled yet."""
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
-        low, high = system.box()
-        rate = float(np.median(np.broadcast_to(system.rate(task.rng.uniform(low, high, (1000, system.nx)).T), 1000)))
+        rate = typical_rate(system, task.rng)
         chosen, share = configuration.get("cutoff"), 1.0
         if chosen is None:
             every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
@@ -81,12 +80,6 @@ class AE(KKLMethod):
         )
 
 
-def bessel_filter(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """D in real blocks with the poles of a Bessel filter of order nx + 1 at cutoff 1, and F = 1, for each output."""
-    D = bessel_spectrum(nx + 1, 1.0, norm="phase").A
-    return np.kron(np.eye(ny), D), np.kron(np.eye(ny), np.ones((len(D), 1)))
-
-
 class _Problem(nn.Module):
     """T(x, w) and T_inv(z, w) with their losses; w is drawn evenly in the logarithm between slowest and fastest.
 
@@ -97,7 +90,8 @@ class _Problem(nn.Module):
     def __init__(self, task: Task, slowest: float, fastest: float) -> None:
         super().__init__()
         system, budget, data, device = task.system, task.budget, task.data, task.device
-        self.D, self.F = bessel_filter(system.nx, system.ny)
+        unit = bessel_spectrum(system.nx + 1, 1.0, norm="phase").filter(system.ny, budget.dt)
+        self.D, self.F = unit.A, unit.B
         self.system, self.slowest, self.fastest = system, slowest, fastest
         low, high = system.box()
         states = data.x.reshape(-1, system.nx)

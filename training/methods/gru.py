@@ -31,7 +31,7 @@ class GRU(Method[Arrays]):
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """The network and its scaling."""
         torch.manual_seed(task.seed)
-        problem = _Problem(task.data, configuration["hidden"], configuration["chunk"], task.device)
+        problem = _Problem(task.data, **configuration, device=task.device)
         task.fit("gru", problem, problem.loss, LEARNING_RATE)
         arrays = {key: value.cpu().numpy() for key, value in problem.network.state_dict().items()}
         return {**arrays, **problem.scaling}
@@ -51,7 +51,7 @@ class _Network(nn.Module):
 class _Problem(nn.Module):
     """The network, and how far the current batch of trajectories has come: all of it is part of a checkpoint."""
 
-    def __init__(self, data: Data, hidden: int, chunk: int, device: torch.device) -> None:
+    def __init__(self, data: Data, *, hidden: int, chunk: int, device: torch.device) -> None:
         super().__init__()
         ny, nx = data.y.shape[-1], data.x.shape[-1]
         self.network = _Network(ny, nx, hidden).to(device)

@@ -138,8 +138,8 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
     y = rng.normal(size=(301, 3, ny))
     ages = np.array([0, 1, 2, 7, 8, 150, 300])
     expected = linear.run(y, np.zeros((300, 3, 0)), ages)
-    parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y, expected[0]))
-    found = rollout(*parts, torch.as_tensor(y.swapaxes(0, 1)), ages)
+    parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y))
+    found = rollout(*parts, z0=torch.as_tensor(expected[0]), y=torch.as_tensor(y.swapaxes(0, 1)), ages=ages)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-10, atol=1e-12)
 
 
@@ -149,9 +149,9 @@ def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
     seen = {}
     original = node.rollout
 
-    def spy(transition, early, late, z0, y, ages):
+    def spy(transition, early, late, **named):
         seen.update(transition=transition.detach().numpy(), early=early.detach().numpy(), late=late.detach().numpy())
-        return original(transition, early, late, z0, y, ages)
+        return original(transition, early, late, **named)
 
     node.rollout = spy
     try:
@@ -327,7 +327,11 @@ def test_noise_variants_see_noise_in_training(name, expected, tmp_path, monkeypa
 def test_gru_sees_every_noise_level_in_training(tmp_path):
     data = Task(Oscillator(), SMALL, tmp_path).data
     torch.manual_seed(0)
-    problem, generator, fed = _GRUProblem(data, 8, 50, torch.device("cpu")), torch.Generator().manual_seed(0), []
+    problem, generator, fed = (
+        _GRUProblem(data, hidden=8, chunk=50, device=torch.device("cpu")),
+        torch.Generator().manual_seed(0),
+        [],
+    )
     problem.network.gru.register_forward_pre_hook(lambda _, inputs: fed.append(inputs[0]))
     problem.loss(generator)
     level = problem.level[:, 0].numpy()
