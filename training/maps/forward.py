@@ -13,10 +13,24 @@ from training.maps.pde import on_tensors, residual
 
 
 def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
-    """t*, in seconds, after which at most epsilon is left of a start z0.
+    """Time t* after which at most epsilon is left of a start z0.
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
     printed upside down).
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    z0_norm : float
+        Norm of the start.
+    epsilon : float
+        What may be left, in units of z.
+
+    Returns
+    -------
+    float
+        t* in seconds.
     """
     poles, V = np.linalg.eig(linear.A)
     return float(max(0.0, np.log(np.linalg.cond(V) * z0_norm / epsilon)) / np.abs(poles.real).min())
@@ -33,7 +47,22 @@ class ForwardProblem(nn.Module):
 
     Parameters
     ----------
-    x, z : pairs, (n, nx) and (n, nz).
+    network : Network
+        From nx scaled states to nz scaled values, the map to be trained.
+    system : System
+        Its equations.
+    linear : LinearFilter
+        The filter.
+    x : ndarray, shape (n, nx)
+        States of the pairs.
+    z : ndarray, shape (n, nz)
+        Filter states of the pairs.
+    physics_weight : float
+        Weight nu of the residual.
+    batch : int
+        Number of pairs, and of collocation points, in a batch.
+    device : torch.device
+        Where the network is trained.
     """
 
     def __init__(
@@ -85,7 +114,7 @@ class ForwardProblem(nn.Module):
 
     @torch.no_grad()
     def error(self, n: int = 100_000) -> np.ndarray:
-        """z - T(x) on up to n of the data pairs, (n, nz)."""
+        """Misfit z - T(x) on up to n of the data pairs, (n, nz)."""
         rows = np.random.default_rng(0).permutation(len(self._x))[:n]
         difference = self._zs * (self._z[rows] - self.network(self._x[rows]))
         return np.asarray(difference.cpu().numpy(), dtype=float)
@@ -96,7 +125,29 @@ class ForwardProblem(nn.Module):
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float) -> int:
-    """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
+    """First sample k* by which the filter has forgotten its start along every trajectory from X.
+
+    Parameters
+    ----------
+    system : System
+        What the filter observes.
+    linear : LinearFilter
+        The filter.
+    steps : int
+        Length of the trajectories in sampling intervals.
+    epsilon : float
+        What may be left of the start, in units of z.
+
+    Returns
+    -------
+    int
+        k*.
+
+    Raises
+    ------
+    ValueError
+        If the trajectories end before.
+    """
     x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
     t = truncation_time(linear, z0, epsilon)

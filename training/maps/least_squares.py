@@ -17,26 +17,38 @@ RIDGE = 1e-5
 def solve_forward(
     system: System, linear: LinearFilter, *, features: int, box_factor: float, rng: np.random.Generator
 ) -> ForwardMap:
-    """T with random features and an output layer that solves the PDE in the mean square.
+    """Solve for T with random features and an output layer that fulfils the PDE in the mean square.
 
     With A diagonal, dT/dx f = A T + B h is one linear equation for each component of T. For T_i = w . phi(x) with fixed
     features phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point: linear least squares,
     solved in float64 by a QR factorisation with a small ridge. Rows are divided by the local speed plus the rate of the
-    mode, as in :class:`training.forward.ForwardProblem`. No filter is simulated.
+    mode, as in :class:`training.maps.forward.ForwardProblem`. No filter is simulated.
 
     Collocation points lie along motions, because the equation transports T along them: a box that motions leave and
     enter holds T only up to what came in, and its corners are where it then goes wrong.
 
     Parameters
     ----------
-    system, linear : the system and its filter, A diagonal.
-    features : tanh units; the time grows with their cube, a minute for 1,500.
-    box_factor : motions start in this multiple of X.
-    rng : of features and points.
+    system : System
+        The system.
+    linear : LinearFilter
+        Its filter, A diagonal.
+    features : int
+        Number of tanh units; the time grows with their cube, a minute for 1,500.
+    box_factor : float
+        Motions start in this multiple of X.
+    rng : Generator
+        Of features and points.
+
+    Returns
+    -------
+    ForwardMap
+        T.
 
     Raises
     ------
-    ValueError : if A is not diagonal, or hardly any motion stays within the system's bounds.
+    ValueError
+        If A is not diagonal, or hardly any motion stays within the system's bounds.
     """
     if np.count_nonzero(linear.A - np.diag(linear.A.diagonal())):
         raise ValueError("solving for T component by component needs a diagonal A")

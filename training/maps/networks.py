@@ -13,7 +13,21 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 
 
 class Network(nn.Sequential):
-    """A multilayer perceptron of ``depth`` hidden layers of ``width``."""
+    """A multilayer perceptron that begins with Glorot's normal weights and no biases.
+
+    Parameters
+    ----------
+    inputs : int
+        Width of the input.
+    outputs : int
+        Width of the output.
+    width : int
+        Neurons in each hidden layer.
+    depth : int
+        Number of hidden layers.
+    activation : {"tanh", "silu"}
+        Of the hidden layers.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
@@ -46,7 +60,22 @@ def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 def from_mlp(mlp: MLP, *, device: torch.device | None = None, dtype: torch.dtype = torch.float32) -> nn.Sequential:
-    """The torch network of a multilayer perceptron for NumPy, not to be trained further."""
+    """Put a multilayer perceptron for NumPy into torch, not to be trained further.
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network.
+    device : torch.device, optional
+        Where it is to live.
+    dtype : torch.dtype, default torch.float32
+        Of its weights.
+
+    Returns
+    -------
+    Sequential
+        The same network.
+    """
     layers: list[nn.Module] = []
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
         layer = nn.Linear(weight.shape[1], weight.shape[0], device=device, dtype=dtype)

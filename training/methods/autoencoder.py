@@ -133,7 +133,7 @@ class _Problem(nn.Module):
         return torch.cat([self._states[rows], self._low + self._span * uniform])
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Reconstruction and PDE residual, the latter relative to the local speed as in :mod:`training.forward`."""
+        """Reconstruction, and PDE residual relative to the local speed as in :mod:`training.maps.forward`."""
         x = self.draw(BATCH, generator)
         position = torch.rand((BATCH, 1), generator=generator, device=x.device)
         w = self.slowest * (self.fastest / self.slowest) ** position
@@ -151,7 +151,7 @@ class _Problem(nn.Module):
         }
 
     def best_cutoff(self, n: int = 1000, candidates: int = 25) -> float:
-        """The cutoff that minimises sensitivity x (noise gain + transient gain) over the range."""
+        """The cutoff of least sensitivity x (noise gain + transient gain), among some over the range, on n states."""
         x = self.draw(n, torch.Generator(self._states.device).manual_seed(0))
         frequencies = np.geomspace(1e-3, 1e3, 400)
         eye = np.eye(len(self.D))

@@ -86,7 +86,7 @@ class UntunedEKF(EKF):
 
 
 def faster(system: System, factor: float) -> System:
-    """The system with time running faster."""
+    """Let time run faster by a factor for a system."""
 
     class Faster(type(system)):  # type: ignore[misc]
         name = f"{system.name}-faster"

@@ -79,6 +79,17 @@ class Decoder(nn.Module):
 
     The components of z are nearly collinear. Its principal directions are scaled to unit variance down to
     ``SOFT_FLOOR`` of the largest: full whitening would have to follow the spectrum as it is learned.
+
+    Parameters
+    ----------
+    network : Network
+        From nz coordinates to nx scaled states.
+    linear : LinearFilter
+        The filter with the initial spectrum.
+    data : Data
+        Training trajectories.
+    device : torch.device
+        Where the network is trained.
     """
 
     def __init__(self, network: Network, linear: LinearFilter, data: Data, *, device: torch.device) -> None:
@@ -105,7 +116,19 @@ class Decoder(nn.Module):
 
 
 class Batches:
-    """Random trajectories at random ages."""
+    """Random trajectories at random ages.
+
+    Parameters
+    ----------
+    data : Data
+        Training trajectories.
+    decoder : Decoder
+        Whose scaling of the states is taken.
+    noise : float
+        Standard deviation of the noise that is added to y.
+    device : torch.device
+        Where batches are made.
+    """
 
     def __init__(self, data: Data, decoder: Decoder, *, noise: float, device: torch.device) -> None:
         self._ages, self._noise = data.ages, noise

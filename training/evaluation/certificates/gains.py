@@ -9,7 +9,7 @@ from training.maps.smooth import decoder
 
 
 def theorem_gain(linear: LinearFilter) -> float:
-    """Gain by which a bounded noise may move z in the paper's theorem 4 (sec. 7): cond(V) |B| / |lambda_min(A)|."""
+    """Most that a bounded noise may move z by the paper's theorem 4 (sec. 7): cond(V) |B| / |lambda_min(A)|."""
     poles, V = np.linalg.eig(linear.A)
     return float(np.linalg.cond(V) * np.linalg.norm(linear.B, 2) / np.abs(poles.real).min())
 
