@@ -140,6 +140,7 @@ class _Problem(nn.Module):
         scaled, f = (x - self._xo) / self._xs, on_tensors(self.system.f, x) / self._xs
         z, derivative = along(lambda s: self.encode(s, w), scaled, f)
         h = on_tensors(self.system.h, x)
+        # The residual of the scaled z, where A = w D and B = w F are others in each row.
         steady = (self.z_offset + self.z_scale * z) @ self._D.T + h @ self._F.T
         residual = (derivative - w * steady / self.z_scale) / (f.norm(dim=-1, keepdim=True) + w)
         reconstruction = ((self.decode(z, w) - scaled) ** 2).mean()
