@@ -9,19 +9,24 @@ from observers import LinearFilter
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
     """Covariance of the filter's error due to unit white noise on the output, by the number of samples since reset.
 
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    ages : ndarray of int, shape (n,)
+        Samples since reset, sorted.
+
+    Returns
+    -------
+    ndarray, shape (n, size, size)
+        For a standard deviation of 1; the covariance is proportional to its square.
+
+    Notes
+    -----
     With e_k the part of z_k that the noise v_0, ..., v_k causes, e_0 = E v_0 and
     e_k+1 = Phi e_k + early v_k + late v_k+1: neighbouring increments share a sample of noise. What is uncorrelated
     with v_k is s_k = e_k - late v_k, for which s_k+1 = Phi s_k + (Phi late + early) v_k; that recursion is summed
     exactly. Many samples after reset the covariance is the solution of its discrete Lyapunov equation.
-
-    Parameters
-    ----------
-    linear : the filter.
-    ages : samples since reset, sorted, shape (n,).
-
-    Returns
-    -------
-    (n, size, size), for sigma_v = 1; it is proportional to sigma_v^2.
     """
     phi, late = linear.transition, linear.late_y
     drive = phi @ late + linear.early_y
@@ -41,13 +46,13 @@ def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
 
 
 def stationary_covariance(linear: LinearFilter) -> np.ndarray:
-    """The limit of :func:`noise_covariance` at great ages, (size, size)."""
+    """Limit of :func:`noise_covariance` at great ages, (size, size)."""
     phi, late = linear.transition, linear.late_y
     drive = phi @ late + linear.early_y
     return np.asarray(solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
 
 
 def root(covariance: np.ndarray) -> np.ndarray:
-    """A matrix R with R R^T = covariance, also where rounding made small eigenvalues negative."""
+    """Matrices R with R R^T = covariance, (..., size, size), also where rounding made small eigenvalues negative."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])

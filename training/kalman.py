@@ -1,90 +1,169 @@
 """Kalman filters that know the equations of motion: what a control engineer would try first."""
 
-from typing import Any
+from abc import ABC, abstractmethod
 
 import numpy as np
+import torch
 
-from kkl_gym.simulate import advance, advance_batch
+from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 NOISE_FLOOR = 0.01  # the least standard deviation of measurement noise that a filter assumes
 
+Gaussian = tuple[np.ndarray, np.ndarray]
+"""Means (n, nx) and covariances (n, nx, nx) of a batch, or those of one Gaussian, (nx,) and (nx, nx)."""
 
-def unknown_start(system: System) -> tuple[np.ndarray, np.ndarray]:
+
+def unknown_start(system: System) -> Gaussian:
     """Mean (nx,) and covariance (nx, nx) of a start uniform in X."""
     low, high = system.box()
     return (low + high) / 2, np.diag((high - low) ** 2 / 12)
 
 
-class ExtendedKalmanFilter:
-    """A batch of continuous-discrete extended Kalman filters in NumPy (Jazwinski, 1970, sec. 8.3).
+class KalmanFilter(ABC):
+    """A batch of continuous-discrete Kalman filters in NumPy.
 
-    Mean and sensitivity Phi are integrated together over each sample, P = Phi P Phi^T + Q dt. A filter whose
-    mean leaves the system's declared bounds starts anew.
+    A filter that loses its way, out of the system's declared bounds or to a covariance that is none, starts anew.
 
     Parameters
     ----------
-    system : the model.
-    dt : sampling interval in seconds.
-    Q : intensity of the process noise, (nx, nx), per second.
-    R : covariance of the measurement noise, (ny, ny).
-    start : its mean (nx,) and covariance (nx, nx); None is a start uniform in X.
+    system : System
+        The model.
+    dt : float
+        Sampling interval in seconds.
+    Q : ndarray, shape (nx, nx)
+        Intensity of the process noise, per second.
+    R : ndarray, shape (ny, ny)
+        Covariance of the measurement noise on each sample.
+    start : tuple of ndarray, shapes (nx,) and (nx, nx), optional
+        Mean and covariance of the start; by default those of a start uniform in X.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n, nx)
+        Estimates.
+    P : ndarray, shape (n, nx, nx)
+        Their covariances.
     """
 
     def __init__(
-        self,
-        system: System,
-        dt: float,
-        *,
-        Q: np.ndarray,
-        R: np.ndarray,
-        start: tuple[np.ndarray, np.ndarray] | None = None,
+        self, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray, start: Gaussian | None = None
     ) -> None:
         self._system, self._dt, self._Q, self._R = system, dt, Q, R
         self._start = start or unknown_start(system)
-        self._joint = with_sensitivity(system)
-        self._outputs = jacobian(system.h, system.nx)
         self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
-        """The start, corrected by the first sample."""
-        x0, P0 = self._start
-        n = len(y0)
-        self.x, self.P = self._corrected(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), y0)
+        """Begin with the start, corrected by the first sample.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (n, ny)
+            First samples, which also say how many filters there are.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            Estimates.
+        """
+        self.x, self.P = self._corrected(*self._starts(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
-        """Begin anew in some rows, boolean (n,), from their first samples, (number of rows, ny)."""
-        x0, P0 = self._start
-        n = len(y0)
+        """Begin anew in some rows.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (number of rows, ny)
+            Their first samples.
+        rows : ndarray of bool, shape (n,)
+            Which rows.
+        """
         self.x, self.P = self.x.copy(), self.P.copy()
-        self.x[rows], self.P[rows] = self._corrected(np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1)), y0)
+        self.x[rows], self.P[rows] = self._corrected(*self._starts(len(y0)), y0)
 
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Predict over one sample under the input u, (n, nu) or None for zero, and correct."""
+        """Predict over one sample and correct.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n, ny)
+            The next samples.
+        u : ndarray, shape (n, nu), optional
+            Inputs held since the samples before; zero by default.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            Estimates.
+        """
         self.advance(y, u)
         return self.decode()
 
     def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """:meth:`step` without the estimate; with ``rows``, boolean (n,), in these rows only."""
-        n, nx = self.x.shape
-        Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
-        joint = np.concatenate([self.x.T, Phi0])
-        held = np.zeros((self._joint.nu, n)) if u is None else np.ascontiguousarray(u.T, dtype=float)
-        joint = advance_batch(self._joint, joint, held, np.zeros_like(joint), self._dt)
-        x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
-        x, P = self._corrected(x, Phi @ self.P @ Phi.mT + self._Q * self._dt, y)
+        """Do what :meth:`step` does without the estimate, in some rows only if ``rows`` are given.
+
+        Parameters
+        ----------
+        y : ndarray, shape (n, ny)
+            The next samples.
+        u : ndarray, shape (n, nu), optional
+            Inputs held since the samples before; zero by default.
+        rows : ndarray of bool, shape (n,), optional
+            Which rows move; by default all of them.
+        """
+        held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
+        x, P = self._corrected(*self._predicted(held), y)
         if rows is not None:
             x, P = np.where(rows[:, None], x, self.x), np.where(rows[:, None, None], P, self.P)
         self.x, self.P = x, P
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """The estimate as things stand, (n, nx), or of some rows only."""
+        """Estimates as things stand, (n, nx), or those of some rows only."""
         return self.x.copy() if rows is None else self.x[rows]
 
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        inside = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+    def _starts(self, n: int) -> Gaussian:
+        x0, P0 = self._start
+        return np.tile(x0, (n, 1)), np.tile(P0, (n, 1, 1))
+
+    def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
+        inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
+        return inside
+
+    @abstractmethod
+    def _predicted(self, u: np.ndarray) -> Gaussian:
+        """Mean and covariance one sample later under held inputs, (nu, n)."""
+
+    @abstractmethod
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+        """Mean and covariance given the samples y, (n, ny); lost filters start anew."""
+
+
+class ExtendedKalmanFilter(KalmanFilter):
+    """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3).
+
+    Mean and sensitivity Phi are integrated together over each sample, P = Phi P Phi^T + Q dt. A filter whose predicted
+    mean leaves the system's declared bounds starts anew. Parameters are those of :class:`KalmanFilter`.
+    """
+
+    def __init__(
+        self, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray, start: Gaussian | None = None
+    ) -> None:
+        super().__init__(system, dt, Q=Q, R=R, start=start)
+        self._joint = with_sensitivity(system)
+        self._outputs = jacobian(system.h, system.nx)
+
+    def _predicted(self, u: np.ndarray) -> Gaussian:
+        n, nx = self.x.shape
+        Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
+        joint = np.concatenate([self.x.T, Phi0])
+        joint = advance_batch(self._joint, joint, u, np.zeros_like(joint), self._dt)
+        x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
+        return x, Phi @ self.P @ Phi.mT + self._Q * self._dt
+
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+        inside = self._inside(x, P)
         if not inside.all():
             x, P = x.copy(), P.copy()
             x[~inside], P[~inside] = self._start
@@ -96,64 +175,59 @@ class ExtendedKalmanFilter:
         return x, I_KH @ P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
 
 
-class UnscentedFilters:
-    """filterpy's filter for each row of a batch; one that loses positive definiteness or its bounds starts anew."""
+class UnscentedKalmanFilter(KalmanFilter):
+    """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
+
+    The sigma points are van der Merwe's scaled ones with alpha = 1, beta = 2 and kappa = 3 - nx: the mean, and the mean
+    +- sqrt(3) times each column of the covariance's Cholesky factor. They are drawn anew between prediction and
+    correction. A filter starts anew if its corrected mean leaves the system's declared bounds, or if its covariance is
+    no longer positive definite. Parameters are those of :class:`KalmanFilter`.
+    """
 
     def __init__(
-        self,
-        system: System,
-        dt: float,
-        *,
-        Q: np.ndarray,
-        R: np.ndarray,
-        start: tuple[np.ndarray, np.ndarray] | None = None,
+        self, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray, start: Gaussian | None = None
     ) -> None:
-        self._system, self._dt, self._Q, self._R = system, dt, Q, R
-        self._start = start or unknown_start(system)
-        self._low, self._high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
+        super().__init__(system, dt, Q=Q, R=R, start=start)
+        nx = system.nx
+        self._mean_weights = np.array([(3 - nx) / 3, *[1 / 6] * (2 * nx)])
+        self._weights = self._mean_weights + np.array([2.0, *[0.0] * (2 * nx)])
 
-    def reset(self, y0: np.ndarray) -> np.ndarray:
-        """The start, corrected by the first sample."""
-        self._filters = [self._fresh() for _ in y0]
-        for one, y in zip(self._filters, y0, strict=True):
-            self._begin(one, y)
-        return self._estimates()
+    @np.errstate(over="ignore", invalid="ignore")
+    def _predicted(self, u: np.ndarray) -> Gaussian:
+        points = self._sigma_points(self.x, self.P)
+        count, n, nx = points.shape
+        flat = np.ascontiguousarray(points.reshape(-1, nx).T)
+        moved = advance_batch(self._system, flat, np.tile(u, count), np.zeros_like(flat), self._dt)
+        x, spread = self._moments(moved.T.reshape(count, n, nx))
+        return x, self._covariance(spread, spread) + self._Q * self._dt
 
-    def step(self, y: np.ndarray) -> np.ndarray:
-        """Predict over one sample and correct."""
-        for i, (one, value) in enumerate(zip(self._filters, y, strict=True)):
-            try:
-                one.predict()
-                one.update(value)
-                lost = not ((one.x >= self._low) & (one.x <= self._high)).all()
-            except (np.linalg.LinAlgError, ValueError):  # the covariance is no longer positive definite or finite
-                lost = True
-            if lost:
-                self._filters[i] = one = self._fresh()
-                self._begin(one, value)
-        return self._estimates()
+    @np.errstate(over="ignore", invalid="ignore")
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+        x, P = self._updated(x, P, y)
+        lost = ~self._inside(x, P)
+        if lost.any():
+            x[lost], P[lost] = self._updated(*self._starts(int(lost.sum())), y[lost])
+        return x, P
 
-    def _estimates(self) -> np.ndarray:
-        return np.array([one.x for one in self._filters]).reshape(-1, self._system.nx)
+    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+        points = self._sigma_points(x, P)
+        expected, spread = self._moments(self._system.output(points))
+        S = self._covariance(spread, spread) + self._R
+        K = np.linalg.solve(S, self._covariance(spread, points - x)).mT
+        return x + (K @ (y - expected)[..., None])[..., 0], P - K @ S @ K.mT
 
-    def _begin(self, one: Any, y: np.ndarray) -> None:
-        one.sigmas_f = one.points_fn.sigma_points(one.x, one.P)
-        one.update(y)
+    def _sigma_points(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
+        """Points (2 nx + 1, n, nx); NaN where P is not positive definite."""
+        factor, failed = torch.linalg.cholesky_ex(torch.as_tensor(3.0 * P))
+        columns = np.where(failed.numpy()[:, None], np.nan, np.moveaxis(factor.numpy(), -1, 0))
+        return np.concatenate([x[None], x + columns, x - columns])
 
-    def _fresh(self) -> Any:
-        from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+    def _moments(self, points: np.ndarray) -> Gaussian:
+        """Weighted mean (n, k) of transformed points (2 nx + 1, n, k), and what the points differ from it by."""
+        mean = np.tensordot(self._mean_weights, points, 1)
+        return mean, points - mean
 
-        system = self._system
-        no_input, no_noise = [0.0] * system.nu, [0.0] * system.nx
-
-        def fx(x: np.ndarray, dt: float) -> np.ndarray:
-            return np.array(advance(system, x.tolist(), no_input, no_noise, dt))
-
-        def hx(x: np.ndarray) -> np.ndarray:
-            return np.array(system.h(x))
-
-        points = MerweScaledSigmaPoints(system.nx, alpha=1.0, beta=2.0, kappa=3.0 - system.nx)
-        one = UnscentedKalmanFilter(system.nx, system.ny, self._dt, hx, fx, points)
-        one.x, one.P = (value.copy() for value in self._start)
-        one.Q, one.R = self._Q * self._dt, self._R
-        return one
+    def _covariance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Weighted sum over points of outer products of (2 nx + 1, n, k) and (2 nx + 1, n, l), as (n, k, l)."""
+        products: np.ndarray = np.einsum("s,snk,snl->nkl", self._weights, a, b)
+        return products

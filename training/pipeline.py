@@ -167,7 +167,7 @@ class _Run:
         self.steps = max(1, round(config.duration / config.dt))
         first = 0
         if config.pipeline == "spinn":
-            first = truncation_step(system, self.linear, self.steps, config.truncation)
+            first = truncation_step(system, self.linear, steps=self.steps, epsilon=config.truncation)
         self.ages = recording_ages(first, self.steps, config.samples)
 
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
@@ -213,7 +213,7 @@ class _Run:
             report(1)
             some = np.random.default_rng(0).permutation(len(x))[:100_000]
             T, error = on_torch(forward, device), z[some] - forward(x[some])
-            points = collocation(system, INVERTED, config.box_factor, self.rng)
+            points = collocation(system, INVERTED, box_factor=config.box_factor, rng=self.rng)
             return forward, ForwardMapSampler(
                 T, error, box=system.box(), batch=config.batch, device=device, points=points
             )

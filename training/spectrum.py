@@ -13,7 +13,15 @@ from observers import LinearFilter
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenvalues of A for each output: real ones, and pairs (a, w) of a +- iw."""
+    """Eigenvalues of A for each output.
+
+    Parameters
+    ----------
+    eigenvalues : tuple of float
+        Real ones, in 1/s.
+    pairs : tuple of tuple of float
+        Complex pairs a +- iw as (a, w), in 1/s and rad/s.
+    """
 
     eigenvalues: tuple[float, ...] = ()
     pairs: tuple[tuple[float, float], ...] = ()
@@ -25,7 +33,7 @@ class Spectrum:
 
     @property
     def poles(self) -> np.ndarray:
-        """All of them, complex, (modes,)."""
+        """All eigenvalues, complex, (modes,)."""
         above = [complex(a, w) for a, w in self.pairs]
         return np.array([*map(complex, self.eigenvalues), *above, *np.conj(above)])
 
@@ -38,13 +46,41 @@ class Spectrum:
         return np.asarray(block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
 
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
-        """The filter with these modes for each of ny outputs, B all ones for each output."""
+        """The filter with these modes for each output, driven by B = 1.
+
+        Parameters
+        ----------
+        ny : int
+            Number of outputs.
+        dt : float
+            Sampling interval in seconds.
+        nu : int, default 0
+            Number of inputs that it takes in.
+
+        Returns
+        -------
+        LinearFilter
+            One whose A has ny blocks.
+        """
         A = self.A
         return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
 
 
 def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """n real eigenvalues from slowest to fastest, both negative, evenly spaced in the logarithm."""
+    """Space real eigenvalues evenly in the logarithm.
+
+    Parameters
+    ----------
+    n : int
+        How many.
+    slowest, fastest : float
+        The first and the last, both negative, in 1/s.
+
+    Returns
+    -------
+    tuple of float
+        The eigenvalues.
+    """
     return tuple((-np.geomspace(-slowest, -fastest, n)).tolist())
 
 
@@ -54,16 +90,50 @@ def papers_spectrum(system: System) -> tuple[float, ...]:
 
 
 def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "mag") -> Spectrum:
-    """The poles of a Bessel filter of an order at a cutoff in rad/s, which ``norm`` defines as in scipy.signal."""
+    """Poles of an analogue Bessel filter.
+
+    Parameters
+    ----------
+    order : int
+        How many.
+    cutoff : float
+        In rad/s.
+    norm : {"mag", "phase"}, default "mag"
+        What the cutoff means, as in :func:`scipy.signal.bessel`: where the gain is -3 dB, or where the phase is at its
+        middle.
+
+    Returns
+    -------
+    Spectrum
+        The poles, a real one first if the order is odd.
+    """
     _, poles, _ = besselap(order, norm=norm)
     real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
     return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))
 
 
-def typical_rate(system: System) -> float:
-    """Median over X of how fast f changes, in 1/s; raises ValueError if the system does not say."""
+def typical_rate(system: System, rng: np.random.Generator | None = None) -> float:
+    """Median over X of how fast f changes.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    rng : Generator, optional
+        Of the 1,000 states at which ``system.rate`` is asked; by default always the same ones.
+
+    Returns
+    -------
+    float
+        The rate in 1/s.
+
+    Raises
+    ------
+    ValueError
+        If the rate is zero or not finite.
+    """
     low, high = system.box()
-    points = np.random.default_rng(0).uniform(low, high, (1000, system.nx)).T
+    points = (rng or np.random.default_rng(0)).uniform(low, high, (1000, system.nx)).T
     rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
     if not 0 < rate < np.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")

@@ -16,14 +16,9 @@ from observers import Artifact
 from observers.storage import replacing, write
 from training import markdown
 from training.commands.options import Observers, OwnSystem, read_observers
-from training.evaluation.certificates.certificate import (
-    QUANTILES,
-    Certificate,
-    SettledTrajectories,
-    certify,
-    noise_variance,
-    record_settled,
-)
+from training.evaluation.certificates.certificate import QUANTILES, Certificate, certify
+from training.evaluation.certificates.gains import noise_variance
+from training.evaluation.certificates.settled import SettledTrajectories, record_settled
 from training.evaluation.report import draw_residual
 
 SHOWN = 30_000  # states in the figure
@@ -83,7 +78,14 @@ class Certify:
             with console.status(f"certifying {name}"):
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
                 levels = (self.measurement_noise, process_noise)
-                motion = record_settled(artifact, system, levels, trajectories=self.trajectories, seed=self.seed)
+                motion = record_settled(
+                    artifact,
+                    system,
+                    measurement_noise=self.measurement_noise,
+                    process_noise=process_noise,
+                    trajectories=self.trajectories,
+                    seed=self.seed,
+                )
                 certificate = certify(
                     artifact,
                     system,
@@ -94,7 +96,7 @@ class Certify:
                     delta=self.delta,
                     seed=self.seed,
                     name=name,
-                    motion=motion,
+                    recorded=motion,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
                 draw(self.out / f"{name}.png", artifact, system, name=name, levels=levels, motion=motion)
@@ -229,7 +231,8 @@ def draw(
     axes = figure.subplots(1, panels, squeeze=False)[0]
     first, second = (i % system.nx for i in system.portrait)
     shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
-    x, size = motion.x[shown], np.sqrt(noise_variance(artifact, motion.z[shown], *levels))
+    variance = noise_variance(artifact, motion.z[shown], measurement_noise=levels[0], process_noise=levels[1])
+    x, size = motion.x[shown], np.sqrt(variance)
     order = size.argsort()
     points: Any = axes[-1].scatter(
         x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None

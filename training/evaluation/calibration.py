@@ -122,8 +122,8 @@ def sound_trajectories(
     while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
         u = np.zeros((steps, missing, system.nu))
         if artifact.nu:
-            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt, rng)
-        w = draw_process_noise(system, system.process_noise, missing, steps, rng)
+            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng)
+        w = draw_process_noise(system, system.process_noise, n=missing, steps=steps, rng=rng)
         x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))
@@ -145,7 +145,7 @@ def _limits(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Limits of mean, low and high at one noise level, each (ny,)."""
     dt = artifact.filter.dt
-    y = noisy_output(system, x, level, rng)
+    y = noisy_output(system, x, measurement_noise=level, rng=rng)
     observer = KKLObserver(artifact, level, process_noise=system.process_noise)
     residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
     a = -np.expm1(-dt / WINDOW)

@@ -167,10 +167,12 @@ def unseen_trajectories(
     rng = generator(stream, seed)
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
-    u = random_inputs(system, n, steps, dt, rng, ("steps", "sine")) if driven else np.zeros((steps, n, system.nu))
+    u = np.zeros((steps, n, system.nu))
+    if driven:
+        u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
     w = None
     if process_noise:
-        w = draw_process_noise(system, process_noise, n, steps, generator(stream, seed, 2))
+        w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
     x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
@@ -208,7 +210,7 @@ def errors(
         One for each trajectory.
     """
     rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(system, trajectories.x, measurement_noise, rng)
+    y = noisy_output(system, trajectories.x, measurement_noise=measurement_noise, rng=rng)
     observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
     x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
     first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)

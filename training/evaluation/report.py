@@ -55,7 +55,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     t = np.arange(len(x)) * artifact.filter.dt
     for column, noise in enumerate((0.0, 0.5)):
         level = min(noise, artifact.inverse.measurement_noise_max)
-        y = noisy_output(system, x, level, rng)
+        y = noisy_output(system, x, measurement_noise=level, rng=rng)
         x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])

@@ -10,10 +10,29 @@ MOTION = 20.0  # s
 SAMPLES = 400  # points along a motion
 
 
-def collocation(system: System, n: int, box_factor: float, rng: np.random.Generator) -> np.ndarray:
-    """n states along motions from ``box_factor`` times X, more of them from X itself.
+def collocation(system: System, n: int, *, box_factor: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw states along motions, more of which start in X than in the rest of a larger box.
 
-    Raises ValueError if motions leave the system's bounds too soon.
+    Parameters
+    ----------
+    system : System
+        What moves.
+    n : int
+        Number of states.
+    box_factor : float
+        The larger box is this multiple of X.
+    rng : Generator
+        Of everything random.
+
+    Returns
+    -------
+    ndarray, shape (n, nx)
+        States in random order.
+
+    Raises
+    ------
+    ValueError
+        If motions leave the system's bounds too soon.
     """
     motions = max(50, 2 * n // SAMPLES)
     near = round(NEAR * motions)

@@ -17,9 +17,14 @@ class Coordinates:
     The components of z are nearly collinear, with variances that spread over ten orders of magnitude; a network
     in float32 cannot read them unless they are whitened.
 
-    offset : (size,).
-    whiten : (modes, size), sorted by falling ratio of signal to noise.
-    noise_gain : (modes,), standard deviation of each coordinate's noise at sigma_v = 1.
+    Parameters
+    ----------
+    offset : ndarray, shape (size,)
+        What is subtracted from z.
+    whiten : ndarray, shape (modes, size)
+        What the rest is multiplied by; rows are sorted by falling ratio of signal to noise.
+    noise_gain : ndarray, shape (modes,)
+        Standard deviation of each coordinate's noise where that of y is 1.
     """
 
     offset: np.ndarray
@@ -32,7 +37,20 @@ class Coordinates:
 
 
 def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
-    """Coordinates from samples of z, (n, size), and the covariance of the noise in z, (size, size)."""
+    """Find the coordinates for a filter's states.
+
+    Parameters
+    ----------
+    z : ndarray, shape (n, size)
+        Samples without noise.
+    noise : ndarray, shape (size, size)
+        Covariance of the noise in z where the standard deviation of that on y is 1.
+
+    Returns
+    -------
+    Coordinates
+        Without the directions that hold rounding errors only.
+    """
     offset, scale = z.mean(0), z.std(0)
     scale = np.where(scale > 0, scale, 1.0)
     _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)

@@ -9,19 +9,28 @@ from torch import nn
 from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
 from training.maps.networks import Network, tensor
-
-
-def on_tensors(function: object, x: torch.Tensor) -> torch.Tensor:
-    """A system's f or h on states (n, nx)."""
-    values = function(x.unbind(-1))  # type: ignore[operator]
-    return torch.stack([torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(len(x)) for value in values], -1)
+from training.maps.pde import on_tensors, residual
 
 
 def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
-    """t*, in seconds, after which at most epsilon is left of a start z0.
+    """Time t* after which at most epsilon is left of a start z0.
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
     printed upside down).
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    z0_norm : float
+        Norm of the start.
+    epsilon : float
+        What may be left, in units of z.
+
+    Returns
+    -------
+    float
+        t* in seconds.
     """
     poles, V = np.linalg.eig(linear.A)
     return float(max(0.0, np.log(np.linalg.cond(V) * z0_norm / epsilon)) / np.abs(poles.real).min())
@@ -38,7 +47,22 @@ class ForwardProblem(nn.Module):
 
     Parameters
     ----------
-    x, z : pairs, (n, nx) and (n, nz).
+    network : Network
+        From nx scaled states to nz scaled values, the map to be trained.
+    system : System
+        Its equations.
+    linear : LinearFilter
+        The filter.
+    x : ndarray, shape (n, nx)
+        States of the pairs.
+    z : ndarray, shape (n, nz)
+        Filter states of the pairs.
+    physics_weight : float
+        Weight nu of the residual.
+    batch : int
+        Number of pairs, and of collocation points, in a batch.
+    device : torch.device
+        Where the network is trained.
     """
 
     def __init__(
@@ -80,14 +104,9 @@ class ForwardProblem(nn.Module):
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
-        f = on_tensors(self.system.f, x) / self._xs
-        scaled = (x - self._xo) / self._xs
-        value, derivative = torch.func.jvp(self.network, (scaled,), (f,))  # type: ignore[misc]
-        T = self._zo + self._zs * value
-        h = on_tensors(self.system.h, x)
-        return self._zs * derivative - T @ self._A.T - h @ self._B.T, f.norm(dim=-1)
+        f, h = on_tensors(self.system.f, x), on_tensors(self.system.h, x)
+        return residual(self.T, x, f=f, h=h, A=self._A, B=self._B), (f / self._xs).norm(dim=-1)
 
-    @torch.no_grad()
     def T(self, x: torch.Tensor) -> torch.Tensor:
         """The learned map at states (n, nx), (n, nz)."""
         z: torch.Tensor = self._zo + self._zs * self.network((x - self._xo) / self._xs)
@@ -95,7 +114,7 @@ class ForwardProblem(nn.Module):
 
     @torch.no_grad()
     def error(self, n: int = 100_000) -> np.ndarray:
-        """z - T(x) on up to n of the data pairs, (n, nz)."""
+        """Misfit z - T(x) on up to n of the data pairs, (n, nz)."""
         rows = np.random.default_rng(0).permutation(len(self._x))[:n]
         difference = self._zs * (self._z[rows] - self.network(self._x[rows]))
         return np.asarray(difference.cpu().numpy(), dtype=float)
@@ -105,8 +124,30 @@ class ForwardProblem(nn.Module):
         return ForwardMap(self.network.export(), self.x_offset, self.x_scale, self.z_offset, self.z_scale)
 
 
-def truncation_step(system: System, linear: LinearFilter, steps: int, epsilon: float) -> int:
-    """k*, the first sample by which every trajectory from the training box has forgotten its z0 to epsilon."""
+def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float) -> int:
+    """First sample k* by which the filter has forgotten its start along every trajectory from X.
+
+    Parameters
+    ----------
+    system : System
+        What the filter observes.
+    linear : LinearFilter
+        The filter.
+    steps : int
+        Length of the trajectories in sampling intervals.
+    epsilon : float
+        What may be left of the start, in units of z.
+
+    Returns
+    -------
+    int
+        k*.
+
+    Raises
+    ------
+    ValueError
+        If the trajectories end before.
+    """
     x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
     t = truncation_time(linear, z0, epsilon)

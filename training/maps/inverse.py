@@ -8,7 +8,17 @@ from training.maps.samplers import Sampler
 
 
 class InverseProblem(nn.Module):
-    """The inverse network with the running mean square error of each cell."""
+    """The inverse network with the running mean square error of each cell.
+
+    Parameters
+    ----------
+    network : Network
+        From a batch's inputs to scaled states.
+    sampler : Sampler
+        Where batches are from.
+    device : torch.device
+        Where the network is trained.
+    """
 
     def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
         super().__init__()
@@ -22,8 +32,16 @@ class InverseProblem(nn.Module):
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Mean square error of a batch, each cell relative to its own running error.
 
-        That loss stays near one while all cells improve; "error", the geometric mean of the cells' root mean square
-        errors in scaled states, is what falls.
+        Parameters
+        ----------
+        generator : torch.Generator
+            Of the batch.
+
+        Returns
+        -------
+        dict of str to Tensor
+            "loss", which stays near one while all cells improve, and "error", the geometric mean of the cells' root
+            mean square errors in scaled states, which falls.
         """
         inputs, x, weight, cell = self.sampler(generator)
         square = weight * ((self.network(inputs) - x) ** 2).mean(-1)

@@ -13,7 +13,21 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 
 
 class Network(nn.Sequential):
-    """A multilayer perceptron of ``depth`` hidden layers of ``width``."""
+    """A multilayer perceptron that begins with Glorot's normal weights and no biases.
+
+    Parameters
+    ----------
+    inputs : int
+        Width of the input.
+    outputs : int
+        Width of the output.
+    width : int
+        Neurons in each hidden layer.
+    depth : int
+        Number of hidden layers.
+    activation : {"tanh", "silu"}
+        Of the hidden layers.
+    """
 
     def __init__(self, inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
@@ -45,20 +59,40 @@ def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
     return torch.as_tensor(np.ascontiguousarray(x, dtype=np.float32), device=device)
 
 
-def on_torch(forward: ForwardMap, device: torch.device) -> Callable[[torch.Tensor], torch.Tensor]:
-    """A forward map on tensors, (n, nx) to (n, nz), in float32."""
-    mlp = forward.mlp
+def from_mlp(mlp: MLP, *, device: torch.device | None = None, dtype: torch.dtype = torch.float32) -> nn.Sequential:
+    """Put a multilayer perceptron for NumPy into torch, not to be trained further.
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network.
+    device : torch.device, optional
+        Where it is to live.
+    dtype : torch.dtype, default torch.float32
+        Of its weights.
+
+    Returns
+    -------
+    Sequential
+        The same network.
+    """
     layers: list[nn.Module] = []
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
-        layer = nn.Linear(weight.shape[1], weight.shape[0], device=device)
-        layer.weight.data, layer.bias.data = tensor(weight, device), tensor(bias, device)
+        layer = nn.Linear(weight.shape[1], weight.shape[0], device=device, dtype=dtype)
+        layer.weight.data, layer.bias.data = (
+            torch.as_tensor(values, device=device, dtype=dtype) for values in (weight, bias)
+        )
         layers += [layer, ACTIVATIONS[mlp.activation]()]
-    network = nn.Sequential(*layers[:-1])
+    return nn.Sequential(*layers[:-1]).requires_grad_(False)
+
+
+def on_torch(forward: ForwardMap, device: torch.device) -> Callable[[torch.Tensor], torch.Tensor]:
+    """A forward map on tensors, (n, nx) to (n, nz), in float32."""
+    network = from_mlp(forward.mlp, device=device)
     xo, xs, zo, zs = (
         tensor(values, device) for values in (forward.x_offset, forward.x_scale, forward.z_offset, forward.z_scale)
     )
 
-    @torch.no_grad()
     def T(x: torch.Tensor) -> torch.Tensor:
         z: torch.Tensor = zo + zs * network((x - xo) / xs)
         return z

@@ -1,55 +1,59 @@
 """Maps as differentiable functions in float64: values, Jacobians, and the residual of the forward map's equation."""
 
-from dataclasses import dataclass
-
 import numpy as np
+import torch
 
 from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap
+from training.maps import pde
+from training.maps.networks import from_mlp
+
+CHUNK = 4096  # points whose Jacobians are taken at once
 
 
-@dataclass(frozen=True)
 class Smooth:
-    """A multilayer perceptron between physical units: scalings are part of the first and the last layer.
+    """A multilayer perceptron between physical units, in float64 and differentiable.
 
-    weights : for each layer (outputs, inputs), float64.
-    biases : for each layer (outputs,).
-    activation : after every layer but the last.
+    Parameters
+    ----------
+    mlp : MLP
+        The network, scalings being part of its first and last layer. Weights in float64 lose nothing.
     """
 
-    weights: tuple[np.ndarray, ...]
-    biases: tuple[np.ndarray, ...]
-    activation: str
+    def __init__(self, mlp: MLP) -> None:
+        weights, biases = ([np.asarray(values, float) for values in part] for part in (mlp.weights, mlp.biases))
+        self.mlp = MLP(weights, biases, mlp.activation)
+        self.network = from_mlp(mlp, dtype=torch.float64)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """(n, inputs) to (n, outputs)."""
-        return self._forward(x)[0]
+        y: np.ndarray = self.network(torch.as_tensor(x, dtype=torch.float64)).numpy()
+        return y
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Derivatives at (n, inputs), as (n, outputs, inputs)."""
-        _, slopes = self._forward(x)
-        out = np.broadcast_to(self.weights[-1], (len(x), *self.weights[-1].shape))
-        for weight, slope in zip(self.weights[-2::-1], slopes[::-1], strict=True):
-            out = (out * slope[:, None]) @ weight
-        return out
-
-    def _forward(self, x: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Values, and the slopes of the hidden layers' activations."""
-        h, slopes = np.asarray(x, dtype=float), []
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            a = h @ weight.T + bias
-            if self.activation == "tanh":
-                h = np.tanh(a)
-                slopes.append(1.0 - h * h)
-            else:
-                sigmoid = 0.5 + 0.5 * np.tanh(0.5 * a)
-                h = a * sigmoid
-                slopes.append(sigmoid * (1.0 + a * (1.0 - sigmoid)))
-        return h @ self.weights[-1].T + self.biases[-1], slopes
+        derivative = torch.func.vmap(torch.func.jacrev(self.network), chunk_size=CHUNK)
+        J: np.ndarray = derivative(torch.as_tensor(x, dtype=torch.float64)).numpy()
+        return J
 
 
 def decoder(artifact: Artifact, measurement_noise: float, process_noise: float = 0.0) -> Smooth:
-    """T_inv of free motion, long after reset, at given noise: filter states, (n, size), to estimates, (n, nx)."""
+    """T_inv of free motion long after reset, in physical units.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    measurement_noise : float
+        Standard deviation of v that the map is told.
+    process_noise : float, default 0
+        Level of w that the map is told, in multiples of the system's scale per second.
+
+    Returns
+    -------
+    Smooth
+        Filter states, (n, size), to estimates, (n, nx).
+    """
     inverse = artifact.free_inverse or artifact.inverse
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = inverse.noise_features(measurement_noise, process_noise)
@@ -60,29 +64,47 @@ def decoder(artifact: Artifact, measurement_noise: float, process_noise: float =
     bias = inverse.mlp.biases[0] - first[:, :modes] @ whiten @ inverse.z_offset + first[:, modes:] @ np.array(told)
     filtered = np.zeros((len(first), artifact.filter.size))  # the part of z that holds inputs is 0
     filtered[:, : whiten.shape[1]] = first[:, :modes] @ whiten
-    return _scaled(inverse.mlp, filtered, bias, inverse.x_scale, inverse.x_offset)
+    return _scaled(inverse.mlp, filtered, bias, scale=inverse.x_scale, offset=inverse.x_offset)
 
 
 def encoder(forward: ForwardMap) -> Smooth:
-    """T: states (n, nx) to (n, nz)."""
+    """T in physical units: states (n, nx) to (n, nz)."""
     first = forward.mlp.weights[0] / forward.x_scale
-    return _scaled(
-        forward.mlp, first, forward.mlp.biases[0] - first @ forward.x_offset, forward.z_scale, forward.z_offset
-    )
+    bias = forward.mlp.biases[0] - first @ forward.x_offset
+    return _scaled(forward.mlp, first, bias, scale=forward.z_scale, offset=forward.z_offset)
 
 
-def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, scale: np.ndarray, offset: np.ndarray) -> Smooth:
+def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, *, scale: np.ndarray, offset: np.ndarray) -> Smooth:
     weights, biases = [first, *mlp.weights[1:]], [bias, *mlp.biases[1:]]
     weights[-1], biases[-1] = scale[:, None] * weights[-1], offset + scale * biases[-1]
-    return Smooth(
-        tuple(np.asarray(w, float) for w in weights), tuple(np.asarray(b, float) for b in biases), mlp.activation
-    )
+    return Smooth(MLP(weights, biases, mlp.activation))
 
 
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
-    """P(x) = dT/dx f(x) - A T(x) - B h(x) at states (n, nx), (n, nz); needs a learned T."""
+    """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x).
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer that holds it.
+    system : System
+        What it was made for.
+    x : ndarray, shape (n, nx)
+        Where.
+
+    Returns
+    -------
+    ndarray, shape (n, nz)
+        P in units of z per second.
+
+    Raises
+    ------
+    ValueError
+        If the observer holds no T.
+    """
     if artifact.forward is None:
         raise ValueError("this observer holds no forward map T")
-    T = encoder(artifact.forward)
-    along = np.einsum("nij,nj->ni", T.jacobian(x), system.drift(x))
-    return np.asarray(along - T(x) @ artifact.filter.A.T - system.output(x) @ artifact.filter.B.T)
+    at, A, B = (torch.as_tensor(values) for values in (x, artifact.filter.A, artifact.filter.B))
+    f, h = pde.on_tensors(system.f, at), pde.on_tensors(system.h, at)
+    P: np.ndarray = pde.residual(encoder(artifact.forward).network, at, f=f, h=h, A=A, B=B).numpy()
+    return P

@@ -10,11 +10,11 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
-from training.maps.forward import on_tensors
 from training.maps.networks import Network, tensor
+from training.maps.pde import along, on_tensors
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
-from training.spectrum import bessel_spectrum
+from training.spectrum import bessel_spectrum, typical_rate
 from training.trajectories.derivatives import output_matrix
 
 BATCH = 512
@@ -50,8 +50,7 @@ class AE(KKLMethod):
         """Learn for every cutoff, choose one, learn for it; the first two only where the cutoff is not settled yet."""
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
-        low, high = system.box()
-        rate = float(np.median(np.broadcast_to(system.rate(task.rng.uniform(low, high, (1000, system.nx)).T), 1000)))
+        rate = typical_rate(system, task.rng)
         chosen, share = configuration.get("cutoff"), 1.0
         if chosen is None:
             every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])
@@ -81,12 +80,6 @@ class AE(KKLMethod):
         )
 
 
-def bessel_filter(nx: int, ny: int) -> tuple[np.ndarray, np.ndarray]:
-    """D in real blocks with the poles of a Bessel filter of order nx + 1 at cutoff 1, and F = 1, for each output."""
-    D = bessel_spectrum(nx + 1, 1.0, norm="phase").A
-    return np.kron(np.eye(ny), D), np.kron(np.eye(ny), np.ones((len(D), 1)))
-
-
 class _Problem(nn.Module):
     """T(x, w) and T_inv(z, w) with their losses; w is drawn evenly in the logarithm between slowest and fastest.
 
@@ -97,7 +90,8 @@ class _Problem(nn.Module):
     def __init__(self, task: Task, slowest: float, fastest: float) -> None:
         super().__init__()
         system, budget, data, device = task.system, task.budget, task.data, task.device
-        self.D, self.F = bessel_filter(system.nx, system.ny)
+        unit = bessel_spectrum(system.nx + 1, 1.0, norm="phase").filter(system.ny, budget.dt)
+        self.D, self.F = unit.A, unit.B
         self.system, self.slowest, self.fastest = system, slowest, fastest
         low, high = system.box()
         states = data.x.reshape(-1, system.nx)
@@ -139,17 +133,14 @@ class _Problem(nn.Module):
         return torch.cat([self._states[rows], self._low + self._span * uniform])
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Reconstruction and PDE residual, the latter relative to the local speed as in :mod:`training.forward`."""
+        """Reconstruction, and PDE residual relative to the local speed as in :mod:`training.maps.forward`."""
         x = self.draw(BATCH, generator)
         position = torch.rand((BATCH, 1), generator=generator, device=x.device)
         w = self.slowest * (self.fastest / self.slowest) ** position
         scaled, f = (x - self._xo) / self._xs, on_tensors(self.system.f, x) / self._xs
-
-        def at(s: torch.Tensor) -> torch.Tensor:
-            return self.encode(s, w)
-
-        z, derivative = torch.func.jvp(at, (scaled,), (f,))  # type: ignore[misc]
+        z, derivative = along(lambda s: self.encode(s, w), scaled, f)
         h = on_tensors(self.system.h, x)
+        # The residual of the scaled z, where A = w D and B = w F are others in each row.
         steady = (self.z_offset + self.z_scale * z) @ self._D.T + h @ self._F.T
         residual = (derivative - w * steady / self.z_scale) / (f.norm(dim=-1, keepdim=True) + w)
         reconstruction = ((self.decode(z, w) - scaled) ** 2).mean()
@@ -161,7 +152,7 @@ class _Problem(nn.Module):
         }
 
     def best_cutoff(self, n: int = 1000, candidates: int = 25) -> float:
-        """The cutoff that minimises sensitivity x (noise gain + transient gain) over the range."""
+        """The cutoff of least sensitivity x (noise gain + transient gain), among some over the range, on n states."""
         x = self.draw(n, torch.Generator(self._states.device).manual_seed(0))
         frequencies = np.geomspace(1e-3, 1e3, 400)
         eye = np.eye(len(self.D))

@@ -55,12 +55,12 @@ class DMF(Method[Arrays]):
             network = Network(
                 linear.size, system.nx, width=budget.width, depth=budget.depth, activation=budget.activation
             )
-            decoder = Decoder(network, linear, task.data, task.device)
+            decoder = Decoder(network, linear, task.data, device=task.device)
             start = Network(inputs, linear.size, width=budget.width, depth=2, activation=budget.activation)
-            return _Stage(decoder, start, linear, task.device)
+            return _Stage(decoder, start, linear, device=task.device)
 
         transient, asymptotic = stage(system.ny), stage(system.nx)
-        batches = Batches(task.data, transient.decoder, self.noise, task.device)
+        batches = Batches(task.data, transient.decoder, noise=self.noise, device=task.device)
         y_offset, y_scale = task.data.y.mean((0, 1)), task.data.y.std((0, 1))
         offset, scale = torch.as_tensor(y_offset).double(), torch.as_tensor(y_scale).double()
 
@@ -102,7 +102,7 @@ class DMFNoise(DMF):
 class _Stage(nn.Module):
     """One filter with its decoder, and the network that gives its start."""
 
-    def __init__(self, decoder: Decoder, start: Network, linear: LinearFilter, device: torch.device) -> None:
+    def __init__(self, decoder: Decoder, start: Network, linear: LinearFilter, *, device: torch.device) -> None:
         super().__init__()
         self.decoder, self.start, self.dt = decoder, start.to(device), linear.dt
         self._S = torch.diag(torch.as_tensor(np.sqrt(-linear.A.diagonal()), device=device))
@@ -127,7 +127,7 @@ class _Stage(nn.Module):
 
     def run(self, z0: torch.Tensor, y: torch.Tensor, ages: np.ndarray) -> torch.Tensor:
         """Filter states at ``ages``, (m, n, nz)."""
-        return rollout(self.A(), self.B, torch.zeros_like(self.B), z0, y, ages)
+        return rollout(self.A(), self.B, torch.zeros_like(self.B), z0=z0, y=y, ages=ages)
 
     def export(self) -> Arrays:
         """What the observer needs at run time."""
@@ -148,7 +148,15 @@ def _unpack(arrays: Arrays, name: str) -> MLP:
 
 
 class Switching:
-    """Both observers side by side; the estimate is that of the smaller filtered innovation."""
+    """Both observers side by side; the estimate is that of the smaller filtered innovation.
+
+    Parameters
+    ----------
+    arrays : dict of str to ndarray
+        What :meth:`DMF.train` returned.
+    system : System
+        Whose h the innovations take.
+    """
 
     def __init__(self, arrays: Arrays, system: System) -> None:
         self._system = system

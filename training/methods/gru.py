@@ -31,7 +31,7 @@ class GRU(Method[Arrays]):
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """The network and its scaling."""
         torch.manual_seed(task.seed)
-        problem = _Problem(task.data, configuration["hidden"], configuration["chunk"], task.device)
+        problem = _Problem(task.data, **configuration, device=task.device)
         task.fit("gru", problem, problem.loss, LEARNING_RATE)
         arrays = {key: value.cpu().numpy() for key, value in problem.network.state_dict().items()}
         return {**arrays, **problem.scaling}
@@ -51,7 +51,7 @@ class _Network(nn.Module):
 class _Problem(nn.Module):
     """The network, and how far the current batch of trajectories has come: all of it is part of a checkpoint."""
 
-    def __init__(self, data: Data, hidden: int, chunk: int, device: torch.device) -> None:
+    def __init__(self, data: Data, *, hidden: int, chunk: int, device: torch.device) -> None:
         super().__init__()
         ny, nx = data.y.shape[-1], data.x.shape[-1]
         self.network = _Network(ny, nx, hidden).to(device)
@@ -98,7 +98,13 @@ class _Problem(nn.Module):
 
 
 class Recurrent:
-    """The trained network as an observer."""
+    """The trained network as an observer.
+
+    Parameters
+    ----------
+    arrays : dict of str to ndarray
+        What :meth:`GRU.train` returned.
+    """
 
     def __init__(self, arrays: Arrays) -> None:
         hidden, ny = arrays["gru.weight_hh_l0"].shape[1], arrays["gru.weight_ih_l0"].shape[1]

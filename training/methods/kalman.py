@@ -1,44 +1,54 @@
-"""Kalman filters that know the equations of motion: what a control engineer would try first."""
+"""Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
 
 from typing import Any, ClassVar
 
 import numpy as np
 
 from kkl_gym.system import Components, System
-from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter, UnscentedFilters, unknown_start
+from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
-# Process noise, in multiples of each state's scale per square root of a second: what stands for the filters'
-# own errors of linearisation, for there is none in the trajectories.
-PROCESS_NOISE = (1e-3, 1e-2, 1e-1)
+# Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of a second:
+# white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
+# linearisation, for there is none in the trajectories.
+DIFFUSION = (1e-3, 1e-2, 1e-1)
 
 
 class EKF(Method[Arrays]):
-    """Extended Kalman filter with the exact model and noise level; its process noise is chosen on validation.
+    """Extended Kalman filter with the exact model and noise level; its diffusion is chosen on validation.
 
     The start is unknown to it: the centre of X, with the covariance of a uniform draw from X.
     """
 
     name: ClassVar[str] = "ekf"
     label: ClassVar[str] = "EKF"
+    filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of process noise."""
-        return tuple({"process_noise": level} for level in PROCESS_NOISE)
+        """Three levels of diffusion, in multiples of the scale per square root of a second."""
+        return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
-        return {"process_noise": np.array([configuration["process_noise"]])}
+        return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
         """The filter, told the noise level."""
-        Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
+        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2)
         R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
-        return ExtendedKalmanFilter(self.model(system), dt, Q=Q, R=R)
+        return self.filter(self.model(system), dt, Q=Q, R=R)
 
     def model(self, system: System) -> System:
         """The equations that the filter believes in."""
         return system
+
+
+class UKF(EKF):
+    """Unscented Kalman filter with the exact model and noise level, tuned as the EKF is."""
+
+    name: ClassVar[str] = "ukf"
+    label: ClassVar[str] = "UKF"
+    filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
 
 
 class WrongEKF(EKF):
@@ -66,31 +76,17 @@ class UntunedEKF(EKF):
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
-        return {"process_noise": np.array([1.0])}
+        return {}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
-        """The filter."""
+        """The filter, told nothing."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))
 
 
-class UKF(EKF):
-    """filterpy's unscented Kalman filter with the exact model and noise level, tuned as the EKF is."""
-
-    name: ClassVar[str] = "ukf"
-    label: ClassVar[str] = "UKF"
-    trajectories: ClassVar[int | None] = 10
-
-    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
-        """One filter for each trajectory."""
-        Q = np.diag((trained["process_noise"] * np.array(system.scale)) ** 2)
-        R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
-        return UnscentedFilters(system, dt, Q=Q, R=R)
-
-
 def faster(system: System, factor: float) -> System:
-    """The system with time running faster."""
+    """Let time run faster by a factor for a system."""
 
     class Faster(type(system)):  # type: ignore[misc]
         name = f"{system.name}-faster"

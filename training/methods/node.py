@@ -40,9 +40,10 @@ class NODE(KKLMethod):
         fastest, slowest = configuration["spectrum"]
         linear = Spectrum(spectrum(system, fastest, slowest)).filter(system.ny, budget.dt)
         network = Network(linear.size, system.nx, width=budget.width, depth=budget.depth, activation=budget.activation)
-        decoder = Decoder(network, linear, task.data, task.device)
-        problem = _Problem(decoder, -linear.A.diagonal()[: linear.size // system.ny], system.ny, budget.dt, task.device)
-        batches = Batches(task.data, decoder, self.noise, task.device)
+        decoder = Decoder(network, linear, task.data, device=task.device)
+        rates = -linear.A.diagonal()[: linear.size // system.ny]
+        problem = _Problem(decoder, rates, ny=system.ny, dt=budget.dt, device=task.device)
+        batches = Batches(task.data, decoder, noise=self.noise, device=task.device)
         task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=1e-2)
         eigenvalues = tuple(problem.theta().tolist())
         return Artifact(
@@ -75,7 +76,7 @@ class NODENoise(NODE):
 class _Problem(nn.Module):
     """The decoder and the logarithms of the rates -theta, the same for each output."""
 
-    def __init__(self, decoder: Decoder, rates: np.ndarray, ny: int, dt: float, device: torch.device) -> None:
+    def __init__(self, decoder: Decoder, rates: np.ndarray, *, ny: int, dt: float, device: torch.device) -> None:
         super().__init__()
         self.decoder, self.ny, self.dt = decoder, ny, dt
         self._log_rates = torch.as_tensor(np.log(rates), device=device)
@@ -97,5 +98,5 @@ class _Problem(nn.Module):
         late = (torch.expm1(s) - s) / (self.theta() * s)
         z0 = y[:, 0] @ block(-1.0 / self.theta()).T
         transition = torch.kron(eye, torch.diag(s.exp()))
-        z = rollout(transition, block(hold - late), block(late), z0, y, ages)
+        z = rollout(transition, block(hold - late), block(late), z0=z0, y=y, ages=ages)
         return {"loss": distance(self.decoder(z), x)}

@@ -28,26 +28,33 @@ def rollout(
     transition: torch.Tensor,
     early: torch.Tensor,
     late: torch.Tensor,
+    *,
     z0: torch.Tensor,
     y: torch.Tensor,
     ages: np.ndarray,
 ) -> torch.Tensor:
-    """States of z_k+1 = transition z_k + early y_k + late y_k+1 at some ages.
+    """Run z_k+1 = transition z_k + early y_k + late y_k+1 and take its states at some ages.
 
     Between two ages the filter moves in one jump, by powers of the transition, so that fifty seconds of samples cost
     no more operations than there are ages.
 
     Parameters
     ----------
-    transition : (nz, nz).
-    early, late : (nz, ny).
-    z0 : (n, nz).
-    y : (n, steps + 1, ny).
-    ages : sorted, not negative, (m,).
+    transition : Tensor, shape (nz, nz)
+        Of the state.
+    early, late : Tensor, shape (nz, ny)
+        Of the sample before and the one after.
+    z0 : Tensor, shape (n, nz)
+        Starts.
+    y : Tensor, shape (n, steps + 1, ny)
+        Outputs at every sample.
+    ages : ndarray of int, shape (m,)
+        Samples since the start, sorted, not negative.
 
     Returns
     -------
-    (m, n, nz).
+    Tensor, shape (m, n, nz)
+        States.
     """
     gaps = np.diff(ages, prepend=0)
     powers = torch.eye(len(transition), dtype=transition.dtype, device=transition.device)[None]
@@ -72,9 +79,20 @@ class Decoder(nn.Module):
 
     The components of z are nearly collinear. Its principal directions are scaled to unit variance down to
     ``SOFT_FLOOR`` of the largest: full whitening would have to follow the spectrum as it is learned.
+
+    Parameters
+    ----------
+    network : Network
+        From nz coordinates to nx scaled states.
+    linear : LinearFilter
+        The filter with the initial spectrum.
+    data : Data
+        Training trajectories.
+    device : torch.device
+        Where the network is trained.
     """
 
-    def __init__(self, network: Network, linear: LinearFilter, data: Data, device: torch.device) -> None:
+    def __init__(self, network: Network, linear: LinearFilter, data: Data, *, device: torch.device) -> None:
         super().__init__()
         y = data.y[:, :500].astype(float)
         z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
@@ -98,9 +116,21 @@ class Decoder(nn.Module):
 
 
 class Batches:
-    """Random trajectories at random ages."""
+    """Random trajectories at random ages.
 
-    def __init__(self, data: Data, decoder: Decoder, noise: float, device: torch.device) -> None:
+    Parameters
+    ----------
+    data : Data
+        Training trajectories.
+    decoder : Decoder
+        Whose scaling of the states is taken.
+    noise : float
+        Standard deviation of the noise that is added to y.
+    device : torch.device
+        Where batches are made.
+    """
+
+    def __init__(self, data: Data, decoder: Decoder, *, noise: float, device: torch.device) -> None:
         self._ages, self._noise = data.ages, noise
         self._y = tensor(data.y.transpose(1, 0, 2), device)
         self._x = tensor((data.x - decoder.x_offset) / decoder.x_scale, device)

@@ -21,7 +21,11 @@ GROUPS = 50  # of closed-loop trajectories with a noise level and a time for whi
 class ClosedLoop(Trajectories):
     """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw.
 
-    measurement_noise : its standard deviation along each trajectory, (n,).
+    Parameters
+    ----------
+    measurement_noise : ndarray, shape (n,)
+        Its standard deviation along each trajectory. The other parameters are those of
+        :class:`training.trajectories.record.Trajectories`.
     """
 
     measurement_noise: np.ndarray
@@ -41,16 +45,48 @@ def record_closed_loop(
     process_noise_share: float = 0.0,
     report: Callable[[int], None] = lambda done: None,
 ) -> ClosedLoop:
-    """Simulate n trajectories from starts in the training box, in which the controller acts on x_hat, with exploration.
+    """Simulate trajectories from starts in X, in which the controller acts on x_hat, with exploration.
 
-    Never on the true state: such inputs would tell the observer, which filters them, what it is to find out by itself.
-    For the same reason noise is not added afterwards, but is what the observer and through it the controller saw.
-    Groups of trajectories differ in noise level and in how long an action is held, and if the observer is told it in
-    the level of process noise; rows in how much is added to an action. ``noise_free_share``, ``high_noise_emphasis``
-    and ``process_noise_share`` are those of :class:`training.config.Config`, of groups. Trajectories that leave the
-    declared bounds are dropped, so that there may be fewer than n.
+    The controller never acts on the true state: such inputs would tell the observer, which filters them, what it is to
+    find out by itself. For the same reason noise is not added afterwards, but is what the observer and through it the
+    controller saw. Groups of trajectories differ in noise level, in how long an action is held, and in the level of
+    process noise if the observer is told it. Trajectories of a group differ in how much is added to an action.
 
-    Raises ValueError if that happens to more than half of them.
+    Parameters
+    ----------
+    system : System
+        What is simulated.
+    artifact : Artifact
+        The observer.
+    controller : callable
+        Estimates (n, nx) to actions (n, nu) in [-1, 1].
+    n : int
+        Number of trajectories.
+    steps : int
+        Their length in sampling intervals of the observer.
+    ages : ndarray of int, shape (m,)
+        Samples at which to record, sorted.
+    rng : Generator
+        Of everything random.
+    noise_free_share : float, default 0.2
+        Share of the groups without measurement noise, as in :class:`training.config.Config`. The maps that ship were
+        made with the defaults of this and the next.
+    high_noise_emphasis : float, default 2
+        How often levels of measurement noise are high, as there.
+    process_noise_share : float, default 0
+        Share of the groups with process noise, as there, if the observer is told its level.
+    report : callable, optional
+        Told the number of trajectories that are there so far.
+
+    Returns
+    -------
+    ClosedLoop
+        The trajectories that stayed within the system's bounds, perhaps fewer than n.
+
+    Raises
+    ------
+    ValueError
+        If more than half of them leave the bounds.
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
@@ -76,7 +112,7 @@ def record_closed_loop(
         w = np.zeros_like(x)
         u = np.zeros((count, system.nu))
         for k in range(steps + 1):
-            y = noisy_output(system, x.T, level, rng)
+            y = noisy_output(system, x.T, measurement_noise=level, rng=rng)
             if k == 0:
                 observer.reset(y)
             else:
@@ -87,7 +123,7 @@ def record_closed_loop(
                 action = controller(observer.decode()) + amplitude * rng.uniform(-1, 1, (count, system.nu))
                 u = np.clip(action, -1.0, 1.0) * u_max
             if disturbance:
-                w = np.ascontiguousarray(draw_process_noise(system, disturbance, count, 1, rng)[0].T)
+                w = np.ascontiguousarray(draw_process_noise(system, disturbance, n=count, steps=1, rng=rng)[0].T)
             after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
             inside &= ((after >= low) & (after <= high)).all(0)
             x = np.where(inside, after, x)

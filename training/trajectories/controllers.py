@@ -11,16 +11,28 @@ from training.trajectories.derivatives import linearised
 Controller = Callable[[np.ndarray], np.ndarray]
 """States (n, nx) in, actions (n, nu) in [-1, 1] out."""
 
-
-INPUT_WEIGHT = 0.1
+INPUT_WEIGHT = 0.1  # beside a weight of 1 on the states, both in units of their typical sizes
 
 
 def linear_quadratic(system: System) -> Controller:
-    """u = -K (x - target), cut at the input bounds: the linear-quadratic regulator of the linearisation at the target.
+    """Linear-quadratic regulator of the linearisation at the target, u = -K (x - target) cut at the input bounds.
 
     Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input.
 
-    Raises numpy.linalg.LinAlgError if the linearisation cannot be stabilised.
+    Parameters
+    ----------
+    system : System
+        What is to be held at its target.
+
+    Returns
+    -------
+    Controller
+        The regulator.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the linearisation cannot be stabilised.
     """
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)

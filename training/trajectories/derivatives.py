@@ -9,7 +9,25 @@ from kkl_gym.system import Box, Components, System
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
-    """Derivatives of f or h from its own equations: for each component, those that are not zero by state."""
+    """Derivatives of f or h from its own equations.
+
+    Parameters
+    ----------
+    equations : callable
+        A system's f or h.
+    nx : int
+        Number of states.
+
+    Returns
+    -------
+    list of dict
+        For each component the derivatives that are not zero, as functions of the states by index of the state.
+
+    Raises
+    ------
+    ValueError
+        If the equations do not take sympy symbols.
+    """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
     x = sympy.symbols(f"x:{nx}", real=True)
@@ -25,7 +43,7 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
 
 def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
-    """What :func:`jacobian` returned, at states (..., nx), as (..., rows, nx)."""
+    """Evaluate what :func:`jacobian` returned at states (..., nx), as (..., rows, nx)."""
     out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
     for i, row in enumerate(rows):
         for j, derivative in row.items():
@@ -34,16 +52,31 @@ def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """df/dx, g and dh/dx at a state x: (nx, nx), (nx, nu) and (ny, nx)."""
+    """Linearise a system at a state x: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx)."""
     g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
     at = np.array(x, dtype=float)
     return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
-    """The system beside its variational equation: states (x, Phi row by row), x' = f(x) + G u, Phi' = df/dx Phi.
+    """Put a system beside its variational equation, x' = f(x) + G u and Phi' = df/dx Phi.
 
-    Raises ValueError if it is ``driven`` through an input matrix that depends on the state.
+    Parameters
+    ----------
+    system : System
+        The system.
+    driven : bool, default True
+        Whether it keeps its inputs.
+
+    Returns
+    -------
+    System
+        One whose states are x and then Phi row by row.
+
+    Raises
+    ------
+    ValueError
+        If it is driven through an input matrix that depends on the state, or f does not take sympy symbols.
     """
     nx, rows = system.nx, jacobian(system.f, system.nx)
     nu = system.nu if driven else 0
@@ -74,7 +107,7 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
 
 
 def output_matrix(system: System) -> np.ndarray | None:
-    """C if the output is h(x) = C x, else None."""
+    """C, (ny, nx), if the output is h(x) = C x, else None."""
     C = system.output(np.eye(system.nx)).T
     x = np.random.default_rng(0).uniform(*system.box(), (100, system.nx))
     return C if np.allclose(system.output(x), x @ C.T, rtol=1e-9, atol=1e-12) else None

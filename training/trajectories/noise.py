@@ -5,19 +5,38 @@ simulates; measurement noise in :mod:`training.maps.samplers`, into the filter's
 :mod:`training.filter_noise` gives it.
 """
 
-from typing import Any
-
 import numpy as np
 
 from kkl_gym.system import System
 
 
-def draw_process_noise(system: System, level: Any, n: int, steps: int, rng: np.random.Generator) -> np.ndarray:
-    """w held over each sample, (steps, n, nx): uniform up to a level (one, or (n,)) in multiples of the scale per s."""
+def draw_process_noise(
+    system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw process noise, uniform in a box and held over each sampling interval.
+
+    Parameters
+    ----------
+    system : System
+        What it is to disturb.
+    level : float or ndarray, shape (n,)
+        Largest magnitude in multiples of the system's scale per second, for all trajectories or each of them.
+    n : int
+        Number of trajectories.
+    steps : int
+        Number of sampling intervals.
+    rng : Generator
+        Of everything random.
+
+    Returns
+    -------
+    ndarray, shape (steps, n, nx)
+        w in units of the states per second.
+    """
     bound = np.multiply.outer(level, system.scale)
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))
 
 
-def noisy_output(system: System, x: np.ndarray, measurement_noise: float, rng: np.random.Generator) -> np.ndarray:
-    """h(x) at states (..., nx) with Gaussian noise of this standard deviation on every sample, (..., ny)."""
+def noisy_output(system: System, x: np.ndarray, *, measurement_noise: float, rng: np.random.Generator) -> np.ndarray:
+    """Measure states (..., nx) with Gaussian noise of this standard deviation on every output, (..., ny)."""
     return system.output(x) + measurement_noise * rng.standard_normal((*x.shape[:-1], system.ny))

@@ -21,10 +21,16 @@ CONSTANT_LEAD_IN = 20.0  # seconds for which constant ones do
 class Trajectories:
     """Trajectories of a system, measured without noise, with the filter running beside them from its own start.
 
-    ages : samples since reset at which they were recorded, sorted, (m,).
-    x : (m, n, nx).
-    z : (m, n, size of the filter's state).
-    process_noise : its level along each trajectory, (n,), in multiples of the system's scale per second.
+    Parameters
+    ----------
+    ages : ndarray of int, shape (m,)
+        Samples since reset at which they were recorded, sorted.
+    x : ndarray, shape (m, n, nx)
+        States.
+    z : ndarray, shape (m, n, size)
+        The filter's.
+    process_noise : ndarray, shape (n,)
+        Its level along each trajectory, in multiples of the system's scale per second.
     """
 
     ages: np.ndarray
@@ -37,12 +43,17 @@ class Trajectories:
 class Motions:
     """What trajectories are drawn from, beside uniform starts in the training box.
 
-    kinds : of random inputs, see :func:`training.trajectories.signals.random_inputs`; without any, there are no inputs.
-    lead_in_share : share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
-    lead_in_input : these inputs are constant, up to so many times their bounds, for CONSTANT_LEAD_IN seconds; or, if it
-        is 0, random ones within their bounds, for RANDOM_LEAD_IN seconds.
-    process_noise_share : share of the trajectories with process noise, at any level up to the system's own, high ones
-        more often.
+    Parameters
+    ----------
+    kinds : tuple of str
+        Of random inputs, see :func:`training.trajectories.signals.random_inputs`; without any there are no inputs.
+    lead_in_share : float, default 0
+        Share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
+    lead_in_input : float, default 0
+        If positive, these inputs are constant, up to so many times their bounds, for CONSTANT_LEAD_IN seconds. If 0,
+        they are random within their bounds, for RANDOM_LEAD_IN seconds.
+    process_noise_share : float, default 0
+        Share of the trajectories with process noise, at any level up to the system's own, high ones more often.
     """
 
     kinds: tuple[str, ...] = ()
@@ -52,9 +63,21 @@ class Motions:
 
 
 def recording_ages(first: int, steps: int, n: int) -> np.ndarray:
-    """At most n ages from ``first`` to ``steps``, even in time; from 0, half of them even in the logarithm instead.
+    """Ages at which to record trajectories.
 
-    Those catch the transient.
+    Parameters
+    ----------
+    first : int
+        The least age in samples. From 0, half of the ages are even in the logarithm, which catches the transient.
+    steps : int
+        The greatest age.
+    n : int
+        How many ages at most.
+
+    Returns
+    -------
+    ndarray of int, shape (at most n,)
+        Samples since reset, sorted, otherwise even in time.
     """
     if first > 0:
         return np.unique(np.linspace(first, steps, n).round()).astype(int)
@@ -74,10 +97,36 @@ def record(
     motions: Motions | None = None,
     report: Callable[[int], None] = lambda done: None,
 ) -> Trajectories:
-    """Simulate n trajectories and run the filter beside them.
+    """Simulate trajectories and run the filter beside them.
 
-    ``motions`` are undriven if the filter takes no inputs; None is all kinds of inputs. ``report`` is told how many
-    there are so far; for the rest see :func:`trajectories`.
+    Parameters
+    ----------
+    system : System
+        What is simulated.
+    linear : LinearFilter
+        The filter.
+    n : int
+        Number of trajectories.
+    steps : int
+        Their length in sampling intervals of the filter.
+    ages : ndarray of int, shape (m,)
+        Samples at which to record, sorted.
+    rng : Generator
+        Of everything random.
+    motions : Motions, optional
+        What to draw from, undriven if the filter takes no inputs; by default all kinds of inputs.
+    report : callable, optional
+        Told the number of trajectories that are there so far.
+
+    Returns
+    -------
+    Trajectories
+        What was recorded.
+
+    Raises
+    ------
+    ValueError
+        If hardly any trajectory stays within the system's bounds.
     """
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
@@ -102,14 +151,39 @@ def trajectories(
     rng: np.random.Generator,
     motions: Motions | None = None,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """n trajectories from starts in the training box, in chunks.
+    """Simulate trajectories from starts in the training box, in chunks.
 
-    States and inputs, (steps (+ 1), CHUNK, ...), and the level of process noise, (CHUNK,). Those that leave the
-    declared bounds are replaced by new ones of the same kind: driven alike, and led from X or not.
+    Those that leave the system's bounds are replaced by new ones of the same kind: driven alike, and led from X or not.
+    Starts and process noise are drawn anew.
 
-    ``motions`` None is the plainest: no inputs, no process noise, starts in X.
+    Parameters
+    ----------
+    system : System
+        What is simulated.
+    n : int
+        Number of trajectories.
+    steps : int
+        Their length in sampling intervals.
+    dt : float
+        Sampling interval in seconds.
+    rng : Generator
+        Of everything random.
+    motions : Motions, optional
+        What to draw from; by default there are no inputs and no process noise, and starts lie in X.
 
-    Raises ValueError if hardly any stays within the bounds.
+    Yields
+    ------
+    x : ndarray, shape (steps + 1, at most CHUNK, nx)
+        States.
+    u : ndarray, shape (steps, at most CHUNK, nu)
+        Inputs, without columns if there are none.
+    level : ndarray, shape (at most CHUNK,)
+        Levels of process noise, in multiples of the system's scale per second.
+
+    Raises
+    ------
+    ValueError
+        If hardly any trajectory stays within the bounds.
     """
     motions = motions or Motions()
     tried, pending = 0, []
@@ -117,21 +191,20 @@ def trajectories(
         pending += [(row, row < round(motions.lead_in_share * count)) for row in range(count)]
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
-        count, led = len(rows), np.array([led for _, led in rows])
+        count, led = len(rows), np.array([beyond for _, beyond in rows])
         x0 = rng.uniform(*system.box(), (count, system.nx))
         if system.nu and led.any():
-            end = _lead_in(system, x0[led], dt, rng, motions.lead_in_input)
+            end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
             x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
         u = np.zeros((steps, count, 0))
         if motions.kinds:
-            u = random_inputs(
-                system, count, steps, dt, rng, tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
-            )
+            kinds = tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
+            u = random_inputs(system, count, steps, dt=dt, rng=rng, kinds=kinds)
         w, level = None, np.zeros(count)
         if motions.process_noise_share and system.process_noise:
             some = rng.random(count) < motions.process_noise_share
             level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
-            w = draw_process_noise(system, level, count, steps, rng)
+            w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
         x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         pending += [row for row, stayed in zip(rows, inside) if not stayed]
@@ -144,12 +217,12 @@ def trajectories(
         yield x[:, inside], u[:, inside], level[inside]
 
 
-def _lead_in(system: System, x0: np.ndarray, dt: float, rng: np.random.Generator, constant: float) -> np.ndarray:
+def _lead_in(system: System, x0: np.ndarray, *, dt: float, rng: np.random.Generator, constant: float) -> np.ndarray:
     """Where inputs lead from starts (n, nx); NaN where that is out of bounds."""
     steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) / dt)
     if constant:
         values = constant * rng.uniform(-1, 1, (len(x0), system.nu)) * system.u_max
         u = np.broadcast_to(values, (steps, len(x0), system.nu))
     else:
-        u = random_inputs(system, len(x0), steps, dt, rng, DRIVEN)
+        u = random_inputs(system, len(x0), steps, dt=dt, rng=rng, kinds=DRIVEN)
     return np.asarray(simulate(system, x0, steps, dt, u=u)[-1])

@@ -9,14 +9,34 @@ DRIVEN = ("steps", "sine", "pulses")
 
 
 def random_inputs(
-    system: System, n: int, steps: int, dt: float, rng: np.random.Generator, kinds: tuple[str, ...] = KINDS
+    system: System, n: int, steps: int, *, dt: float, rng: np.random.Generator, kinds: tuple[str, ...] = KINDS
 ) -> np.ndarray:
-    """Inputs held over each sampling interval, shape (steps, n, nu), each row of one of the ``kinds`` in turn.
+    """Draw random inputs, held over each sampling interval.
 
-    - "zero": none (twice as often as each of the others by default);
-    - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
-    - "pulses": the same up to a time uniform within the record, and none from there on;
-    - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
+    Parameters
+    ----------
+    system : System
+        What they are to drive.
+    n : int
+        Number of trajectories.
+    steps : int
+        Number of sampling intervals.
+    dt : float
+        Their length in seconds.
+    rng : Generator
+        Of everything random.
+    kinds : tuple of str
+        The trajectories are of these in turn:
+
+        - "zero": no input (twice as often as each of the others by default);
+        - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
+        - "pulses": the same up to a time uniform within the record, and no input from there on;
+        - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
+
+    Returns
+    -------
+    ndarray, shape (steps, n, nu)
+        The inputs, in their own units.
     """
     u = np.zeros((steps, n, system.nu))
     t = np.arange(steps) * dt

@@ -565,7 +565,7 @@ def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):
 def test_run_is_causal():
     y = np.random.default_rng(0).normal(size=(50, 2, 1))
     method = get_method("ekf")
-    arrays = {"process_noise": np.array([0.01])}
+    arrays = {"diffusion": np.array([0.01])}
     whole = run(method.observer(arrays, get_system("lorenz"), 0.01, 0.5), y)
     part = run(method.observer(arrays, get_system("lorenz"), 0.01, 0.5), y[:20])
     np.testing.assert_array_equal(whole[:20], part)

@@ -1,4 +1,4 @@
-"""Each method of the benchmark, where the truth is known."""
+"""Each learned method of the benchmark, where the truth is known."""
 
 import importlib
 import math
@@ -7,26 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
-from filterpy.kalman import KalmanFilter
-from linear_system import C, F, Oscillator, sylvester
-from scipy.linalg import expm
+from linear_system import Oscillator, sylvester
+from scipy.signal import bessel
 
 import training.methods.ablation
-from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
-from training.kalman import ExtendedKalmanFilter, UnscentedFilters, unknown_start
 from training.methods import ABLATION, METHODS, Budget, Task, get_method
 from training.methods.autoencoder import _Problem as _AEProblem
-from training.methods.autoencoder import bessel_filter
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
 from training.methods.gru import _Problem as _GRUProblem
-from training.methods.kalman import faster
 from training.methods.recurrent import rollout
-from training.trajectories.derivatives import jacobian, with_sensitivity
 
 SMALL = Budget(
     "small", trajectories=100, duration=25.0, samples=60, cpu_seconds=math.inf, width=32, depth=2, dt=0.05, steps=600
@@ -138,8 +131,8 @@ def test_rollout_is_the_filter_sample_by_sample(ny):
     y = rng.normal(size=(301, 3, ny))
     ages = np.array([0, 1, 2, 7, 8, 150, 300])
     expected = linear.run(y, np.zeros((300, 3, 0)), ages)
-    parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y, expected[0]))
-    found = rollout(*parts, torch.as_tensor(y.swapaxes(0, 1)), ages)
+    parts = (torch.as_tensor(part) for part in (linear.transition, linear.early_y, linear.late_y))
+    found = rollout(*parts, z0=torch.as_tensor(expected[0]), y=torch.as_tensor(y.swapaxes(0, 1)), ages=ages)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-10, atol=1e-12)
 
 
@@ -149,9 +142,9 @@ def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
     seen = {}
     original = node.rollout
 
-    def spy(transition, early, late, z0, y, ages):
+    def spy(transition, early, late, **named):
         seen.update(transition=transition.detach().numpy(), early=early.detach().numpy(), late=late.detach().numpy())
-        return original(transition, early, late, z0, y, ages)
+        return original(transition, early, late, **named)
 
     node.rollout = spy
     try:
@@ -187,103 +180,21 @@ def test_default_estimates_the_oscillator(tmp_path):
     assert late_error(x, x_hat) < 0.2
 
 
-def kalman(dt, Q, R, x0, P0):
-    one = KalmanFilter(dim_x=2, dim_z=1)
-    one.F, one.H, one.Q, one.R = expm(F * dt), C, Q * dt, R
-    one.x, one.P = x0[:, None].copy(), P0.copy()
-    return one
+@pytest.mark.parametrize("ny", [1, 2])
+def test_the_autoencoder_has_the_poles_of_a_bessel_filter(ny, tmp_path):
+    class Measured(Oscillator):
+        name = "measured"
 
+        def h(self, x):
+            return x[:ny]
 
-@pytest.mark.parametrize("filters", [ExtendedKalmanFilter, UnscentedFilters])
-def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters):
-    dt, Q, R = 0.02, np.diag([0.01, 0.02]), np.array([[0.3]])
-    x0, P0 = np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])
-    y = np.random.default_rng(0).normal(size=(200, 3, 1))
-    found = run(filters(Oscillator(), dt, Q=Q, R=R, start=(x0, P0)), y)
-    for i in range(3):
-        one = kalman(dt, Q, R, x0, P0)
-        one.update(y[0, i])
-        expected = [one.x[:, 0]]
-        for value in y[1:, i]:
-            one.predict()
-            one.update(value)
-            expected.append(one.x[:, 0])
-        np.testing.assert_allclose(found[:, i], expected, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
-def test_ekf_against_filterpy(name):
-    system, dt = get_system(name), 0.01
-    x0, P0 = unknown_start(system)
-    Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
-    x = simulate(system, np.array([x0 + 0.1 * np.array(system.scale)]), 100, dt)
-    y = system.output(x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
-    found = run(ExtendedKalmanFilter(system, dt, Q=Q, R=R, start=(x0, P0)), y)
-
-    def flow(state):
-        return simulate(system, state, 1, dt)[1]
-
-    one = FilterpyEKF(dim_x=system.nx, dim_z=1)
-    one.x, one.P, one.Q, one.R = x0.copy(), P0.copy(), Q * dt, R
-    rows = jacobian(system.h, system.nx)
-    H = np.array([[row[j](*x0) if j in row else 0.0 for j in range(system.nx)] for row in rows])
-    for k, value in enumerate(y[:, 0]):
-        if k:
-            around = one.x + 1e-5 * np.vstack([np.eye(system.nx), -np.eye(system.nx)])
-            moved = flow(around)
-            Phi = ((moved[: system.nx] - moved[system.nx :]) / 2e-5).T
-            one.x, one.P = flow(one.x[None])[0], Phi @ one.P @ Phi.T + one.Q
-        one.update(value, lambda _: H, lambda state: H @ state)
-        np.testing.assert_allclose(found[k, 0], one.x, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
-def test_sensitivity_is_the_derivative_of_the_flow(name):
-    system, dt, eps = get_system(name), 0.05, 1e-5
-    nx = system.nx
-    x = np.random.default_rng(0).uniform(*system.box(0.5), (4, nx))
-    start = np.concatenate([x, np.tile(np.eye(nx).ravel(), (4, 1))], 1)
-    Phi = simulate(with_sensitivity(system), start, 1, dt)[1][:, nx:].reshape(4, nx, nx)
-    for j in range(nx):
-        step = eps * np.eye(nx)[j]
-        difference = (simulate(system, x + step, 1, dt)[1] - simulate(system, x - step, 1, dt)[1]) / (2 * eps)
-        np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
-
-
-def test_a_filter_that_leaves_the_bounds_starts_anew():
-    system = get_system("van_der_pol")
-    x0, P0 = unknown_start(system)
-    for filters in (ExtendedKalmanFilter, UnscentedFilters):
-        observer = filters(system, 0.01, Q=np.eye(2), R=0.01 * np.eye(1), start=(x0, P0))
-        observer.reset(np.array([[1.0]]))
-        for value in (1e9, 1e-9, 1e12, 0.5):
-            x_hat = observer.step(np.array([[value]]))
-        x_hat = run(observer, np.full((50, 1, 1), 0.5))
-        assert np.isfinite(x_hat).all()
-        assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
-
-
-def test_wrong_models_are_ten_percent_off():
-    believed = get_method("ekf-wrong").model(get_system("lorenz"))
-    assert believed.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
-    duffing = get_system("reverse_duffing")
-    np.testing.assert_allclose(
-        get_method("ekf-wrong").model(duffing).f([0.3, 0.5]), 1.1 * np.array(duffing.f([0.3, 0.5]))
-    )
-    quick = faster(duffing, 2.0)
-    x = np.array([[0.5, -0.3]])
-    np.testing.assert_allclose(simulate(quick, x, 10, 0.01)[-1], simulate(duffing, x, 20, 0.01)[-1], rtol=1e-9)
-
-
-@pytest.mark.parametrize("nx", [2, 3])
-def test_bessel_filter_has_the_poles_of_a_bessel_filter(nx):
-    from scipy.signal import bessel
-
-    D, ones = bessel_filter(nx, 2)
-    assert D.shape == (2 * (nx + 1), 2 * (nx + 1))
-    assert ones.sum(0).tolist() == [nx + 1, nx + 1]
-    poles = np.sort_complex(np.linalg.eigvals(D[: nx + 1, : nx + 1]))
-    np.testing.assert_allclose(poles, np.sort_complex(bessel(nx + 1, 1.0, analog=True, output="zpk")[1]), atol=1e-9)
+    problem = _AEProblem(Task(Measured(), SMALL, tmp_path), 0.5, 8.0)
+    expected = np.sort_complex(bessel(3, 1.0, analog=True, output="zpk", norm="phase")[1])
+    for output in range(ny):
+        block = slice(3 * output, 3 * output + 3)
+        np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(problem.D[block, block])), expected, atol=1e-9)
+    assert problem.D.shape == (3 * ny, 3 * ny)
+    np.testing.assert_array_equal(problem.F, np.kron(np.eye(ny), np.ones((3, 1))))
 
 
 def test_gain_tuning_takes_the_least_of_the_authors_criterion(tmp_path):
@@ -294,18 +205,6 @@ def test_gain_tuning_takes_the_least_of_the_authors_criterion(tmp_path):
     ):  # maps that ignore the cutoff: only the transient gain depends on it
         network.linear_layers()[0].weight.data[:, -1] = 0.0
     assert problem.best_cutoff() == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("name", ["ekf", "ukf"])
-def test_kalman_filters_are_told_the_noise(name):
-    method, system = get_method(name), get_system("van_der_pol")
-    y0 = np.array([[3.0]])
-    moved = [
-        method.observer({"process_noise": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0]
-        for noise in (0.0, 50.0)
-    ]
-    assert moved[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
-    assert moved[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
 
 
 @pytest.mark.parametrize(("name", "expected"), [("node", 0.0), ("node-noise", 0.5), ("dmf", 0.0), ("dmf-noise", 0.5)])
@@ -328,7 +227,11 @@ def test_noise_variants_see_noise_in_training(name, expected, tmp_path, monkeypa
 def test_gru_sees_every_noise_level_in_training(tmp_path):
     data = Task(Oscillator(), SMALL, tmp_path).data
     torch.manual_seed(0)
-    problem, generator, fed = _GRUProblem(data, 8, 50, torch.device("cpu")), torch.Generator().manual_seed(0), []
+    problem, generator, fed = (
+        _GRUProblem(data, hidden=8, chunk=50, device=torch.device("cpu")),
+        torch.Generator().manual_seed(0),
+        [],
+    )
     problem.network.gru.register_forward_pre_hook(lambda _, inputs: fed.append(inputs[0]))
     problem.loss(generator)
     level = problem.level[:, 0].numpy()
@@ -388,7 +291,7 @@ def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
 
 
 def test_a_file_of_another_method_is_refused(tmp_path):
-    get_method("ekf").save({"process_noise": np.ones(1)}, tmp_path / "one.safetensors")
+    get_method("ekf").save({"diffusion": np.ones(1)}, tmp_path / "one.safetensors")
     with pytest.raises(ValueError, match="'ekf', not 'gru'"):
         get_method("gru").load(tmp_path / "one.safetensors")
 

@@ -7,7 +7,7 @@ from training.trajectories.signals import random_inputs
 
 
 def test_signals_are_bounded_and_of_three_kinds():
-    u = random_inputs(VanDerPol(), 8, 1000, 0.01, np.random.default_rng(0))
+    u = random_inputs(VanDerPol(), 8, 1000, dt=0.01, rng=np.random.default_rng(0))
     assert u.shape == (1000, 8, 1)
     assert np.abs(u).max() <= 5.0
     assert not u[:, [0, 2, 4, 6]].any()
@@ -16,7 +16,7 @@ def test_signals_are_bounded_and_of_three_kinds():
 
 
 def test_pulses_end_and_leave_free_motion_behind():
-    u = random_inputs(VanDerPol(), 200, 500, 0.01, np.random.default_rng(0), ("pulses",))
+    u = random_inputs(VanDerPol(), 200, 500, dt=0.01, rng=np.random.default_rng(0), kinds=("pulses",))
     last = np.array([np.flatnonzero(row).max(initial=-1) for row in u[..., 0].T])
     assert last.min() < 50
     assert 450 < last.max() < 500

@@ -7,22 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.config import current_names
-from training.evaluation.certificates.gains import h2, h_infinity, theorem_gain
+from training.evaluation.certificates.gains import h2, h_infinity, noise_variance, theorem_gain
 from training.evaluation.certificates.generalisation import generalisation_term, pseudo_dimension_bound
-from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product
-from training.filter_noise import stationary_covariance
+from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product, output_lipschitz
+from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
 from training.maps.smooth import Smooth, decoder, encoder, residual
 from training.seeds import Stream, generator
-from training.trajectories.noise import draw_process_noise
 
-SETTLED = 1e-4  # part of the filter's start that is left where recording begins
-RECORDED = 30.0  # seconds of each motion
-EVERY = 10  # samples between recorded ones
-TRUNCATED = 3.0  # standard deviations at which Gaussian noise is cut, for theorems about bounded noise
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
 
 
@@ -30,17 +24,31 @@ QUANTILES = (0.5, 0.9, 0.99, 1.0)
 class Forward:
     """What is known where a forward map T was learned.
 
-    data_risk : mean |z - T(x)|^2 along the motion.
-    pde_risk : mean |P(x)|^2 of the PDE's residual P = dT/dx f - A T - B h over X.
-    physics_risk : the sum of the first and the physics weight times the second, R_S1 (paper, eq. emp-risk-theta).
-    reconstruction_risk : mean |x - T_inv(T(x))|^2 along the motion, R_S2 (paper, eq. emp-risk-eta).
-    reconstruction_risk_over_box : the same uniformly over X.
-    residual : quantiles of |P| over X, by their level.
-    residual_worst : where in X it is largest, (nx,).
-    forward_dimension, forward_term : bound of the pseudo-dimension of |z - T(x)|^2 (with the residual beside it, as in
-        R_S1, it would be larger still), and C_theta with that.
-    bound : the right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_S2 + 2 l^2 R_S1).
-    noisy_bound : that of the noisy one, with the T_inv that is told the noise.
+    Parameters
+    ----------
+    data_risk : float
+        Mean |z - T(x)|^2 along the trajectories.
+    pde_risk : float
+        Mean |P(x)|^2 of the PDE's residual P = dT/dx f - A T - B h over X.
+    physics_risk : float
+        ``data_risk`` plus the physics weight times ``pde_risk``, R_S1 (paper, eq. emp-risk-theta).
+    reconstruction_risk : float
+        Mean |x - T_inv(T(x))|^2 along the trajectories, R_S2 (paper, eq. emp-risk-eta).
+    reconstruction_risk_over_box : float
+        The same uniformly over X.
+    residual : mapping of float to float
+        Quantiles of |P| over X, by their level.
+    residual_worst : tuple of float, length nx
+        Where in X it is largest.
+    forward_dimension : float
+        Bound of the pseudo-dimension of |z - T(x)|^2; with the residual beside it, as in R_S1, it would be larger
+        still.
+    forward_term : float
+        The term C_theta with that.
+    bound : float
+        Right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_S2 + 2 l^2 R_S1).
+    noisy_bound : float
+        Right-hand side of the theorem on noise, with the T_inv that is told the noise.
     """
 
     data_risk: float
@@ -60,31 +68,58 @@ class Forward:
 class Certificate:
     """What :func:`certify` found. Errors are of the whole state in its own units; bounds are of their squares.
 
-    observer, system : names.
-    measurement_noise, noise_bound : standard deviation of the Gaussian noise, and where it is cut for the theorems.
-    process_noise : bound of |w|, w uniform in a box and held over each sample.
-    psi : bound of how far w may move the state; default: the diagonal of the box that the motions keep to.
-    samples : number of states along the motion.
-    error, noisy_error : mean |x - x_hat|^2 over motion and time, without noise and with v and w; on other motions than
-        those that the risks are from.
-    lipschitz_lower, lipschitz_at : largest spectral norm of T_inv's Jacobian along the motion, and z there.
-    lipschitz_upper : no two z anywhere give more.
-    norm_product : of the layers of T_inv, the bound that costs no work.
-    output_lipschitz : largest norm of dh/dx at random points of X; where h is not linear there may be larger ones.
-    gain_theorem, gain_h_infinity, gain_h2 : of the filter from noise to z, see :mod:`training.certificates.gains`.
-    noise_term : what the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2.
-    predicted_noise_error, measured_noise_error : rms of what noise alone does to the estimate, from the stationary
-        covariance through the Jacobian, and by simulation.
-    inverse_dimension, inverse_term : bound of the pseudo-dimension of T_inv's losses, and C_eta, the largest loss that
-        was seen standing for the bound of all.
-    forward : what needs a learned T; None where there is none.
+    Parameters
+    ----------
+    observer : str
+        Its name.
+    system : str
+        The name of what it observes.
+    measurement_noise : float
+        Standard deviation of the Gaussian noise on y.
+    noise_bound : float
+        Where that noise is cut for the theorems.
+    process_noise_bound : float
+        Bound of |w| in units of the state per second; w is uniform in a box and held over each sample.
+    psi : float
+        Bound of how far w may move the state; by default the diagonal of the box that the trajectories keep to.
+    samples : int
+        Number of states along the trajectories.
+    error : float
+        Mean |x - x_hat|^2 over trajectories and time without noise, on other trajectories than those that the risks are
+        from.
+    noisy_error : float
+        The same with v and w.
+    lipschitz_lower : float
+        Largest spectral norm of T_inv's Jacobian along the trajectories.
+    lipschitz_at : tuple of float, length of the filter's state
+        The z where it is.
+    lipschitz_upper : float
+        No two z anywhere give more.
+    norm_product : float
+        Of the layers of T_inv, the bound that costs no work.
+    output_lipschitz : float
+        Largest norm of dh/dx at random points of X; where h is not linear there may be larger ones.
+    gain_theorem, gain_h_infinity, gain_h2 : float
+        Of the filter from noise to z, see :mod:`training.evaluation.certificates.gains`.
+    noise_term : float
+        What the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2.
+    predicted_noise_error : float
+        Rms of what measurement noise alone does to the estimate, from the stationary covariance through the Jacobian.
+    measured_noise_error : float
+        The same by simulation.
+    inverse_dimension : float
+        Bound of the pseudo-dimension of T_inv's losses.
+    inverse_term : float
+        The term C_eta, the largest loss that was seen standing for the bound of all.
+    forward : Forward or None
+        What needs a learned T; None where there is none.
     """
 
     observer: str
     system: str
     measurement_noise: float
     noise_bound: float
-    process_noise: float
+    process_noise_bound: float
     psi: float
     samples: int
     error: float
@@ -109,37 +144,6 @@ class Certificate:
         return {key: _plain(value) for key, value in asdict(self).items()}
 
 
-@dataclass(frozen=True)
-class SettledTrajectories:
-    """Where a system goes in the long run, with the filter beside it.
-
-    x : states, (n, nx).
-    z : of the filter under noise-free outputs, (n, size).
-    noisy_x, noisy_z : the same under process noise and noisy outputs.
-    noise : in z, due to the measurement noise alone, (n, size).
-    motions : number of motions, each of whose samples follow one another.
-    """
-
-    x: np.ndarray
-    z: np.ndarray
-    noisy_x: np.ndarray
-    noisy_z: np.ndarray
-    noise: np.ndarray
-    motions: int
-
-    def halves(self) -> tuple["SettledTrajectories", "SettledTrajectories"]:
-        """Two sets of motions."""
-        first = self.motions // 2
-        cut = first * (len(self.x) // self.motions)
-
-        def part(rows: slice, motions: int) -> "SettledTrajectories":
-            return SettledTrajectories(
-                self.x[rows], self.z[rows], self.noisy_x[rows], self.noisy_z[rows], self.noise[rows], motions
-            )
-
-        return part(slice(cut), first), part(slice(cut, None), self.motions - first)
-
-
 def certify(
     artifact: Artifact,
     system: System,
@@ -151,30 +155,47 @@ def certify(
     delta: float = 0.05,
     seed: int = 0,
     name: str = "",
-    motion: SettledTrajectories | None = None,
+    recorded: SettledTrajectories | None = None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
     Parameters
     ----------
-    artifact : the observer.
-    system : what it was made for, without input.
-    measurement_noise : standard deviation of v; the theorems are about the same noise, cut at three of these.
-    process_noise : bound of w as a multiple of the system's scale; None is the system's own default.
-    psi : bound of how far w may move the state from where it would have been; None is the diagonal of the box that the
-        simulated motions keep to, with w and without, which is what is left to say where they drift in phase or are
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for, without input.
+    measurement_noise : float, default 0.5
+        Standard deviation of v; the theorems are about the same noise, cut at three of these.
+    process_noise : float, optional
+        Bound of w in multiples of the system's scale per second; by default the system's own.
+    psi : float, optional
+        Bound of how far w may move the state from where it would have been. By default the diagonal of the box that the
+        simulated trajectories keep to, with w and without; no less can be said where they drift in phase or are
         chaotic.
-    trajectories : from starts uniform in X.
-    delta : probability with which each of the generalisation terms may fail.
-    seed : of everything random.
-    name : of the observer, for the report.
-    motion : what :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+    trajectories : int, default 200
+        From starts uniform in X.
+    delta : float, default 0.05
+        Probability with which each of the generalisation terms may fail.
+    seed : int, default 0
+        Of everything random.
+    name : str, optional
+        Of the observer, for the report.
+    recorded : SettledTrajectories, optional
+        What :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+
+    Returns
+    -------
+    Certificate
+        What was found.
 
     Raises
     ------
-    ValueError : if a number makes no sense, the noise is beyond what the map was trained for, or too many motions
-        leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another
-        system.
+    ValueError
+        If a number makes no sense, the noise is beyond what the map was trained for, h does not take sympy symbols, or
+        too many trajectories leave the system's bounds.
+    observers.ArtifactError
+        If the observer was made for another system; also a ValueError.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     process_noise = system.process_noise if process_noise is None else process_noise
@@ -186,32 +207,31 @@ def certify(
     if not 0 < delta < 1:
         raise ValueError(f"delta must lie between 0 and 1, got {delta!r}")
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
-    levels = (measurement_noise, process_noise)
-    if motion is None:
-        motion = record_settled(artifact, system, levels, trajectories=trajectories, seed=seed)
-    measured, sample = motion.halves()
-    told, quiet = decoder(artifact, *levels), decoder(artifact, 0.0)
-    lower, at = lipschitz_lower(told, motion.z)
+    noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
+    if recorded is None:
+        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
+    measured, sample = recorded.halves()
+    told, noise_free = decoder(artifact, **noise), decoder(artifact, 0.0)
+    lower, at = lipschitz_lower(told, recorded.z)
     upper = lipschitz_upper(told)
     linear = artifact.filter
     gain = theorem_gain(linear)
-    l_h = output_lipschitz(system, seed)
+    l_h = output_lipschitz(system, generator(Stream.CERTIFICATE, seed, 1).uniform(*system.box(), (2_000, system.nx)))
     noise_bound = TRUNCATED * measurement_noise
     if psi is None:
-        everywhere = np.concatenate([motion.x, motion.noisy_x])
+        everywhere = np.concatenate([recorded.x, recorded.noisy_x])
         psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
     noise_term = 2 * (upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)) ** 2
-    losses = _squared(measured.x - quiet(measured.z))
+    losses = _squared(measured.x - noise_free(measured.z))
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
-    seen = _training_samples(artifact)
     return Certificate(
         observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
         system=system.name,
         measurement_noise=measurement_noise,
         noise_bound=noise_bound,
-        process_noise=process_noise * float(np.linalg.norm(system.scale)),
+        process_noise_bound=process_noise * float(np.linalg.norm(system.scale)),
         psi=psi,
-        samples=len(motion.x),
+        samples=len(recorded.x),
         error=float(losses.mean()),
         noisy_error=float(_squared(measured.noisy_x - told(measured.noisy_z)).mean()),
         lipschitz_lower=lower,
@@ -223,128 +243,72 @@ def certify(
         gain_h_infinity=h_infinity(linear),
         gain_h2=h2(linear),
         noise_term=noise_term,
-        predicted_noise_error=float(np.sqrt(noise_variance(artifact, motion.z, *levels).mean())),
-        measured_noise_error=float(np.sqrt(_squared(told(motion.z + motion.noise) - told(motion.z)).mean())),
+        predicted_noise_error=float(np.sqrt(noise_variance(artifact, recorded.z, **noise).mean())),
+        measured_noise_error=float(np.sqrt(_squared(told(recorded.z + recorded.noise) - told(recorded.z)).mean())),
         inverse_dimension=inverse_dimension,
-        inverse_term=generalisation_term(float(losses.max()), inverse_dimension, seen, delta),
-        forward=_forward(artifact, system, sample, (quiet, told), upper, noise_term, delta, seed),
+        inverse_term=generalisation_term(
+            float(losses.max()), pseudo_dimension=inverse_dimension, samples=_training_samples(artifact), delta=delta
+        ),
+        forward=_forward(
+            artifact,
+            system,
+            sample,
+            told=told,
+            noise_free=noise_free,
+            lipschitz=upper,
+            noise_term=noise_term,
+            delta=delta,
+            seed=seed,
+        ),
     )
-
-
-def record_settled(
-    artifact: Artifact,
-    system: System,
-    levels: tuple[float, float],
-    *,
-    trajectories: int,
-    seed: int,
-) -> SettledTrajectories:
-    """Trajectories from starts uniform in X, from where the filter has forgotten its start.
-
-    ``levels`` are of measurement noise and process noise; the other parameters are those of :func:`certify`.
-
-    Raises ValueError if more than half of them leave the system's bounds.
-    """
-    measurement_noise, process_noise = levels
-    rng = generator(Stream.CERTIFICATE, seed)
-    linear = artifact.filter
-    dt = linear.dt
-    settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
-    first = math.ceil(settled / dt)
-    steps = first + round(RECORDED / dt)
-    ages = np.arange(first, steps + 1, EVERY)
-    x0 = rng.uniform(*system.box(), (trajectories, system.nx))
-    x = noisy_x = simulate(system, x0, steps, dt)
-    if process_noise:
-        w = draw_process_noise(system, process_noise, trajectories, steps, rng)
-        noisy_x = simulate(system, x0, steps, dt, w=w)
-    inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
-    if 2 * inside.sum() < trajectories:
-        raise ValueError(
-            f"only {inside.sum()} of {trajectories} motions of {steps * dt:g} s stayed within bounds = {system.bounds}"
-        )
-    x, noisy_x = x[:, inside], noisy_x[:, inside]
-    white = rng.standard_normal((*x.shape[:2], system.ny))
-    v = measurement_noise * np.clip(white, -TRUNCATED, TRUNCATED)
-    no_input = np.zeros((steps, x.shape[1], linear.nu))
-
-    def recorded(values: np.ndarray) -> np.ndarray:  # motion by motion
-        return np.asarray(np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1]))
-
-    def filtered(y: np.ndarray) -> np.ndarray:
-        return recorded(linear.run(y, no_input, ages))
-
-    return SettledTrajectories(
-        x=recorded(x[ages]),
-        z=filtered(system.output(x)),
-        noisy_x=recorded(noisy_x[ages]),
-        noisy_z=filtered(system.output(noisy_x) + v),
-        noise=filtered(v),
-        motions=x.shape[1],
-    )
-
-
-def noise_variance(
-    artifact: Artifact, z: np.ndarray, measurement_noise: float, process_noise: float = 0.0
-) -> np.ndarray:
-    """Variance of the estimate due to stationary measurement noise, trace(J P J^T) at each z (n, size), (n,).
-
-    P is the exact stationary covariance of z, J the Jacobian of T_inv: the noise to first order.
-    """
-    J = decoder(artifact, measurement_noise, process_noise).jacobian(z)
-    P = measurement_noise**2 * stationary_covariance(artifact.filter)
-    return np.asarray(np.einsum("nij,jk,nik->n", J, P, J))
-
-
-def output_lipschitz(system: System, seed: int, n: int = 2000) -> float:
-    """The largest spectral norm of dh/dx at random points of X, by central differences; exact where h is linear."""
-    x = generator(Stream.CERTIFICATE, seed, 1).uniform(*system.box(), (n, system.nx))
-    J = np.empty((n, system.ny, system.nx))
-    for j, scale in enumerate(system.scale):
-        step = 1e-5 * scale * np.eye(system.nx)[j]
-        J[..., j] = (system.output(x + step) - system.output(x - step)) / (2e-5 * scale)
-    return float(np.linalg.norm(J, ord=2, axis=(1, 2)).max())
 
 
 def _forward(
     artifact: Artifact,
     system: System,
-    motion: SettledTrajectories,
-    inverses: tuple[Smooth, Smooth],
+    recorded: SettledTrajectories,
+    *,
+    told: Smooth,
+    noise_free: Smooth,
     lipschitz: float,
     noise_term: float,
     delta: float,
     seed: int,
 ) -> Forward | None:
-    """``inverses`` : T_inv told that there is no noise, and told the noise, whose Lipschitz constant is given."""
+    """What a learned T allows to say of T_inv told the noise, with its Lipschitz constant, and of T_inv told none."""
     if artifact.forward is None:
         return None
-    T, (quiet, told) = encoder(artifact.forward), inverses
+    T = encoder(artifact.forward)
     x = generator(Stream.CERTIFICATE, seed, 2).uniform(*system.box(), (20_000, system.nx))
     size = np.linalg.norm(residual(artifact, system, x), axis=1)
     weight = float(artifact.training.get("physics_weight", 0.0))
-    data_losses = _squared(motion.z - T(motion.x))
+    data_losses = _squared(recorded.z - T(recorded.x))
     data_risk, pde_risk = float(data_losses.mean()), float(np.square(size).mean())
     physics_risk = data_risk + weight * pde_risk
 
     def bound(T_inv: Smooth, constant: float) -> float:
-        reconstruction = float(_squared(motion.x - T_inv(T(motion.x))).mean())
+        reconstruction = float(_squared(recorded.x - T_inv(T(recorded.x))).mean())
         return 2 * (2 * reconstruction + 2 * constant**2 * physics_risk)
 
-    same = all((a == b).all() for a, b in zip((*quiet.weights, *quiet.biases), (*told.weights, *told.biases)))
+    same = all(
+        (a == b).all()
+        for a, b in zip((*told.mlp.weights, *told.mlp.biases), (*noise_free.mlp.weights, *noise_free.mlp.biases))
+    )
     dimension = pseudo_dimension_bound(artifact.forward.mlp)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
     return Forward(
         data_risk=data_risk,
         pde_risk=pde_risk,
         physics_risk=physics_risk,
-        reconstruction_risk=float(_squared(motion.x - quiet(T(motion.x))).mean()),
-        reconstruction_risk_over_box=float(_squared(x - quiet(T(x))).mean()),
+        reconstruction_risk=float(_squared(recorded.x - noise_free(T(recorded.x))).mean()),
+        reconstruction_risk_over_box=float(_squared(x - noise_free(T(x))).mean()),
         residual={level: float(np.quantile(size, level)) for level in QUANTILES},
         residual_worst=tuple(x[size.argmax()].tolist()),
         forward_dimension=dimension,
-        forward_term=generalisation_term(largest, dimension, _training_samples(artifact), delta),
-        bound=bound(quiet, lipschitz if same else lipschitz_upper(quiet)),
+        forward_term=generalisation_term(
+            largest, pseudo_dimension=dimension, samples=_training_samples(artifact), delta=delta
+        ),
+        bound=bound(noise_free, lipschitz if same else lipschitz_upper(noise_free)),
         noisy_bound=bound(told, lipschitz) + noise_term,
     )
 

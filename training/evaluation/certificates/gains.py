@@ -1,14 +1,15 @@
-"""What the filter makes of measurement noise: the theorem's gain, and the exact ones."""
+"""What the filter makes of measurement noise, the theorem's gain and the exact ones, and what T_inv makes of that."""
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from observers import LinearFilter
+from observers import Artifact, LinearFilter
 from training.filter_noise import stationary_covariance
+from training.maps.smooth import decoder
 
 
 def theorem_gain(linear: LinearFilter) -> float:
-    """cond(V) |B| / |lambda_min(A)|, by which a bounded noise may move z in the paper's theorem 4 (sec. 7)."""
+    """Most that a bounded noise may move z by the paper's theorem 4 (sec. 7): cond(V) |B| / |lambda_min(A)|."""
     poles, V = np.linalg.eig(linear.A)
     return float(np.linalg.cond(V) * np.linalg.norm(linear.B, 2) / np.abs(poles.real).min())
 
@@ -16,7 +17,18 @@ def theorem_gain(linear: LinearFilter) -> float:
 def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
     """H-infinity norm of the sampled filter from v to z: the largest amplification of a noise's energy.
 
-    The greatest gain on a grid of frequencies up to Nyquist's, finer about the poles', and refined about the best one.
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    points : int, default 2000
+        Frequencies up to Nyquist's, beside some more about each pole, among which the greatest gain is looked for; it
+        is then refined about the best one.
+
+    Returns
+    -------
+    float
+        The norm.
     """
     poles = np.linalg.eigvals(linear.A) * linear.dt
     near = np.geomspace(1e-2, 1e2, 40)
@@ -35,6 +47,34 @@ def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
 def h2(linear: LinearFilter) -> float:
     """H2 norm from v to z: the stationary rms of |z| under white noise of unit variance on every sample."""
     return float(np.sqrt(np.trace(stationary_covariance(linear))))
+
+
+def noise_variance(
+    artifact: Artifact, z: np.ndarray, *, measurement_noise: float, process_noise: float = 0.0
+) -> np.ndarray:
+    """Variance of the estimate due to stationary measurement noise, to first order: trace(J P J^T).
+
+    P is the exact stationary covariance of z and J the Jacobian of T_inv.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    z : ndarray, shape (n, size)
+        Filter states.
+    measurement_noise : float
+        Standard deviation of the noise on each sample of y.
+    process_noise : float, default 0
+        What T_inv is told of process noise, in multiples of the system's scale per second.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Sums of the variances of the states, each in its own unit squared.
+    """
+    J = decoder(artifact, measurement_noise, process_noise).jacobian(z)
+    P = measurement_noise**2 * stationary_covariance(artifact.filter)
+    return np.asarray(np.einsum("nij,jk,nik->n", J, P, J))
 
 
 def _gain(linear: LinearFilter, frequency: float) -> float:

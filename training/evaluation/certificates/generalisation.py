@@ -6,8 +6,20 @@ from observers import MLP
 
 
 def pseudo_dimension_bound(mlp: MLP) -> float:
-    """An upper bound of the pseudo-dimension of {(x, y) -> |y - mlp(x)|^2} over all weights.
+    """Bound the pseudo-dimension of {(x, y) -> |y - mlp(x)|^2} over all weights from above.
 
+    Parameters
+    ----------
+    mlp : MLP
+        A network of the set.
+
+    Returns
+    -------
+    float
+        The bound.
+
+    Notes
+    -----
     Anthony and Bartlett, Neural Network Learning (1999), theorem 8.14: a set of functions of d parameters, each
     computed by t operations (sums, products, quotients, comparisons) of which q are exponentials, has
     VC dimension at most (d (q + 1))^2 + 11 d (q + 1) (t + log2(9 d (q + 1))). The pseudo-dimension is the VC dimension
@@ -21,8 +33,25 @@ def pseudo_dimension_bound(mlp: MLP) -> float:
     return float(product**2 + 11 * product * (operations + math.log2(9 * product)))
 
 
-def generalisation_term(largest_loss: float, pseudo_dimension: float, samples: int, delta: float) -> float:
-    """M sqrt(2 d ln(e N/d) / N) + M sqrt(ln(1/delta) / 2N) (paper, sec. 4.2), infinite where N < d: it says nothing."""
+def generalisation_term(largest_loss: float, *, pseudo_dimension: float, samples: int, delta: float) -> float:
+    """Bound how far the risk may lie above its mean on a sample (paper, sec. 4.2).
+
+    Parameters
+    ----------
+    largest_loss : float
+        Bound M of the loss.
+    pseudo_dimension : float
+        That of the losses, d.
+    samples : int
+        Their number, N.
+    delta : float
+        Probability with which the bound may fail.
+
+    Returns
+    -------
+    float
+        M sqrt(2 d ln(e N/d) / N) + M sqrt(ln(1/delta) / 2N), infinite where N < d: then nothing is said.
+    """
     if samples < pseudo_dimension:
         return math.inf
     complexity = math.sqrt(2 * pseudo_dimension * math.log(math.e * samples / pseudo_dimension) / samples)

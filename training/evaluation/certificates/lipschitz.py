@@ -1,9 +1,11 @@
-"""Lipschitz constants of networks, from below and from above."""
+"""Lipschitz constants of networks, from below and from above, and of the output."""
 
 import numpy as np
 import torch
 
+from kkl_gym.system import System
 from training.maps.smooth import Smooth
+from training.trajectories.derivatives import evaluate, jacobian
 
 # Least and greatest slope of each activation, rounded outwards; those of x sigmoid(x) are where its second derivative
 # vanishes, at |x| = 2.39936.
@@ -11,9 +13,21 @@ SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
 
 
 def lipschitz_lower(network: Smooth, x: np.ndarray) -> tuple[float, np.ndarray]:
-    """The largest spectral norm of the Jacobian among the points (n, inputs), and the point where it is.
+    """Bound a network's Lipschitz constant from below, over any convex set that holds some points.
 
-    No Lipschitz constant over a convex set that holds these points is smaller.
+    Parameters
+    ----------
+    network : Smooth
+        The network.
+    x : ndarray, shape (n, inputs)
+        The points.
+
+    Returns
+    -------
+    largest : float
+        The largest spectral norm of the Jacobian at a point.
+    at : ndarray, shape (inputs,)
+        The point where it is.
     """
     norms = np.linalg.norm(network.jacobian(x), ord=2, axis=(1, 2))
     worst = int(norms.argmax())
@@ -21,8 +35,22 @@ def lipschitz_lower(network: Smooth, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
-    """A constant that no two inputs anywhere exceed, by a quadratic certificate for each layer.
+    """Bound a network's Lipschitz constant from above, everywhere, by a quadratic certificate for each layer.
 
+    Parameters
+    ----------
+    network : Smooth
+        The network.
+    steps : int, default 150
+        Of the search for the multipliers. Any number gives a bound, more of them a better one.
+
+    Returns
+    -------
+    float
+        No two inputs anywhere give a larger ratio; not more than :func:`norm_product`.
+
+    Notes
+    -----
     Let M be a matrix with |f(h) - f(h')|^2 <= (h - h')^T M (h - h') for everything behind a layer h = phi(W x + b).
     With activations of slopes between a and b, and any positive diagonal D with D - M > 0, the same holds in
     front of it for W^T [(a + b)^2/4 D (D - M)^-1 D - a b D] W (the S-procedure on (dh - a dv)^T D (b dv - dh) >= 0,
@@ -31,10 +59,10 @@ def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
     (ECLipsE, NeurIPS 2024) layer by layer; here the diagonals of all layers are found together by gradients, so that no
     solver of such programs is needed. Every choice of them is sound; a good one is less than the product of norms.
     """
-    if len(network.weights) == 1 or norm_product(network) == 0.0:
+    if len(network.mlp.weights) == 1 or norm_product(network) == 0.0:
         return norm_product(network)
-    low, high = SLOPES[network.activation]
-    weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in network.weights]
+    low, high = SLOPES[network.mlp.activation]
+    weights = [torch.as_tensor(weight, dtype=torch.float64) for weight in network.mlp.weights]
     # D is a shape about the diagonal of M, times the least factor with D >= M, times 1 + e^margin: always admissible.
     # Zeros are a good start: for diagonal M they give D = 2 M, with which nothing is lost.
     shapes = [torch.zeros(len(weight), dtype=torch.float64, requires_grad=True) for weight in weights[:-1]]
@@ -67,9 +95,15 @@ def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
     return min(certified, norm_product(network))
 
 
+def output_lipschitz(system: System, x: np.ndarray) -> float:
+    """Largest spectral norm of dh/dx at states (n, nx); ValueError if h does not take sympy symbols."""
+    J = evaluate(jacobian(system.h, system.nx), x)
+    return float(np.linalg.norm(J, ord=2, axis=(1, 2)).max())
+
+
 def norm_product(network: Smooth) -> float:
-    """The product of the layers' spectral norms and the activations' largest slope, what is known without work."""
-    slope = max(abs(value) for value in SLOPES[network.activation])
-    return float(np.prod([np.linalg.norm(weight, 2) for weight in network.weights])) * slope ** (
-        len(network.weights) - 1
+    """Product of the layers' spectral norms and the activations' largest slopes, a bound that costs no work."""
+    slope = max(abs(value) for value in SLOPES[network.mlp.activation])
+    return float(np.prod([np.linalg.norm(weight, 2) for weight in network.mlp.weights])) * slope ** (
+        len(network.mlp.weights) - 1
     )

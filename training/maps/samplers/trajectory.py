@@ -1,7 +1,6 @@
-"""Batches on which the inverse is fitted."""
+"""Batches along recorded trajectories, with the noise that the filter would pass on."""
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from observers import InverseMap, LinearFilter
 from training.filter_noise import noise_covariance, root, stationary_covariance
 from training.maps.coordinates import coordinates, settling_time
 from training.maps.networks import Network, tensor
-from training.trajectories.closed_loop import ClosedLoop
+from training.maps.samplers.batch import Batch
 from training.trajectories.record import Trajectories
 
 MEASUREMENT_NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
@@ -19,22 +18,47 @@ AGE_UNIT = 0.05  # s, in the age feature log(1 + t / unit)
 PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
 
-# inputs (batch, inputs), x scaled (batch, nx), weight (batch,), cell (batch,)
-Batch = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
-
-
 class TrajectorySampler:
     """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
 
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
-    that fits such data in the mean square is the conditional mean of x. A share ``noise_free_share`` of the samples has
-    no noise; of the others a share p ** ``high_noise_emphasis`` lies below the level at p of the way, on a logarithmic
-    scale, along the two decades up to ``measurement_noise_max``: high levels are harder to learn. If
-    ``process_noise_max`` is not 0 the network is told the level of process noise as well, up to this one.
+    that fits such data in the mean square is the conditional mean of x.
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
     into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
     improve in proportion.
+
+    Parameters
+    ----------
+    data : Trajectories
+        Where states and noise-free z are from.
+    linear : LinearFilter
+        The filter that ran beside them.
+    measurement_noise_max : float
+        Largest standard deviation of measurement noise.
+    batch : int
+        Samples in a batch.
+    device : torch.device
+        Where batches are made.
+    noise_free_share : float, default 0.2
+        Share of the samples without measurement noise.
+    high_noise_emphasis : float, default 2
+        Of the other samples a share p to this power lies below the level at p of the way, on a logarithmic scale, along
+        the two decades up to ``measurement_noise_max``: high levels are harder to learn.
+    process_noise_max : float, default 0
+        If positive, the network is told the level of process noise as well, up to this one, in multiples of the
+        system's scale per second.
+
+    Attributes
+    ----------
+    coordinates : Coordinates
+        In which the network sees z.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Mean and standard deviation of the states.
+    age_max : float
+        Seconds since reset beyond which the network is told no difference.
+    cells : int
+        Their number.
     """
 
     AGES_PER_BATCH = 32
@@ -109,7 +133,7 @@ class TrajectorySampler:
         level_cell = torch.where(loud, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
         cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows])
         batch = self.AGES_PER_BATCH * self._per_age
-        return (
+        return Batch(
             inputs.reshape(batch, -1),
             self._x[ages, rows].reshape(batch, -1),
             self._weight[ages, rows].reshape(batch),
@@ -160,124 +184,3 @@ class TrajectorySampler:
             age_unit=AGE_UNIT,
             age_max=self.age_max,
         )
-
-
-class ClosedLoopSampler:
-    """Batches half from open-loop trajectories, half from closed-loop ones, with the noise that these already hold."""
-
-    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
-        self.open_loop = open_loop
-        coordinates, gain = open_loop.coordinates, open_loop.coordinates.noise_gain
-        shrink = 1.0 + (data.measurement_noise[:, None] * gain) ** 2
-        self._modes = tensor(coordinates(data.z) / shrink, device)
-        self._x = tensor((data.x - open_loop.x_offset) / open_loop.x_scale, device)
-        self._level = tensor(np.log1p(data.measurement_noise / MEASUREMENT_NOISE_UNIT), device)
-        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / AGE_UNIT), device)
-        self._weight = open_loop.weight(data.x, device)
-        self._age_cell = open_loop.age_cell(data.ages, device)
-        position = (
-            np.log10(np.maximum(data.measurement_noise / open_loop.measurement_noise_max, 1e-9)) / 2 + 1
-        )  # over two decades, as there
-        level_cell = np.where(
-            data.measurement_noise > 0, 1 + np.clip(position * open_loop.LEVELS, 0, open_loop.LEVELS - 1), 0
-        )
-        self._level_cell = torch.as_tensor(level_cell.astype(int), device=device)
-        self._process_cell = torch.zeros_like(self._level_cell)
-        if open_loop.process_noise_max:
-            self._process, self._process_cell = open_loop.process_conditions(data.process_noise, device)
-        self.cells = 2 * open_loop.cells
-
-    def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
-        inputs, x, weight, cell = self.open_loop(generator)
-        m, n, _ = self._x.shape
-        half, device = len(x) // 2, self._x.device
-        ages = torch.randint(m, (half,), generator=generator, device=device)
-        rows = torch.randint(n, (half,), generator=generator, device=device)
-        conditions = [self._level[rows], self._age[ages]]
-        if self.open_loop.process_noise_max:
-            conditions.insert(1, self._process[rows])
-        closed = torch.cat([self._modes[ages, rows], torch.stack(conditions, -1)], -1)
-        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows], self._process_cell[rows])
-        return (
-            torch.cat([inputs[:half], closed]),
-            torch.cat([x[:half], self._x[ages, rows]]),
-            torch.cat([weight[:half], self._weight[ages, rows]]),
-            torch.cat([cell[:half], self.open_loop.cells + closed_cell]),
-        )
-
-    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
-        """The map that a network trained on these batches makes."""
-        return self.open_loop.inverse_map(network, linear)
-
-
-class ForwardMapSampler:
-    """The paper's second data set S_2: x' uniform in the training box (or given), z' = T(x') by the map (sec. 5.2).
-
-    The filter's z differs from T(x) by the error of T, which an inverse fitted to T(x') alone would magnify by its
-    Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
-    error, measured on the forward map's own data, and each coordinate is shrunk to its linear conditional mean.
-
-    Parameters
-    ----------
-    forward : T on tensors, (n, nx) to (n, nz).
-    error : samples of z - T(x), (n, nz).
-    box : low and high corner of where x' is drawn.
-    points : states (n, nx) of which x' is drawn instead.
-    """
-
-    cells = 1
-
-    def __init__(
-        self,
-        forward: Callable[[torch.Tensor], torch.Tensor],
-        error: np.ndarray,
-        *,
-        box: tuple[np.ndarray, np.ndarray],
-        batch: int,
-        device: torch.device,
-        points: np.ndarray | None = None,
-    ) -> None:
-        low, high = box if points is None else (points.min(0), points.max(0))
-        self._low, self._span = tensor(low, device), tensor(high - low, device)
-        self._points = None if points is None else tensor(points, device)
-        self._forward, self._batch = forward, batch
-        x = self._draw(torch.Generator(device).manual_seed(0), 100_000)
-        z = forward(x).cpu().numpy().astype(float)
-        self.coordinates = coordinates(z, error.T @ error / len(error))
-        self.x_offset, self.x_scale = (low + high) / 2, (high - low) / 2
-        self._offset, self._scale = tensor(self.x_offset, device), tensor(self.x_scale, device)
-        self._z_offset = torch.as_tensor(self.coordinates.offset, device=device)
-        self._whiten = torch.as_tensor(self.coordinates.whiten, device=device)
-        self._blur = tensor(self.coordinates.noise_gain, device)
-
-    def _draw(self, generator: torch.Generator, n: int) -> torch.Tensor:
-        if self._points is not None:
-            rows = torch.randint(len(self._points), (n,), generator=generator, device=generator.device)
-            return self._points[rows]
-        return self._low + self._span * torch.rand((n, len(self._low)), generator=generator, device=generator.device)
-
-    def __call__(self, generator: torch.Generator) -> Batch:
-        """One batch."""
-        x = self._draw(generator, self._batch)
-        modes = ((self._forward(x).double() - self._z_offset) @ self._whiten.T).float()
-        modes = modes + self._blur * torch.randn(modes.shape, generator=generator, device=x.device)
-        modes = modes / (1.0 + self._blur**2)
-        ones = torch.ones(len(x), device=x.device)
-        return modes, (x - self._offset) / self._scale, ones, torch.zeros(len(x), dtype=torch.long, device=x.device)
-
-    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
-        """The map that a network trained on these batches makes: the paper's, of z alone."""
-        found = self.coordinates
-        return InverseMap(
-            mlp=network.export(),
-            features=("z_y",),
-            z_offset=found.offset,
-            whiten=found.whiten / (1.0 + found.noise_gain**2)[:, None],
-            noise_gain=np.zeros(len(found.noise_gain)),
-            x_offset=self.x_offset,
-            x_scale=self.x_scale,
-        )
-
-
-Sampler = TrajectorySampler | ClosedLoopSampler | ForwardMapSampler

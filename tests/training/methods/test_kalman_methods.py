@@ -1,0 +1,50 @@
+"""What Kalman filters are told as methods of the benchmark."""
+
+import numpy as np
+import pytest
+
+from kkl_gym import get_system
+from kkl_gym.simulate import simulate
+from training.methods import get_method
+from training.methods.kalman import DIFFUSION, faster
+
+
+def test_wrong_models_are_ten_percent_off():
+    believed = get_method("ekf-wrong").model(get_system("lorenz"))
+    assert believed.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
+    duffing = get_system("reverse_duffing")
+    np.testing.assert_allclose(
+        get_method("ekf-wrong").model(duffing).f([0.3, 0.5]), 1.1 * np.array(duffing.f([0.3, 0.5]))
+    )
+    quick = faster(duffing, 2.0)
+    x = np.array([[0.5, -0.3]])
+    np.testing.assert_allclose(simulate(quick, x, 10, 0.01)[-1], simulate(duffing, x, 20, 0.01)[-1], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf"])
+def test_kalman_filters_are_told_the_noise(name):
+    method, system = get_method(name), get_system("van_der_pol")
+    y0 = np.array([[3.0]])
+    moved = [
+        method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise).reset(y0)[0, 0] for noise in (0.0, 50.0)
+    ]
+    assert moved[0] == pytest.approx(3.0, abs=0.01)  # from the centre of X, 0
+    assert moved[1] == pytest.approx(3.0 * (25 / 3) / (25 / 3 + 2500), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["ekf", "ukf", "ekf-wrong"])
+def test_diffusion_is_in_multiples_of_the_scale_per_root_of_a_second(name):
+    """Where nothing is measured it adds its square times dt to the variance of each state."""
+    method, system, dt = get_method(name), get_system("lorenz"), 1e-4
+    assert [one["diffusion"] for one in method.configurations(system)] == list(DIFFUSION)
+    variance = []
+    for level in (0.0, 0.1):
+        observer = method.observer({"diffusion": np.array([level])}, system, dt, 1e9)
+        observer.reset(np.zeros((1, 1)))
+        observer.step(np.zeros((1, 1)))
+        variance.append(np.diag(observer.P[0]))
+    np.testing.assert_allclose(variance[1] - variance[0], (0.1 * np.array(system.scale)) ** 2 * dt, rtol=1e-6)
+
+
+def test_the_ukf_takes_every_trajectory_of_the_benchmark():
+    assert getattr(get_method("ukf"), "trajectories", None) is None

@@ -1,0 +1,161 @@
+"""Kalman filters against filterpy's, and against the linear filter where that is exact."""
+
+import numpy as np
+import pytest
+from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
+from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints
+from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
+from linear_system import C, F, Oscillator
+from scipy.linalg import expm
+
+from kkl_gym import get_system
+from kkl_gym.simulate import advance, simulate
+from training.benchmark.protocol import run
+from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.trajectories.derivatives import jacobian
+
+SYSTEMS = ["reverse_duffing", "van_der_pol", "rossler", "lorenz"]
+
+
+@pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])
+def filters(request):
+    return request.param
+
+
+def of_the_oscillator(filters):
+    start = np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])
+    return filters(Oscillator(), 0.02, Q=np.diag([0.01, 0.02]), R=np.array([[0.3]]), start=start)
+
+
+def of_van_der_pol(filters):
+    return filters(get_system("van_der_pol"), 0.01, Q=0.01 * np.eye(2), R=0.01 * np.eye(1))
+
+
+@pytest.mark.parametrize("driven", [False, True])
+def test_nonlinear_filters_are_the_kalman_filter_on_a_linear_system(filters, driven):
+    ours, dt, rng = of_the_oscillator(filters), 0.02, np.random.default_rng(0)
+    y, u = rng.normal(size=(200, 3, 1)), rng.uniform(-0.5, 0.5, (200, 3, 1))
+    found = [ours.reset(y[0])] + [ours.step(y[k], u[k] if driven else None) for k in range(1, 200)]
+    Phi = expm(F * dt)
+    held = np.linalg.solve(F, Phi - np.eye(2)) @ [[0.0], [1.0]]  # what an input does that is held over a sample
+    for i in range(3):
+        one = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+        one.F, one.B, one.H, one.Q, one.R = Phi, held, C, np.diag([0.01, 0.02]) * dt, np.array([[0.3]])
+        one.x, one.P = np.array([[0.2], [-0.1]]), np.array([[1.0, 0.3], [0.3, 0.5]])
+        for k in range(200):
+            if k:
+                one.predict(u=u[k, i, :, None] if driven else None)
+            one.update(y[k, i])
+            np.testing.assert_allclose(found[k][i], one.x[:, 0], rtol=1e-7, atol=1e-9)
+        np.testing.assert_allclose(ours.P[i], one.P, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_ekf_against_filterpy(name):
+    system, dt = get_system(name), 0.01
+    x0, P0 = unknown_start(system)
+    Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
+    x = simulate(system, np.array([x0 + 0.1 * np.array(system.scale)]), 100, dt)
+    y = system.output(x) + 0.5 * np.random.default_rng(0).normal(size=(101, 1, 1))
+    found = run(ExtendedKalmanFilter(system, dt, Q=Q, R=R, start=(x0, P0)), y)
+
+    def flow(state):
+        return simulate(system, state, 1, dt)[1]
+
+    one = FilterpyEKF(dim_x=system.nx, dim_z=1)
+    one.x, one.P, one.Q, one.R = x0.copy(), P0.copy(), Q * dt, R
+    rows = jacobian(system.h, system.nx)
+    H = np.array([[row[j](*x0) if j in row else 0.0 for j in range(system.nx)] for row in rows])
+    for k, value in enumerate(y[:, 0]):
+        if k:
+            around = one.x + 1e-5 * np.vstack([np.eye(system.nx), -np.eye(system.nx)])
+            moved = flow(around)
+            Phi = ((moved[: system.nx] - moved[system.nx :]) / 2e-5).T
+            one.x, one.P = flow(one.x[None])[0], Phi @ one.P @ Phi.T + one.Q
+        one.update(value, lambda _: H, lambda state: H @ state)
+        np.testing.assert_allclose(found[k, 0], one.x, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_ukf_is_filterpys_to_rounding(name):
+    system, dt = get_system(name), 0.01
+    Q, R = np.diag((0.01 * np.array(system.scale)) ** 2), 0.25 * np.eye(1)
+    rng = np.random.default_rng(0)
+    u = rng.uniform(-1, 1, (31, 3, system.nu)) * system.u_max
+    x = simulate(system, rng.uniform(*system.box(), (3, system.nx)), 30, dt, u=u[1:])
+    y = system.output(x) + 0.5 * rng.normal(size=(31, 3, 1))
+    ours = UnscentedKalmanFilter(system, dt, Q=Q, R=R)
+    found = [ours.reset(y[0])] + [ours.step(y[k], u[k]) for k in range(1, 31)]
+    points = MerweScaledSigmaPoints(system.nx, alpha=1.0, beta=2.0, kappa=3.0 - system.nx)
+
+    def flow(x, dt, u):
+        return np.array(advance(system, x.tolist(), u.tolist(), [0.0] * system.nx, dt))
+
+    for i in range(3):
+        one = FilterpyUKF(system.nx, 1, dt, lambda x: np.array(system.h(x)), flow, points)
+        one.x, one.P = unknown_start(system)
+        one.Q, one.R = Q * dt, R
+        one.sigmas_f = points.sigma_points(one.x, one.P)  # what its prediction would have left
+        for k in range(31):
+            if k:
+                one.predict(u=u[k, i])
+            one.update(y[k, i])
+            np.testing.assert_allclose(found[k][i], one.x, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(ours.P[i], one.P, rtol=1e-9, atol=1e-10)
+
+
+def test_some_rows_restart_and_others_go_on(filters):
+    rng = np.random.default_rng(0)
+    y = rng.normal(size=(20, 3, 1))
+    alone, together, rows = of_the_oscillator(filters), of_the_oscillator(filters), np.array([False, True, False])
+    whole = run(alone, y)
+    together.reset(y[0])
+    for k in range(1, 10):
+        together.step(y[k])
+    before = together.decode()
+    together.restart(y[0, rows], rows)
+    np.testing.assert_array_equal(together.decode()[~rows], before[~rows])
+    np.testing.assert_array_equal(together.decode(rows), whole[0, rows])
+    for k in range(1, 10):
+        together.advance(y[k], rows=rows)
+    np.testing.assert_allclose(together.decode(), whole[9], rtol=1e-12)
+    together.advance(y[10], rows=np.zeros(3, dtype=bool))
+    np.testing.assert_allclose(together.decode(), whole[9], rtol=1e-12)
+
+
+def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters):
+    y = np.random.default_rng(0).normal(size=(60, 2, 1))
+    wild = y.copy()
+    wild[1:4, 0] = np.array([1e9, 1e-9, 1e12])[:, None]
+    whole = run(of_van_der_pol(filters), y)
+    spoiled = run(of_van_der_pol(filters), wild)
+    np.testing.assert_allclose(spoiled[:, 1], whole[:, 1], rtol=1e-12, atol=1e-12)
+    observer = of_van_der_pol(filters)
+    for value in (1.0, 1e9, 1e-9, 1e12, 0.5):
+        x_hat = observer.reset(np.array([[value]])) if value == 1.0 else observer.step(np.array([[value]]))
+    x_hat = run(observer, np.full((50, 1, 1), 0.5))
+    assert np.isfinite(spoiled).all()
+    assert np.isfinite(x_hat).all()
+    assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
+
+
+@pytest.mark.parametrize("P", [-np.eye(2), np.diag([1.0, -1e-3]), np.full((2, 2), np.nan), np.diag([np.inf, 1.0])])
+def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(P):
+    observer, untouched = of_van_der_pol(UnscentedKalmanFilter), of_van_der_pol(UnscentedKalmanFilter)
+    y = np.array([[0.7], [-0.4]])
+    for one in (observer, untouched):
+        one.reset(y)
+    observer.P[0] = P
+    found, expected = observer.step(y), untouched.step(y)
+    fresh = of_van_der_pol(UnscentedKalmanFilter).reset(y)
+    np.testing.assert_allclose(found, [fresh[0], expected[1]], rtol=1e-12)
+    assert np.isfinite(observer.P).all()
+    assert np.abs(fresh[0] - expected[0]).max() > 1e-3
+
+
+def test_a_batch_of_many_is_each_alone():
+    y = np.random.default_rng(0).normal(size=(30, 40, 1))
+    many = run(of_van_der_pol(UnscentedKalmanFilter), y)
+    for i in (0, 17, 39):
+        alone = run(of_van_der_pol(UnscentedKalmanFilter), y[:, i : i + 1])
+        np.testing.assert_allclose(many[:, i], alone[:, 0], rtol=1e-9, atol=1e-11)

@@ -1,0 +1,131 @@
+"""Where a system goes in the long run, with the filter beside it: the samples that certificates are made of."""
+
+import math
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from observers import Artifact
+from training.seeds import Stream, generator
+from training.trajectories.noise import draw_process_noise
+
+SETTLED = 1e-4  # part of the filter's start that is left where recording begins
+RECORDED = 30.0  # seconds of each trajectory
+EVERY = 10  # samples between recorded ones
+TRUNCATED = 3.0  # standard deviations at which Gaussian noise is cut, for theorems about bounded noise
+
+
+@dataclass(frozen=True)
+class SettledTrajectories:
+    """Trajectories from where the filter has forgotten its start, one behind the other.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, nx)
+        States without noise.
+    z : ndarray, shape (n, size)
+        The filter's, under noise-free outputs.
+    noisy_x : ndarray, shape (n, nx)
+        States from the same starts under process noise.
+    noisy_z : ndarray, shape (n, size)
+        The filter's under these and noisy outputs.
+    noise : ndarray, shape (n, size)
+        The part of z that is due to measurement noise alone.
+    trajectories : int
+        Their number, each of which has the same number of samples.
+    """
+
+    x: np.ndarray
+    z: np.ndarray
+    noisy_x: np.ndarray
+    noisy_z: np.ndarray
+    noise: np.ndarray
+    trajectories: int
+
+    def halves(self) -> tuple["SettledTrajectories", "SettledTrajectories"]:
+        """The first half of the trajectories, and the rest."""
+        first = self.trajectories // 2
+        cut = first * (len(self.x) // self.trajectories)
+
+        def part(rows: slice, trajectories: int) -> "SettledTrajectories":
+            signals = {entry.name: getattr(self, entry.name)[rows] for entry in fields(self)[:-1]}
+            return SettledTrajectories(**signals, trajectories=trajectories)
+
+        return part(slice(cut), first), part(slice(cut, None), self.trajectories - first)
+
+
+def record_settled(
+    artifact: Artifact,
+    system: System,
+    *,
+    measurement_noise: float,
+    process_noise: float,
+    trajectories: int,
+    seed: int,
+) -> SettledTrajectories:
+    """Simulate trajectories from starts uniform in X, and record them once the filter has forgotten its start.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    measurement_noise : float
+        Standard deviation of v, which is cut at three of these.
+    process_noise : float
+        Bound of w in multiples of the system's scale per second.
+    trajectories : int
+        How many to simulate.
+    seed : int
+        Of starts and noise.
+
+    Returns
+    -------
+    SettledTrajectories
+        Those that stayed within the system's bounds, with process noise and without.
+
+    Raises
+    ------
+    ValueError
+        If more than half of them leave the bounds.
+    """
+    rng = generator(Stream.CERTIFICATE, seed)
+    linear = artifact.filter
+    dt = linear.dt
+    settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    first = math.ceil(settled / dt)
+    steps = first + round(RECORDED / dt)
+    ages = np.arange(first, steps + 1, EVERY)
+    x0 = rng.uniform(*system.box(), (trajectories, system.nx))
+    x = noisy_x = simulate(system, x0, steps, dt)
+    if process_noise:
+        w = draw_process_noise(system, process_noise, n=trajectories, steps=steps, rng=rng)
+        noisy_x = simulate(system, x0, steps, dt, w=w)
+    inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
+    if 2 * inside.sum() < trajectories:
+        raise ValueError(
+            f"only {inside.sum()} of {trajectories} trajectories of {steps * dt:g} s stayed within bounds = "
+            f"{system.bounds}; widen the bounds, shrink X or lower process_noise = {process_noise:g}"
+        )
+    x, noisy_x = x[:, inside], noisy_x[:, inside]
+    white = rng.standard_normal((*x.shape[:2], system.ny))
+    v = measurement_noise * np.clip(white, -TRUNCATED, TRUNCATED)
+    no_input = np.zeros((steps, x.shape[1], linear.nu))
+
+    def one_by_one(values: np.ndarray) -> np.ndarray:
+        return np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1])
+
+    def filtered(y: np.ndarray) -> np.ndarray:
+        return one_by_one(linear.run(y, no_input, ages))
+
+    return SettledTrajectories(
+        x=one_by_one(x[ages]),
+        z=filtered(system.output(x)),
+        noisy_x=one_by_one(noisy_x[ages]),
+        noisy_z=filtered(system.output(noisy_x) + v),
+        noise=filtered(v),
+        trajectories=x.shape[1],
+    )

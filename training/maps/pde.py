@@ -1,0 +1,67 @@
+"""The equation that a forward map solves, dT/dx f(x) = A T(x) + B h(x), on tensors."""
+
+from collections.abc import Callable
+
+import torch
+
+from kkl_gym.system import Components
+
+TensorMap = Callable[[torch.Tensor], torch.Tensor]
+
+
+def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
+    """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
+    values = equations(x.unbind(-1))
+    return torch.stack([torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(len(x)) for value in values], -1)
+
+
+def along(T: TensorMap, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Values of a map and its derivatives along a vector field.
+
+    Parameters
+    ----------
+    T : callable
+        The map, (n, nx) to (n, nz), each row by itself.
+    x : Tensor, shape (n, nx)
+        Where.
+    f : Tensor, shape (n, nx)
+        The vector field there.
+
+    Returns
+    -------
+    value : Tensor, shape (n, nz)
+        T(x).
+    derivative : Tensor, shape (n, nz)
+        dT/dx f.
+    """
+    value, derivative = torch.func.jvp(T, (x,), (f,))  # type: ignore[misc]
+    return value, derivative
+
+
+def residual(
+    T: TensorMap, x: torch.Tensor, *, f: torch.Tensor, h: torch.Tensor, A: torch.Tensor, B: torch.Tensor
+) -> torch.Tensor:
+    """How far a map is from solving the equation, P(x) = dT/dx f - A T - B h.
+
+    Parameters
+    ----------
+    T : callable
+        The map, (n, nx) to (n, nz), each row by itself.
+    x : Tensor, shape (n, nx)
+        Where.
+    f : Tensor, shape (n, nx)
+        The system's drift there.
+    h : Tensor, shape (n, ny)
+        Its output there.
+    A : Tensor, shape (nz, nz)
+        Of the filter.
+    B : Tensor, shape (nz, ny)
+        Of the filter.
+
+    Returns
+    -------
+    Tensor, shape (n, nz)
+        In units of z per second.
+    """
+    value, derivative = along(T, x, f)
+    return derivative - value @ A.T - h @ B.T

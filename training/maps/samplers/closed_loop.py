@@ -1,0 +1,76 @@
+"""Batches in which trajectories under a controller join the others."""
+
+import numpy as np
+import torch
+
+from observers import InverseMap, LinearFilter
+from training.maps.networks import Network, tensor
+from training.maps.samplers.batch import Batch
+from training.maps.samplers.trajectory import AGE_UNIT, MEASUREMENT_NOISE_UNIT, TrajectorySampler
+from training.trajectories.closed_loop import ClosedLoop
+
+
+class ClosedLoopSampler:
+    """Batches half from open-loop trajectories, half from closed-loop ones with the noise that these already hold.
+
+    Parameters
+    ----------
+    open_loop : TrajectorySampler
+        Where the first half is from, and the coordinates of both.
+    data : ClosedLoop
+        Where the other half is from.
+    dt : float
+        Sampling interval in seconds.
+    device : torch.device
+        Where batches are made.
+
+    Attributes
+    ----------
+    cells : int
+        Number of cells of like samples, those of the two halves apart.
+    """
+
+    def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
+        self.open_loop = open_loop
+        coordinates, gain = open_loop.coordinates, open_loop.coordinates.noise_gain
+        shrink = 1.0 + (data.measurement_noise[:, None] * gain) ** 2
+        self._modes = tensor(coordinates(data.z) / shrink, device)
+        self._x = tensor((data.x - open_loop.x_offset) / open_loop.x_scale, device)
+        self._level = tensor(np.log1p(data.measurement_noise / MEASUREMENT_NOISE_UNIT), device)
+        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / AGE_UNIT), device)
+        self._weight = open_loop.weight(data.x, device)
+        self._age_cell = open_loop.age_cell(data.ages, device)
+        position = (
+            np.log10(np.maximum(data.measurement_noise / open_loop.measurement_noise_max, 1e-9)) / 2 + 1
+        )  # over two decades, as there
+        level_cell = np.where(
+            data.measurement_noise > 0, 1 + np.clip(position * open_loop.LEVELS, 0, open_loop.LEVELS - 1), 0
+        )
+        self._level_cell = torch.as_tensor(level_cell.astype(int), device=device)
+        self._process_cell = torch.zeros_like(self._level_cell)
+        if open_loop.process_noise_max:
+            self._process, self._process_cell = open_loop.process_conditions(data.process_noise, device)
+        self.cells = 2 * open_loop.cells
+
+    def __call__(self, generator: torch.Generator) -> Batch:
+        """One batch."""
+        inputs, x, weight, cell = self.open_loop(generator)
+        m, n, _ = self._x.shape
+        half, device = len(x) // 2, self._x.device
+        ages = torch.randint(m, (half,), generator=generator, device=device)
+        rows = torch.randint(n, (half,), generator=generator, device=device)
+        conditions = [self._level[rows], self._age[ages]]
+        if self.open_loop.process_noise_max:
+            conditions.insert(1, self._process[rows])
+        closed = torch.cat([self._modes[ages, rows], torch.stack(conditions, -1)], -1)
+        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows], self._process_cell[rows])
+        return Batch(
+            torch.cat([inputs[:half], closed]),
+            torch.cat([x[:half], self._x[ages, rows]]),
+            torch.cat([weight[:half], self._weight[ages, rows]]),
+            torch.cat([cell[:half], self.open_loop.cells + closed_cell]),
+        )
+
+    def inverse_map(self, network: Network, linear: LinearFilter) -> InverseMap:
+        """The map that a network trained on these batches makes."""
+        return self.open_loop.inverse_map(network, linear)
