@@ -48,8 +48,8 @@ class Stage:
     cpu_seconds : float
         CPU time after which the stage ends if its steps are not done; the learning rate then follows the clock.
     optimiser : {"adam", "soap"}
-        SOAP is Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al., arXiv:2409.11321). For networks as small
-        as these, on batches as large, it takes about as long a step, and far fewer of them.
+        SOAP is Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al., arXiv:2409.11321). For networks as
+        small as these, on batches as large, it takes about as long a step, and far fewer of them.
     """
 
     name: str
