@@ -9,6 +9,7 @@ import pytest
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
+from training.config import current_names
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape
 from training.presets import preset
@@ -43,9 +44,9 @@ def test_default_maps_are_as_accurate_as_promised(name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_default_maps_are_what_the_preset_makes(name):
-    made = observers.load(name).artifact.training
+    made = current_names(observers.load(name).artifact.training)
     config = json.loads(json.dumps(asdict(preset(get_system(name), "input-aware", "fast"))))
-    assert {key: made.get(key, config[key]) for key in config} == config
+    assert {key: made[key] for key in config} == config
     assert made["optimiser"] == "soap"
 
 
