@@ -31,9 +31,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     clipped to the system's declared bounds (for y, to the outputs that those bounds allow, widened by six standard
     deviations of the noise).
 
-    **Info.** ``y`` the noisy output, ``x`` the true state and ``u`` the physical input that acted, which is zero after
-    reset; float64, never clipped. ``sample``, an integer array of shape (), counts the sampling intervals since reset.
-    ``escaped`` says whether the state has left its declared bounds.
+    **Info.** Arrays, of the same keys at reset and at steps: ``y`` the noisy output, ``x`` the true state and ``u`` the
+    physical input that acted, zero at reset; float64, never clipped. ``sample``, an integer of shape (), counts the
+    sampling intervals since reset. ``escaped``, boolean of shape (), says whether the state left its declared bounds.
 
     **Reward.** 1 / (1 + 4 c) in (0, 1] with c = mean(((x - target) / scale)^2): 1 at the system's target.
 
@@ -280,7 +280,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             "x": np.array(self._x),
             "u": np.array(u),
             "sample": np.array(self._sample, _INTEGER),
-            "escaped": escaped,
+            "escaped": np.array(escaped),
         }
 
     def _next_noise(self) -> tuple[list[float], list[float]]:

@@ -18,8 +18,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
     The observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment applied. ``info`` gains
     ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With
-    ``monitor`` it gains ``score`` too, above 1 where the samples do not fit the estimates (a faulty sensor, states that
-    the map was not made for).
+    ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit the estimates (a
+    faulty sensor, states that the map was not made for).
 
     With ``estimate="z"`` the network is not evaluated, unless there is a monitor. There is then no ``x_hat``, and
     :meth:`render` shows no estimate.
@@ -184,8 +184,6 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()
         info.update(report)
-        if "score" in report:
-            info["score"] = float(report["score"])
         if self.render_mode is not None and "x_hat" in report:
             self._trail.append(report["x_hat"].tolist())
         return observation(self._estimator.shown(report), self._estimator.space)
