@@ -99,13 +99,13 @@ def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "
     cutoff : float
         In rad/s.
     norm : {"mag", "phase"}, default "mag"
-        What the cutoff means, as in :func:`scipy.signal.bessel`: where the gain is -3 dB, or where the phase is at its
-        middle.
+        What the cutoff means, as in :func:`scipy.signal.bessel`: where the gain is -3 dB, or that of the Butterworth
+        filter with the same asymptotes, where the phase is about at its middle.
 
     Returns
     -------
     Spectrum
-        The poles, a real one first if the order is odd.
+        The poles: pairs, and a real one if the order is odd.
     """
     _, poles, _ = besselap(order, norm=norm)
     real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)

@@ -1,9 +1,12 @@
 """The eigenvalues of A and the filter that they make."""
 
 import numpy as np
+import pytest
 from linear_system import Oscillator, sylvester
+from scipy.signal import bessel, freqs_zpk
 
-from training.spectrum import Spectrum
+from kkl_gym import get_system
+from training.spectrum import Spectrum, bessel_spectrum, evenly_spaced, papers_spectrum, typical_rate
 from training.trajectories.record import record
 
 
@@ -16,3 +19,72 @@ def test_complex_modes_filter_a_linear_system_to_its_sylvester_solution():
     )
     data = record(system, linear, n=20, steps=2500, ages=np.array([2400, 2500]), rng=np.random.default_rng(0))
     np.testing.assert_allclose(data.z, data.x @ sylvester(linear.A, linear.B).T, atol=1e-4)  # as holding y is exact
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+@pytest.mark.parametrize("nu", [0, 1])
+def test_each_output_has_a_filter_with_the_poles(ny, nu):
+    spectrum = Spectrum((-2.0, -5.0), ((-0.9, 1.7),))
+    assert spectrum.modes == len(spectrum.poles) == 4
+    linear = spectrum.filter(ny, 0.02, nu)
+    assert (linear.dt, linear.nu) == (0.02, nu)
+    block = np.zeros((4, 4))
+    block[:2, :2], block[2:, 2:] = np.diag([-2.0, -5.0]), [[-0.9, 1.7], [-1.7, -0.9]]
+    np.testing.assert_array_equal(linear.A, np.kron(np.eye(ny), block))
+    np.testing.assert_array_equal(linear.B, np.kron(np.eye(ny), np.ones((4, 1))))
+    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(spectrum.A)), np.sort_complex(spectrum.poles))
+
+
+def test_spectra_add_up():
+    both = Spectrum((-2.0,), ((-0.9, 1.7),)) + Spectrum((-3.0,), ((-1.0, 0.5),))
+    assert both == Spectrum((-2.0, -3.0), ((-0.9, 1.7), (-1.0, 0.5)))
+    assert both != Spectrum((-3.0, -2.0), ((-0.9, 1.7), (-1.0, 0.5)))
+
+
+@pytest.mark.parametrize("order", [2, 3, 6])
+@pytest.mark.parametrize("norm", ["mag", "phase"])
+def test_bessel_spectra_are_scipys(order, norm):
+    cutoff = 7.0
+    spectrum = bessel_spectrum(order, cutoff, norm=norm)
+    zeros, poles, gain = bessel(order, cutoff, analog=True, output="zpk", norm=norm)
+    assert spectrum.modes == order
+    np.testing.assert_allclose(np.sort_complex(spectrum.poles), np.sort_complex(poles), rtol=1e-9)
+    _, response = freqs_zpk(zeros, spectrum.poles, gain, [cutoff])
+    if norm == "mag":
+        assert abs(response[0]) == pytest.approx(1 / np.sqrt(2), rel=1e-6)
+    else:
+        assert abs(np.prod(spectrum.poles)) == pytest.approx(cutoff**order)  # the asymptotes are a Butterworth filter's
+    twice = bessel_spectrum(order, 2 * cutoff, norm=norm)
+    np.testing.assert_allclose(twice.poles, 2 * spectrum.poles)
+
+
+def test_the_cutoff_is_by_magnitude_unless_said_otherwise():
+    assert bessel_spectrum(4, 2.0) == bessel_spectrum(4, 2.0, norm="mag") != bessel_spectrum(4, 2.0, norm="phase")
+
+
+def test_evenly_spaced_eigenvalues():
+    found = evenly_spaced(5, -1.0, -16.0)
+    assert all(isinstance(value, float) for value in found)
+    np.testing.assert_allclose(found, [-1.0, -2.0, -4.0, -8.0, -16.0])
+    assert papers_spectrum(get_system("van_der_pol")) == (-1.5, -1.875, -2.25, -2.625, -3.0)
+
+
+def test_typical_rate():
+    class Still(Oscillator):
+        name = "still"
+
+        def rate(self, x):
+            return 0.0
+
+    class Growing(Oscillator):
+        name = "growing"
+
+        def rate(self, x):
+            return 3.0 + x[0]
+
+    assert typical_rate(Oscillator()) == pytest.approx(np.sqrt(2), rel=1e-6)
+    assert typical_rate(Growing()) == pytest.approx(3.0, abs=0.1)
+    assert typical_rate(Growing(), np.random.default_rng(1)) != typical_rate(Growing())
+    assert typical_rate(Growing(), np.random.default_rng(0)) == typical_rate(Growing())
+    with pytest.raises(ValueError, match=r"still\.rate\(x\) is 0\.0"):
+        typical_rate(Still())

@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
-from small_runs import closed_loop
+from small_runs import closed_loop, open_loop, toy, untrained
 
+import training.pipeline
+from kkl_gym import VanDerPol
 from observers import KKLObserver
+from training import train
+from training.trajectories.closed_loop import record_closed_loop
 
 
 @pytest.mark.parametrize("process_noise_share", [0.0, 0.5])
@@ -23,3 +27,63 @@ def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(process_
     assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen)
     states = {tuple(row) for row in data.x.reshape(-1, 2).round(6).tolist()}
     assert not any(tuple(row) in states for x_hat in seen for row in x_hat.round(6).tolist())
+
+
+@pytest.mark.parametrize(
+    ("noise_free_share", "high_noise_emphasis"), [(0.0, 1.0), (0.2, 2.0), (0.6, 4.0), (1.0, 2.0), (0.0, 0.5)]
+)
+def test_how_often_there_is_each_noise_level(noise_free_share, high_noise_emphasis):
+    sampler, _, linear = open_loop()
+    _, artifact = untrained(sampler, linear)
+    data = record_closed_loop(
+        VanDerPol(),
+        artifact,
+        lambda x_hat: np.zeros((len(x_hat), 1)),
+        n=50,  # each a group of its own
+        steps=1,
+        ages=np.array([0, 1]),
+        rng=np.random.default_rng(0),
+        noise_free_share=noise_free_share,
+        high_noise_emphasis=high_noise_emphasis,
+    )
+    level = data.measurement_noise
+    assert len(level) == 50
+    assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.021)
+    assert level.max() <= artifact.inverse.measurement_noise_max
+    for below in (0.1, 0.4):  # of which a part of the two decades below 1 is left out
+        expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below) / 2) ** high_noise_emphasis
+        assert (level <= below).mean() == pytest.approx(expected, abs=0.021)
+
+
+@pytest.mark.parametrize("process_noise_share", [0.0, 0.3, 1.0])
+def test_how_often_there_is_process_noise(process_noise_share):
+    sampler, _, linear = open_loop(process_noise_share=0.5)
+    _, artifact = untrained(sampler, linear)
+    data = record_closed_loop(
+        VanDerPol(),
+        artifact,
+        lambda x_hat: np.zeros((len(x_hat), 1)),
+        n=50,
+        steps=1,
+        ages=np.array([0, 1]),
+        rng=np.random.default_rng(0),
+        process_noise_share=process_noise_share,
+    )
+    disturbed = data.process_noise > 0
+    assert disturbed.mean() == pytest.approx(process_noise_share, abs=0.15)
+    assert disturbed.any() == (process_noise_share > 0)
+    assert disturbed.all() == (process_noise_share == 1.0)
+    assert data.process_noise.max() <= VanDerPol.process_noise
+
+
+def test_the_shares_of_a_run_reach_its_closed_loop(monkeypatch, tmp_path):
+    told = []
+
+    def spy(*arguments, **named):
+        told.append({name: value for name, value in named.items() if name.endswith(("_share", "_emphasis"))})
+        return record_closed_loop(*arguments, **named)
+
+    monkeypatch.setattr(training.pipeline, "record_closed_loop", spy)
+    shares = {"noise_free_share": 0.35, "high_noise_emphasis": 1.5, "process_noise_share": 0.25}
+    train(VanDerPol(), toy(VanDerPol(), closed_loop_trajectories=20, inverse_steps=2, **shares), tmp_path)
+    assert told == [shares]

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from linear_system import Autonomous, Oscillator
 
-import training.evaluation.errors
-import training.maps.optimise
-import training.pipeline
 import training.trajectories.record
 from kkl_gym import ReverseDuffing, VanDerPol
 from kkl_gym.simulate import simulate
+from kkl_gym.system import System
 from observers import LinearFilter
+from training.trajectories.noise import draw_process_noise
 from training.trajectories.record import Motions, record, recording_ages, trajectories
+from training.trajectories.signals import KINDS, random_inputs
 
 
 def test_excited_starts_lie_beyond_the_box_and_the_others_within():
@@ -103,3 +103,100 @@ def test_recording_gives_up_on_a_system_that_always_escapes():
     linear = LinearFilter(np.diag([-1.0]), np.ones((1, 1)), 0.01)
     with pytest.raises(ValueError, match="stayed within bounds"):
         record(Runaway(), linear, n=5, steps=200, ages=np.array([0]), rng=np.random.default_rng(0))
+
+
+@dataclass(frozen=True)
+class Integrator(System):
+    """x' = u: free motion stays where it is, and most driven motion escapes."""
+
+    name: ClassVar[str] = "integrator"
+    X: ClassVar = ((-0.5, 0.5),)
+    bounds: ClassVar = ((-0.6, 0.6),)
+    u_max: ClassVar = (1.0,)
+    G: ClassVar = ((1.0,),)
+
+    def f(self, x):
+        return (0.0 * x[0],)
+
+    def h(self, x):
+        return (x[0],)
+
+    def rate(self, x):
+        return 0.0
+
+
+@dataclass(frozen=True)
+class Conveyor(Integrator):
+    """x' = 1 + u: a long way in whatever happens."""
+
+    name: ClassVar[str] = "conveyor"
+    bounds: ClassVar = ((-1.0, 1.5),)
+
+    def f(self, x):
+        return (1.0 + 0.0 * x[0],)
+
+
+def together(chunks):
+    """States, inputs and levels of all chunks, trajectories first."""
+    x, u, level = zip(*chunks, strict=True)
+    return np.concatenate(x, 1).swapaxes(0, 1), np.concatenate(u, 1).swapaxes(0, 1), np.concatenate(level)
+
+
+@pytest.mark.parametrize("n", [40, 57, 24])
+def test_what_escapes_is_replaced_by_its_like(monkeypatch, n):
+    monkeypatch.setattr(training.trajectories.record, "CHUNK", 24)
+    motions, tried = Motions(kinds=KINDS), []
+
+    def spy(system, x0, *arguments, **named):
+        tried.append(len(x0))
+        return simulate(system, x0, *arguments, **named)
+
+    monkeypatch.setattr(training.trajectories.record, "simulate", spy)
+    x, u, level = together(
+        trajectories(Integrator(), n=n, steps=200, dt=0.01, rng=np.random.default_rng(0), motions=motions)
+    )
+    assert sum(tried) > 1.2 * n  # so many escaped that the kinds of those that stayed are others
+    assert x.shape == (n, 201, 1)
+    assert (np.abs(x) <= 0.6).all()
+    assert not level.any()
+    different = np.array([len(np.unique(row)) for row in u[..., 0]])
+    kinds = np.where((u == 0).all((1, 2)), "zero", np.where(different > 100, "sine", "steps"))
+    expected = [KINDS[row % 4] for chunk in range(0, n, 24) for row in range(min(24, n - chunk))]
+    for kind in ("zero", "steps", "sine"):
+        assert (kinds == kind).sum() == expected.count(kind)
+
+
+@pytest.mark.parametrize(("n", "share"), [(40, 0.5), (57, 0.25), (24, 0.75)])
+def test_as_many_start_beyond_the_box_as_were_asked_for(monkeypatch, n, share):
+    monkeypatch.setattr(training.trajectories.record, "CHUNK", 24)
+    monkeypatch.setattr(training.trajectories.record, "_lead_in", lambda system, x0, **named: x0 + 1.0)
+    motions = Motions(lead_in_share=share)
+    x, u, _ = together(trajectories(Conveyor(), n=n, steps=50, dt=0.01, rng=np.random.default_rng(0), motions=motions))
+    assert x.shape == (n, 51, 1)
+    assert u.shape == (n, 50, 0)
+    assert x.max() <= 1.5  # half of the starts beyond X are too near that bound
+    expected = sum(round(share * min(24, n - chunk)) for chunk in range(0, n, 24))
+    assert (x[:, 0] > 0.5).sum() == expected
+
+
+def test_without_escapes_the_draws_are_chunk_by_chunk(monkeypatch):
+    monkeypatch.setattr(training.trajectories.record, "CHUNK", 24)
+    system, n, steps, dt = VanDerPol(), 57, 30, 0.01
+    motions = Motions(kinds=KINDS, lead_in_share=0.25, lead_in_input=0.5, process_noise_share=0.4)
+    rng = np.random.default_rng(3)
+    found = list(trajectories(system, n=n, steps=steps, dt=dt, rng=np.random.default_rng(3), motions=motions))
+    assert [x.shape[1] for x, _, _ in found] == [24, 24, 9]
+    for x, u, level in found:
+        count = x.shape[1]
+        x0 = rng.uniform(*system.box(), (count, 2))
+        led = round(0.25 * count)
+        constant = 0.5 * rng.uniform(-1, 1, (led, 1)) * system.u_max
+        x0[:led] = simulate(system, x0[:led], 2000, dt, u=np.broadcast_to(constant, (2000, led, 1)))[-1]
+        assert np.isfinite(x0).all()
+        inputs = random_inputs(system, count, steps, dt=dt, rng=rng)
+        disturbed = rng.random(count) < 0.4
+        expected = system.process_noise * np.where(disturbed, np.sqrt(rng.random(count)), 0.0)
+        w = draw_process_noise(system, expected, n=count, steps=steps, rng=rng)
+        np.testing.assert_array_equal(u, inputs)
+        np.testing.assert_array_equal(level, expected)
+        np.testing.assert_array_equal(x, simulate(system, x0, steps, dt, u=inputs, w=w))

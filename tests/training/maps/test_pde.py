@@ -1,0 +1,120 @@
+"""The equation of the forward map on tensors, where derivatives and solutions are known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from conftest import random_artifact
+from linear_system import C, F, Oscillator, sylvester
+
+from kkl_gym import get_system
+from kkl_gym.system import on_states
+from observers import ForwardMap
+from training.maps.forward import ForwardProblem
+from training.maps.networks import Network, from_mlp
+from training.maps.pde import along, on_tensors, residual
+from training.maps.smooth import Smooth, encoder
+from training.maps.smooth import residual as residual_of
+
+A, B = torch.diag(torch.tensor([-1.0, -2.5, -4.0], dtype=torch.float64)), torch.ones(3, 1, dtype=torch.float64)
+
+
+def points(system, n=20):
+    return torch.as_tensor(np.random.default_rng(0).uniform(*system.box(), (n, system.nx)))
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_equations_on_tensors_are_those_on_arrays(name):
+    system = get_system(name)
+    x = points(system)
+    for equations in (system.f, system.h):
+        np.testing.assert_allclose(on_tensors(equations, x).numpy(), on_states(equations, x.numpy()), rtol=1e-14)
+    mixed = on_tensors(lambda x: (1.0, x[0], 2), x.float())
+    assert mixed.dtype == torch.float32
+    np.testing.assert_array_equal(mixed.numpy(), np.stack([np.ones(20), x[:, 0].float(), np.full(20, 2.0)], 1))
+
+
+def test_derivatives_along_a_field_are_those_by_hand():
+    x, f = torch.tensor([[1.0, 2.0], [3.0, -1.0]]), torch.tensor([[0.5, -1.0], [2.0, 4.0]])
+    value, derivative = along(lambda x: torch.stack([x[:, 0] * x[:, 1], x[:, 0] ** 2], 1), x, f)
+    assert value.tolist() == [[2.0, 1.0], [-3.0, 9.0]]
+    assert derivative.tolist() == [[2.0 * 0.5 - 1.0, 1.0], [-2.0 + 12.0, 12.0]]
+
+
+def test_the_solution_leaves_nothing_and_another_map_what_it_is_off_by():
+    system, x = Oscillator(), points(Oscillator())
+    M = torch.as_tensor(sylvester(A.numpy(), B.numpy()))
+    given = {"f": on_tensors(system.f, x), "h": on_tensors(system.h, x), "A": A, "B": B}
+    np.testing.assert_allclose(residual(lambda x: x @ M.T, x, **given), np.zeros((20, 3)), atol=1e-14)
+    wrong = M + 0.1
+    expected = x @ (wrong @ torch.as_tensor(F) - A @ wrong - B @ torch.as_tensor(C)).T - 0.2 * A.sum(1)
+    np.testing.assert_allclose(residual(lambda x: x @ wrong.T + 0.2, x, **given), expected, atol=1e-14)
+
+
+def test_the_residual_can_be_trained():
+    system, x = Oscillator(), points(Oscillator())
+    M = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
+    f, h = on_tensors(system.f, x), on_tensors(system.h, x)
+
+    def risk():
+        return residual(lambda x: x @ M.T, x, f=f, h=h, A=A, B=B).square().mean()
+
+    optimiser = torch.optim.LBFGS([M], max_iter=200, tolerance_grad=1e-12, tolerance_change=1e-14)
+
+    def closure():
+        optimiser.zero_grad()
+        loss = risk()
+        loss.backward()
+        return loss
+
+    optimiser.step(closure)
+    np.testing.assert_allclose(M.detach(), sylvester(A.numpy(), B.numpy()), atol=1e-6)
+
+
+def test_the_residual_is_the_same_in_training_and_in_a_certificate():
+    system = get_system("rossler")
+    artifact = random_artifact("rossler", inputs=False, age=False, forward=True)
+    linear, rng = artifact.filter, np.random.default_rng(0)
+    x = rng.uniform(*system.box(), (50, 3))
+    torch.manual_seed(0)
+    problem = ForwardProblem(
+        Network(3, linear.size, width=16, depth=2, activation="tanh"),
+        system,
+        linear=linear,
+        x=x,
+        z=rng.normal(size=(50, linear.size)),
+        physics_weight=1.0,
+        batch=64,
+        device=torch.device("cpu"),
+    )
+    found, speed = problem.residual(torch.as_tensor(x, dtype=torch.float32))
+    expected = residual_of(dataclasses.replace(artifact, forward=problem.forward_map()), system, x)
+    np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.x_scale, axis=1), rtol=1e-5)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_networks_come_back_from_numpy(activation):
+    torch.manual_seed(0)
+    network = Network(3, 2, width=8, depth=2, activation=activation)
+    x = torch.randn(10, 3)
+    again = from_mlp(network.export())
+    assert not any(parameter.requires_grad for parameter in again.parameters())
+    np.testing.assert_array_equal(again(x), network(x).detach())
+    in_float64 = Smooth(network.export())(x.numpy())
+    assert in_float64.dtype == float
+    np.testing.assert_allclose(in_float64, network(x).detach(), atol=1e-5)
+    scaled = ForwardMap(network.export(), np.ones(3), np.full(3, 2.0), np.full(2, 5.0), np.full(2, 3.0))
+    np.testing.assert_allclose(
+        encoder(scaled)(x.numpy()), 5.0 + 3.0 * network((x - 1.0) / 2.0).detach().numpy(), atol=1e-5
+    )
+
+
+def test_jacobians_in_chunks_are_those_at_once(monkeypatch):
+    network = Smooth(Network(3, 2, width=8, depth=2, activation="tanh").export())
+    x = np.random.default_rng(0).normal(size=(23, 3))
+    whole = network.jacobian(x)
+    assert whole.shape == (23, 2, 3)
+    monkeypatch.setattr("training.maps.smooth.CHUNK", 5)
+    np.testing.assert_allclose(network.jacobian(x), whole, rtol=1e-13)
