@@ -138,7 +138,7 @@ def test_kalman_filters_follow_a_driven_state():
     assert max(errors[200:]) < 0.1 < errors[0]
     system = get_system("van_der_pol")
     ours = KalmanFilters(env.unwrapped)
-    theirs = EKF().observer({"process_noise": np.array([1e-2])}, system, 0.01, 0.1)
+    theirs = EKF().observer({"diffusion": np.array([1e-2])}, system, 0.01, 0.1)
     y = np.random.default_rng(0).normal(size=(20, N, 1))
     ours.reset(y[0])
     theirs.reset(y[0])

@@ -10,6 +10,7 @@ import pytest
 
 import training.evaluation.calibration
 import training.evaluation.certificates.certificate
+import training.evaluation.certificates.gains
 import training.evaluation.faults
 from kkl_gym import VanDerPol
 from observers import Artifact, KKLObserver, Limits
@@ -66,7 +67,8 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
     simulate_faults(calibrated, system, trajectories=2, duration=12.0, measurement_noise=0.5, seed=0)
     assert set(told) == {0.12}
     told.clear()
-    monkeypatch.setattr(training.evaluation.certificates.certificate, "decoder", spy)
+    for module in (training.evaluation.certificates.certificate, training.evaluation.certificates.gains):
+        monkeypatch.setattr(module, "decoder", spy)
     training.certify(artifact, system, measurement_noise=0.3, trajectories=4)
     assert set(told) == {(0.3, 0.12), (0.0, 0.0)}
     assert told.count((0.3, 0.12)) == 2  # for the errors, and for what noise will do
