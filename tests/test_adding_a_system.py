@@ -15,9 +15,7 @@ PAGE = (ROOT / "docs" / "adding_a_system.md").read_text()
 
 # The line above a block says what to do with it.
 NEW = re.compile(r"New file `(?P<path>[^`]+)`:")
-EDIT = re.compile(
-    r"In `(?P<path>[^`]+)`, (?P<where>above|below|in place of) the line that begins with `(?P<line>[^`]+)`:"
-)
+EDIT = re.compile(r"In `(?P<path>[^`]+)`, (?P<where>below|in place of) the line that begins with `(?P<line>[^`]+)`:")
 SCRIPT, LOOK, FULL = "This runs now:", "For a first look", "In full"
 
 
@@ -29,10 +27,10 @@ def blocks():
 
 
 def edit(text, where, line, new):
-    """The text with something above, below or in place of its first line that begins so."""
+    """The text with something below or in place of its first line that begins so."""
     lines = text.splitlines(keepends=True)
-    (at, *_) = [i for i, one in enumerate(lines) if one.startswith(line)]
-    lines[at : at + 1] = {"above": [new, lines[at]], "below": [lines[at], new], "in place of": [new]}[where]
+    at = next(i for i, one in enumerate(lines) if one.startswith(line))
+    lines[at] = lines[at] + new if where == "below" else new
     return "".join(lines)
 
 
