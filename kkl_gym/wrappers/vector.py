@@ -457,4 +457,4 @@ def plant_of(env: VectorEnv, *also: str) -> Plant:
     return first
 
 
-__all__ = ["Estimator", "KKLVectorObservation", "VectorActionRepeat", "VectorEstimate"]
+__all__ = ["KKLVectorObservation", "VectorActionRepeat", "VectorEstimate"]

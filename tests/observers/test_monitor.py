@@ -171,7 +171,7 @@ def test_wrappers_report_the_score(tmp_path, estimate):
         action = many.action_space.sample()
         info = many.step(action)[-1]
         single = [env.step(one)[-1] for env, one in zip(ones, action, strict=True)]
-        assert info["score"] == pytest.approx([each["score"] for each in single], rel=1e-5)
+        assert info["score"] == pytest.approx(np.array([each["score"] for each in single]), rel=1e-5)
         assert all(each["score"].shape == () for each in single)
     assert (info["score"] > 0).all()
     assert info["_score"].all()
