@@ -397,6 +397,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 block[:, :, at] = drawn[: len(some)].transpose(1, 2, 0)
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+        # As System.output, component first and in a third of its time, which a step would feel.
         return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
 
     def _observation(self) -> np.ndarray:
