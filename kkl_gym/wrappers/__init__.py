@@ -4,4 +4,11 @@ from kkl_gym.wrappers.estimator import Estimator
 from kkl_gym.wrappers.single import ActionRepeat, KKLObservation
 from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat, VectorEstimate
 
-__all__ = ["ActionRepeat", "Estimator", "KKLObservation", "KKLVectorObservation", "VectorActionRepeat", "VectorEstimate"]
+__all__ = [
+    "ActionRepeat",
+    "Estimator",
+    "KKLObservation",
+    "KKLVectorObservation",
+    "VectorActionRepeat",
+    "VectorEstimate",
+]
