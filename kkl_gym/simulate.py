@@ -270,6 +270,12 @@ def simulate(
     return out
 
 
+def check_duration(duration: float, dt: float) -> None:
+    """Raise ValueError unless ``duration`` is a finite number of seconds, and not shorter than a sample of ``dt``."""
+    if not dt <= duration < math.inf:
+        raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
+
+
 def check_dt(dt: float) -> None:
     """Raise an error unless ``dt`` is a sampling interval.
 

@@ -3,9 +3,11 @@
 # ruff: noqa: D102 - what each system overrides is documented on System
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
+
+import numpy as np
 
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
@@ -202,7 +204,19 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
         system = system()
     if not isinstance(system, System):
         raise ValueError(f"expected a system or the name of one, got {system!r}")
-    return system.replace(parameters or {})
+    found = system.replace(parameters or {})
+    if type(found) not in SYSTEMS.values():
+        _check_components(found)
+    return found
+
+
+def _check_components(system: System) -> None:
+    """Raise ValueError if f or h of a user's system does not return components, as when a comma is missing."""
+    middle = [(low + high) / 2 for low, high in system.X]
+    for name, found, n in (("f", system.f(middle), system.nx), ("h", system.h(middle), None)):
+        if not isinstance(found, Sequence | np.ndarray) or n not in (None, len(found)):
+            wanted = "its components, as in (y,)" if n is None else f"{n} components"
+            raise ValueError(f"{name}(x) of {system.name} must return {wanted}; it returns {found!r}")
 
 
 def _find(name: str) -> type[System]:

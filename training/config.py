@@ -86,8 +86,8 @@ class Config:
     """Solve for the forward map by least squares with so many random features, 1500 say, instead of training it
     (spinn); 0 trains it."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
-    """Multiple of the training box X from which motions start along which a solved forward map holds and is
-    inverted."""
+    """Where a solved forward map holds and is inverted: along motions that start in this multiple of the training box
+    X (spinn with random_features)."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
@@ -119,6 +119,8 @@ class Config:
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        if self.duration < self.dt:
+            raise ValueError(f"duration = {self.duration} s is shorter than one sample, dt = {self.dt} s")
         if not self.eigenvalues and not self.pairs:
             raise ValueError("A needs eigenvalues, or pairs of them")
         for modes in (self.eigenvalues, self.pairs):
@@ -163,8 +165,17 @@ def current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
     -------
     dict of str to object
         The same values.
+
+    Raises
+    ------
+    ValueError
+        If a setting is there under both of its names.
     """
-    return {FORMER_NAMES.get(name, name): value for name, value in settings.items()}
+    found = {FORMER_NAMES.get(name, name): value for name, value in settings.items()}
+    if len(found) < len(settings):
+        twice = [f"{old} and {new}" for old, new in FORMER_NAMES.items() if old in settings and new in settings]
+        raise ValueError(f"two names of one setting: {', '.join(twice)}")
+    return found
 
 
 def read_changes(path: Path) -> dict[str, Any]:
@@ -188,8 +199,8 @@ def read_changes(path: Path) -> dict[str, Any]:
         If it cannot be read.
     """
     try:
-        found = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:  # that of JSON, or of a text in another encoding
         raise ValueError(f"{path} is no JSON: {error}") from None
     types = setting_types()
     del types["pipeline"], types["closed_loop_trajectories"]

@@ -23,6 +23,30 @@ AGENT_EVALUATION_SEED = 10**9
 AGENT_EVALUATION_EPISODES = 10_000  # at most
 
 
+def agent_training_seed(seed: int) -> int:
+    """Seed of the first episode on which an agent learns.
+
+    Parameters
+    ----------
+    seed : int
+        The agent's own.
+
+    Returns
+    -------
+    int
+        Far below those of evaluation.
+
+    Raises
+    ------
+    ValueError
+        If the seed is negative, or so large that episodes of evaluation would be learned from.
+    """
+    most = AGENT_EVALUATION_SEED // AGENT_TRAINING_SEED - 2
+    if not 0 <= seed <= most:
+        raise ValueError(f"an agent's seed must lie between 0 and {most}, got {seed}")
+    return AGENT_TRAINING_SEED * (seed + 1)
+
+
 def agent_evaluation_seed(seed: int, episodes: int) -> int:
     """Seed of the first episode on which agents are evaluated; no two seeds share an episode.
 

@@ -84,6 +84,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         monitor: bool = False,
     ) -> None:
         observer = None if observer is None else os.fspath(observer)
+        if isinstance(measurement_noise, np.floating):  # which the specification could not write down
+            measurement_noise = float(measurement_noise)
         RecordConstructorArgs.__init__(
             self,
             observer=observer,

@@ -365,3 +365,17 @@ def test_elementary_gradient():
     x = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(elementary.sin(x), x)
     assert float(slope) == pytest.approx(math.cos(0.3))
+
+
+@pytest.mark.parametrize(
+    ("f", "h", "message"),
+    [
+        (lambda self, x: (x[1], -x[0]), lambda self, x: x[0], r"h\(x\) of slip must return its components"),
+        (lambda self, x: x[0], lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
+        (lambda self, x: (x[1], -x[0], 0.0), lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
+    ],
+)
+def test_equations_that_return_no_components_are_named(f, h, message):
+    slip = type("Slip", (System,), {"name": "slip", "X": ((-1, 1),) * 2, "bounds": ((-9, 9),) * 2, "f": f, "h": h})
+    with pytest.raises(ValueError, match=message):
+        get_system(slip)

@@ -12,6 +12,7 @@ from training import preset
     ("change", "message"),
     [
         ({"dt": 0.0}, "dt"),
+        ({"dt": 5.0, "duration": 3.0}, "shorter than one sample"),
         ({"eigenvalues": (1.0,)}, "eigenvalues"),
         ({"eigenvalues": (-1.0, -1.0)}, "distinct"),
         ({"pairs": ((0.1, 1.0),)}, "pairs"),

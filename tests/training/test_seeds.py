@@ -4,7 +4,7 @@ from itertools import product
 
 import pytest
 
-from training.seeds import Stream, generator
+from training.seeds import Stream, agent_evaluation_seed, agent_training_seed, generator
 
 
 def test_no_two_streams_meet():
@@ -19,3 +19,10 @@ def test_seeds_that_would_meet_others_are_refused(seed):
     """Of [1, 2**32 + 5] NumPy makes the words of [1, 5, 1], part 1 of seed 5."""
     with pytest.raises(ValueError, match=rf"seed = {seed[-1]} must be a whole number from 0 to 2\*\*32 - 1"):
         generator(Stream.TRAINING, *seed)
+
+
+def test_no_agent_learns_from_episodes_of_the_evaluation():
+    last = agent_training_seed(99_998)
+    assert last < agent_evaluation_seed(0, 1)
+    with pytest.raises(ValueError, match="99999"):
+        agent_training_seed(99_999)

@@ -25,7 +25,7 @@ from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
-from training.seeds import AGENT_TRAINING_SEED
+from training.seeds import agent_training_seed
 from training.systems import ControlTask, profile
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"ppo": PPO, "sac": SAC, "ppo_lstm": RecurrentPPO}
@@ -77,6 +77,8 @@ def learn(
     """
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
+    if observer is not None and information not in ("x_hat", "z"):
+        raise ValueError(f"an agent that knows {information!r} has no use for the observer {observer!r}")
     name, settings = hyperparameters(task, algorithm)
     named = versioned(observer or observer_of(get_system(task.system))) if information in ("x_hat", "z") else None
     env = make(task, information, settings["n_envs"], observer=named)
@@ -193,10 +195,11 @@ def _fit(
     rate = settings.pop("learning_rate")
     if isinstance(rate, str):
         rate = _linear(float(rate.removeprefix("lin_")))
+    first = agent_training_seed(seed)
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
     model.set_logger(configure(str(folder), ["csv"]))
-    vec_env.seed(AGENT_TRAINING_SEED * (seed + 1))  # only now: the model has just seeded it with ``seed``
+    vec_env.seed(first)  # only now: the model has just seeded it with ``seed``
     try:
         model.learn(timesteps, callback=_Bar(progress, f"{description} {seed}", timesteps))
     finally:

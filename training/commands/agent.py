@@ -19,6 +19,7 @@ from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.commands.compare import Compare
+from training.jobs import locked
 from training.progress import progress_bars
 from training.seeds import agent_evaluation_seed
 
@@ -47,7 +48,7 @@ class Train:
     """Actions to learn from, in all environments together."""
     observer: Annotated[
         str | None,
-        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: that of the published agents, of version 1)"),
+        tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the one of the system's profile, else the newest)"),
     ] = None
     """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
     algorithm: Annotated[
@@ -84,10 +85,12 @@ class Train:
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name
         folder = self.out or Path("runs/agents") / f"{name}-{self.information}-{self.seed}"
-        if (folder / "agent.safetensors").exists():
-            raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
         torch.set_num_threads(self.threads)
-        with progress_bars(console) as progress:
+        with locked(folder), progress_bars(console) as progress:
+            if (folder / "agent.safetensors").exists():
+                raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
             agent = learn(
                 task,
                 self.information,

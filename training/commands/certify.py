@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kkl_gym.system import System
-from observers import Artifact
+from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
 from training.commands.options import Observers, OwnSystem, read_observers
@@ -72,11 +72,14 @@ class Certify:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        names = [Path(given).stem if given.endswith(".safetensors") else given for given in self.observers]
+        if len(set(names)) < len(names):
+            raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
         found = []
-        for given, artifact, system in read_observers(self.observers, self.system):
-            name = Path(given).stem if given.endswith(".safetensors") else given
+        for name, (_, artifact, system) in zip(names, read_observers(self.observers, self.system), strict=True):
             with console.status(f"certifying {name}"):
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
+                KKLObserver(artifact, self.measurement_noise, process_noise=process_noise)  # refuses bad levels now
                 levels = (self.measurement_noise, process_noise)
                 motion = record_settled(
                     artifact,

@@ -13,9 +13,12 @@ from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
+from kkl_gym.simulate import check_duration
 from observers.storage import replacing
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
+
+DT = 0.01  # s, of the environments
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,9 @@ class Demo:
         Path
             The figure.
         """
+        check_duration(self.duration, DT)
+        if self.seed < 0:
+            raise ValueError(f"seed must not be negative, got {self.seed}")
         table = Table(
             "environment",
             "SMAPE in %",
@@ -110,7 +116,7 @@ def play(env_id: str, measurement_noise: float, *, duration: float, seed: int) -
     Episode
         It ends early where the state leaves the system's bounds.
     """
-    steps = round(duration / 0.01)
+    steps = round(duration / DT)
     env = kkl_gym.KKLObservation(gym.make(env_id, measurement_noise=measurement_noise, max_episode_steps=steps))
     _, info = env.reset(seed=seed)
     infos = [info]

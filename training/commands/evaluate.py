@@ -61,6 +61,10 @@ class Evaluate:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        if not self.measurement_noise:
+            raise ValueError("give at least one level of measurement noise; 0 is none")
+        if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
+            raise ValueError(f"csv = {self.csv} is a folder: name a file")
         frames = []
         for name, artifact, system in read_observers(self.observers, self.system):
             with console.status(f"evaluating {name}"):

@@ -47,6 +47,9 @@ class Speed:
         dict of str to float
             Steps per second of each environment, as a multiple of its reference's.
         """
+        for name, count in vars(self).items():
+            if count < 1:
+                raise ValueError(f"{name} must be positive, got {count}")
         ratios = self._single(console)
         return ratios | self._vector(console)
 

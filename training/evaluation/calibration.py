@@ -6,7 +6,7 @@ import math
 import numpy as np
 from scipy.signal import lfilter
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, Limits
 from training.seeds import Stream, generator
@@ -117,6 +117,7 @@ def sound_trajectories(
         If most trajectories leave the bounds.
     """
     dt = artifact.filter.dt
+    check_duration(duration, dt)
     steps = round(duration / dt)
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:

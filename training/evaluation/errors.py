@@ -5,7 +5,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.metrics import smape
@@ -158,8 +158,9 @@ def unseen_trajectories(
     ValueError
         On an unknown domain, or unless n, duration, seed and level make sense.
     """
-    if n < 1 or seed < 0 or not duration >= dt:
-        raise ValueError(f"cannot run {n} trajectories of {duration} s at dt = {dt} from seed {seed}")
+    if n < 1 or seed < 0:
+        raise ValueError(f"cannot simulate {n} trajectories from seed {seed}")
+    check_duration(duration, dt)
     if domain not in get_args(Domain):
         raise ValueError(f"domain must be one of {', '.join(get_args(Domain))}, got {domain!r}")
     if not 0 <= process_noise < np.inf:

@@ -54,13 +54,17 @@ def simulate_faults(
     ValueError
         If the artifact has no limits, or most trajectories leave the system's bounds.
     """
+    allowed = deadline(system, duration)
+    if not allowed <= duration / 2:
+        raise ValueError(
+            f"a fault in the middle of {duration} s leaves less than the {allowed:g} s within which it is to be noticed"
+        )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng)
     clean = system.output(x)
     y = clean + measurement_noise * rng.standard_normal(clean.shape)
     undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
     width = np.ptp(undriven, axis=(0, 1))
-    allowed = deadline(system, duration)
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []

@@ -1,6 +1,7 @@
 """One optimisation loop for every network: Adam or SOAP, cosine decay, checkpoints, resuming, progress."""
 
 import math
+import operator
 import pickle
 import time
 from collections.abc import Callable, Iterator
@@ -197,7 +198,8 @@ def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) ->
         for name, part in parts.items():
             part.load_state_dict(found[name])
         generator.set_state(found["generator"].cpu())
-        return _Course(found["step"], found["seconds"], found["history"])
+        history = [(int(step), float(error)) for step, error in found["history"]]
+        return _Course(operator.index(found["step"]), float(found["seconds"]), history)
     except (KeyError, RuntimeError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
 

@@ -50,7 +50,7 @@ def test_process_noise_in_evaluation_disturbs_the_motion_and_is_told(make_artifa
     [{"n": 0}, {"duration": 0.0}, {"domain": "3X"}, {"seed": -1}, {"process_noise": -1.0}, {"process_noise": np.nan}],
 )
 def test_impossible_evaluations(wrong):
-    with pytest.raises(ValueError, match=r"cannot run|domain|process_noise must"):
+    with pytest.raises(ValueError, match=r"cannot simulate|duration must|domain|process_noise must"):
         unseen_trajectories(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 

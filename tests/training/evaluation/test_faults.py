@@ -64,7 +64,7 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
     calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
     assert set(told) == {0.12}
     told.clear()
-    simulate_faults(calibrated, system, trajectories=2, duration=12.0, measurement_noise=0.5, seed=0)
+    simulate_faults(calibrated, system, trajectories=2, duration=20.0, measurement_noise=0.5, seed=0)
     assert set(told) == {0.12}
     told.clear()
     for module in (training.evaluation.certificates.certificate, training.evaluation.certificates.gains):

@@ -1,0 +1,46 @@
+"""Options that make no sense are refused by name, before any work is done."""
+
+import pytest
+
+from training.cli import main
+from training.jobs import locked
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("evaluate lorenz --duration inf", "duration must be finite"),
+        ("evaluate lorenz --duration 0.001", "at least one sample"),
+        ("evaluate lorenz --csv .", "name a file"),
+        ("evaluate lorenz --measurement-noise", "at least one level"),
+        ("faults lorenz --duration nan", "duration|within which"),
+        ("faults lorenz --duration 0.1", "within which it is to be noticed"),
+        ("certify lorenz lorenz", "names must differ"),
+        ("certify lorenz --measurement-noise inf", "measurement_noise"),
+        ("demo --duration nan", "duration must be finite"),
+        ("demo --seed -1", "seed must not be negative"),
+        ("speed --turns 0", "turns must be positive"),
+        ("agent train lorenz --threads 0", "threads must be at least 1"),
+        ("agent train lorenz --seed 99999", "seed must lie between 0 and 99998"),
+        ("agent train lorenz --information y --observer lorenz", "no use for the observer"),
+    ],
+)
+def test_refused(arguments, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=message):
+        main(arguments.split())
+
+
+def test_two_agents_do_not_share_a_folder(tmp_path):
+    with locked(tmp_path), pytest.raises(SystemExit, match="another process is at work"):
+        main(["agent", "train", "lorenz", "--timesteps", "1", "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [(b'{"quiet": 0.1, "noise_free_share": 0.3}', "two names of one setting"), (b"\xff", "c.json is no JSON")],
+)
+def test_files_of_settings(content, message, tmp_path):
+    (tmp_path / "c.json").write_bytes(content)
+    with pytest.raises(SystemExit, match=message):
+        main(["train", "lorenz", "--config", str(tmp_path / "c.json"), "--out", str(tmp_path / "run")])
