@@ -36,7 +36,7 @@ def progress_bars(console: Console | None) -> Progress:
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
-        console=console,
+        console=console or Console(quiet=True),  # old versions of rich end even disabled bars with a line
         disable=console is None,
         speed_estimate_period=SECONDS_OF_SPEED,
     )
