@@ -306,6 +306,27 @@ class Artifact:
         """Number of inputs that the observer takes into account."""
         return self.filter.nu
 
+    def require_forward(self) -> ForwardMap:
+        """Return T.
+
+        Returns
+        -------
+        ForwardMap
+            What :attr:`forward` holds.
+
+        Raises
+        ------
+        ArtifactError
+            If no T was learned; the message says which maps have one.
+        """
+        if self.forward is None:
+            raise ArtifactError(
+                f"this map for {self.system!r} holds no forward map T; take one of the pipeline spinn, which does: "
+                "for the package's systems those named SYSTEM-spinn ship, others are made by "
+                "kkl-gym train SYSTEM --pipeline spinn"
+            )
+        return self.forward
+
     @property
     def process_noise_max(self) -> float | None:
         """The highest level of process noise that the map was trained for; None if it is not told the level."""

@@ -21,6 +21,10 @@ class KKLObserver:
     All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
     linear filter, followed by :meth:`decode`, the network; :meth:`restart` begins anew in some rows of a batch.
 
+    A filter that is switched on knows nothing of what came before, and its estimates need some time. Where the state
+    x_0 is known and the artifact holds the forward map T, ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead, where a
+    filter would be that has run for ever. T also gives :attr:`mismatch`, which says how far z is from T(x_hat).
+
     Parameters
     ----------
     artifact : Artifact
@@ -57,7 +61,7 @@ class KKLObserver:
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._process_noise = self._level(process_noise)
         self.measurement_noise = measurement_noise
-        self._age: Any = 0  # samples since reset, an array where rows have restarted
+        self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
 
     @property
     def measurement_noise(self) -> float:
@@ -107,27 +111,33 @@ class KKLObserver:
             raise RuntimeError("call reset(y0) before the observer is used")
         return self._z.copy()
 
-    def reset(self, y0: np.ndarray) -> np.ndarray:
+    def reset(self, y0: np.ndarray, x0: np.ndarray | None = None) -> np.ndarray:
         """Forget the past and take in the first sample.
 
         Parameters
         ----------
         y0 : array_like, shape (..., ny)
             The sample; its shape is that of the batch from here on.
+        x0 : array_like, shape (..., nx), optional
+            The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
+            beside a motion without input: there is no transient, and a map that is told the age is told that it is
+            past it. Where it is known in some rows only, :meth:`restart` those.
 
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate.
+            The first estimate, T_inv(z_0). With x0 that is T_inv(T(x0)), as close to x0 as the maps are good.
 
         Raises
         ------
         ValueError
-            If the shape is wrong, or there is anything but finite real numbers; the observer is then as it was.
+            If a shape is wrong, there is anything but finite real numbers, or x0 is given and the artifact holds no T;
+            the observer is then as it was.
         """
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1])
-        self._z, self._y, self._age, self._x_hat = self.artifact.filter.start(y0), y0, 0, None
+        z0, age = self._start(y0, x0)
+        self._z, self._y, self._age, self._x_hat = z0, y0, age, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -149,7 +159,34 @@ class KKLObserver:
             raise RuntimeError("score needs an observer made with monitor=True, and reset(y0)")
         return self._monitor.score
 
-    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+    @property
+    def mismatch(self) -> np.ndarray:
+        """How far the filter's state is from the image of T, shape (...,): 0 where z_y = T(x_hat).
+
+        The root mean square of (T(x_hat) - z_y) / z_scale over the modes, where z_scale is that of
+        :class:`observers.ForwardMap`, each mode's spread over the motions that T was trained on: 0.1 is a tenth of it.
+        (A T that was solved for, with ``random_features``, has another scale: its values compare with each other only.)
+
+        It is near 0 where z_y is the T of some state, and T_inv finds that state. It is large in the transient, under
+        sensor faults and inputs (T is that of motions without), on another plant, and where the maps are bad, such as
+        beyond their training. Noise adds a little. A fault that keeps z on the image of T does not show.
+
+        :attr:`score` judges the estimate by the output alone and over a time; this judges it by all that the filter
+        remembers, at once, and nothing is computed until it is asked for. There are no limits to hold it against: what
+        sound runs show depends on map and noise, and has to be measured.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        ValueError
+            If the artifact holds no T.
+        """
+        z, T = self.z, self.artifact.require_forward()
+        apart = (T(self.decode()) - z[..., : len(T.z_scale)]) / T.z_scale
+        return np.sqrt(np.mean(apart**2, axis=-1, keepdims=True))[..., 0]
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray | None = None) -> None:
         """Forget the past in some rows of the batch and take in their first samples.
 
         Parameters
@@ -158,11 +195,13 @@ class KKLObserver:
             First samples.
         rows : array_like of bool, shape (...,)
             The rows of the batch.
+        x0 : array_like, shape (number of True in rows, nx), optional
+            Their states, where they are known, as for :meth:`reset`.
 
         Raises
         ------
         ValueError
-            If a shape is wrong, or there is anything but finite real numbers.
+            As :meth:`reset`.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -170,10 +209,10 @@ class KKLObserver:
         z = self._rows(rows)
         y0 = real_array("y", y0)
         self._check_output(y0, (int(rows.sum()),))
-        z[rows] = self.artifact.filter.start(y0)
+        z[rows], age = self._start(y0, x0)
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
-        self._age = np.where(rows, 0, self._age)
+        self._age = np.where(rows, age, self._age)
         self._x_hat = None
         if self._monitor is not None:
             self._monitor.restart(rows)
@@ -295,7 +334,7 @@ class KKLObserver:
         z_next = linear.advance(z, self._y, u, y)
         return self._invert(z_next, (self._age + 1) * linear.dt) @ C.T
 
-    def estimate(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+    def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
 
         The observer's own state is left as it was.
@@ -306,6 +345,8 @@ class KKLObserver:
             Outputs; the first row is y_0.
         u : array_like, shape (steps - 1, ..., nu), optional
             The input held after each row but the last, by default zero. A last row more is ignored.
+        x0 : array_like, shape (..., nx), optional
+            The state at y_0, where it is known, as for :meth:`reset`.
 
         Returns
         -------
@@ -315,7 +356,7 @@ class KKLObserver:
         Raises
         ------
         ValueError
-            As :meth:`step`.
+            As :meth:`reset` and :meth:`step`.
         """
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
@@ -329,7 +370,7 @@ class KKLObserver:
         linear = self.artifact.filter
         out = np.empty((*y.shape[:-1], self.artifact.nx))
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
-        z = linear.start(y[0])
+        z, age0 = self._start(y[0], x0)
         for first in range(0, steps, rows):
             count = min(rows, steps - first)
             record = np.empty((count, *z.shape))
@@ -337,7 +378,7 @@ class KKLObserver:
                 if k > 0:
                     z = linear.advance(z, y[k - 1], self._input(None if u is None else u[k - 1], batch), y[k])
                 record[i] = z
-            age = np.arange(first, first + count) * linear.dt
+            age = (age0 + np.arange(first, first + count)) * linear.dt
             out[first : first + count] = self._invert(record, age.reshape(count, *(1 for _ in batch)))
         return out
 
@@ -357,6 +398,19 @@ class KKLObserver:
         x_hat[driven] = self._driven(z[driven], age[driven])
         x_hat[~driven] = self._free(z[~driven][:, :nz], age[~driven])
         return x_hat
+
+    def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
+        """The filter's first state, (..., size), and how many samples old it is."""
+        if x0 is None:
+            return self.artifact.filter.start(y0), 0
+        T, x0, shape = self.artifact.require_forward(), real_array("x0", x0), (*y0.shape[:-1], self.artifact.nx)
+        if x0.shape != shape:
+            raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
+        if not _finite(x0):
+            raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
+        z0 = np.zeros((*shape[:-1], self.artifact.filter.size))
+        z0[..., : T.mlp.outputs] = T(x0)
+        return z0, math.inf  # which every map takes for its age_max
 
     def _check_output(self, y: np.ndarray, batch: tuple[int, ...]) -> None:
         if y.shape != (*batch, self.artifact.ny):

@@ -23,17 +23,19 @@ class Estimator(Protocol):
 
     space: gym.spaces.Box
 
-    def reset(self, y0: np.ndarray) -> object:
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
         """Forget the past and take in the first samples.
 
         Parameters
         ----------
         y0 : ndarray, shape (n, ny)
             First samples.
+        x0 : ndarray, shape (n, nx)
+            True states at these samples, for observers that are meant to know their starts.
         """
         ...
 
-    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows and take in their first samples.
 
         Parameters
@@ -42,6 +44,8 @@ class Estimator(Protocol):
             First samples.
         rows : ndarray of bool, shape (n,)
             Which rows begin anew.
+        x0 : ndarray, shape (number of True in rows, nx)
+            True states at these samples, as for :meth:`reset`.
         """
         ...
 
@@ -107,6 +111,8 @@ class KKLEstimator:
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
         Whether to keep the score.
+    known_start : bool
+        Whether the observer is told the true state at the start of an episode, and only there.
 
     Attributes
     ----------
@@ -122,7 +128,8 @@ class KKLEstimator:
     ValueError
         If ``estimate`` is unknown, no map ships for the system, or the noise level is beyond the map's range.
     observers.ArtifactError
-        If the file is missing or damaged, or was made for another system, other parameters or another dt.
+        If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
+        forward map and ``known_start`` is asked for.
     """
 
     def __init__(
@@ -134,6 +141,7 @@ class KKLEstimator:
         measurement_noise: float | None,
         ignore_input: bool,
         monitor: bool,
+        known_start: bool,
     ) -> None:
         if estimate not in ("x", "z"):
             raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
@@ -148,6 +156,9 @@ class KKLEstimator:
         )
         self._monitor = monitor
         self.observer.artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
+        if known_start:
+            self.observer.artifact.require_forward()  # an error now, not at the first reset
+        self._known_start = known_start
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self._ignore_input = ignore_input
@@ -180,17 +191,19 @@ class KKLEstimator:
             )
         return None
 
-    def reset(self, y0: np.ndarray) -> None:
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples.
 
         Parameters
         ----------
         y0 : ndarray, shape (..., ny)
             First samples, whose leading shape is the batch's.
+        x0 : ndarray, shape (..., nx)
+            True states, which are not looked at unless starts are known.
         """
-        self.observer.reset(y0)
+        self.observer.reset(y0, x0 if self._known_start else None)
 
-    def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows and take in their first samples.
 
         Parameters
@@ -199,8 +212,10 @@ class KKLEstimator:
             First samples.
         rows : ndarray of bool, shape (n,)
             Which rows begin anew.
+        x0 : ndarray, shape (number of True in rows, nx)
+            True states, as for :meth:`reset`.
         """
-        self.observer.restart(y0, rows)
+        self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
         """Take in samples and the inputs that led to them.
@@ -280,7 +295,8 @@ def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:
     """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
 
     Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
-    constant output would have led, so that its start lies within as well.
+    constant output would have led, so that its start lies within as well. A known start may lie outside for a while,
+    where the motion that led to it did; what is shown is then clipped.
     """
     linear = observer.artifact.filter
     y_max = np.maximum(np.abs(plant.output_space.low), np.abs(plant.output_space.high)).astype(float)

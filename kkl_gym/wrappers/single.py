@@ -41,6 +41,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Whether to use a map that knows no inputs (the paper's) although the agent acts.
     monitor : bool
         Whether to keep the score, see :attr:`observers.KKLObserver.score`.
+    known_start : bool
+        Whether the observer is told the true state ``info["x"]`` at reset, and only there. It then has no transient.
+        Only maps with a forward map T can use it: ``observer="SYSTEM-spinn"``.
 
     Attributes
     ----------
@@ -56,8 +59,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and ``ignore_input`` is
         false, or a wrapper inside hides samples from the observer.
     observers.ArtifactError
-        If the file is missing or damaged, or was made for another system, other parameters or another dt. It is a
-        ValueError.
+        If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
+        forward map and ``known_start`` is asked for. It is a ValueError.
 
     Examples
     --------
@@ -82,6 +85,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         measurement_noise: float | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
+        known_start: bool = False,
     ) -> None:
         observer = None if observer is None else os.fspath(observer)
         if isinstance(measurement_noise, np.floating):  # which the specification could not write down
@@ -93,6 +97,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             measurement_noise=measurement_noise,
             ignore_input=ignore_input,
             monitor=monitor,
+            known_start=known_start,
         )
         gym.Wrapper.__init__(self, env)
         base = env.unwrapped
@@ -105,6 +110,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             measurement_noise=measurement_noise,
             ignore_input=ignore_input,
             monitor=monitor,
+            known_start=known_start,
         )
         self.observer = self._estimator.observer
         self.estimate = estimate
@@ -133,7 +139,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         _, info = self.env.reset(seed=seed, options=options)
         self._sample = int(info["sample"])
         self._trail.clear()
-        self._estimator.reset(info["y"])
+        self._estimator.reset(info["y"], info["x"])
         return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

@@ -80,9 +80,9 @@ class VectorEstimate(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if mask.all():
-            self._estimator.reset(info["y"])
+            self._estimator.reset(info["y"], info["x"])
         else:
-            self._estimator.restart(info["y"][mask], mask)
+            self._estimator.restart(info["y"][mask], mask, info["x"][mask])
         self._ended = self._ended & ~mask
         self._sample = np.where(mask, info["sample"], self._sample)
         obs = self._show(info, mask)
@@ -131,7 +131,7 @@ class VectorEstimate(VectorWrapper):
         else:
             self._estimator.advance(y, u)
             if over:
-                self._estimator.restart(y[before], before)
+                self._estimator.restart(y[before], before, info["x"][before])
         self._sample = expected
         obs = self._show(info, np.ones_like(ended))
         self._trace(info)
@@ -147,7 +147,7 @@ class VectorEstimate(VectorWrapper):
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
-        self._estimator.restart(info["y"][ended], ended)
+        self._estimator.restart(info["y"][ended], ended, info["x"][ended])
         self._sample = np.where(ended, 0, expected)
         first = self._estimator.report(ended)
         for key, values in first.items():
@@ -215,6 +215,8 @@ class KKLVectorObservation(VectorEstimate):
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
         Whether to keep the score.
+    known_start : bool
+        As for :class:`kkl_gym.KKLObservation`, at the start of each row's episodes.
 
     Attributes
     ----------
@@ -252,6 +254,7 @@ class KKLVectorObservation(VectorEstimate):
         measurement_noise: float | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
+        known_start: bool = False,
     ) -> None:
         estimator = KKLEstimator(
             plant_of(env),
@@ -260,6 +263,7 @@ class KKLVectorObservation(VectorEstimate):
             measurement_noise=measurement_noise,
             ignore_input=ignore_input,
             monitor=monitor,
+            known_start=known_start,
         )
         if estimator.observer.artifact.process_noise_max is not None:
             plant_of(env, "process_noise")

@@ -46,10 +46,10 @@ def vector(name, mode, steps=23, n=N, **options):
     )
 
 
-def single(name, steps=23, observer=None, repeat=None, estimate="x", **options):
+def single(name, steps=23, observer=None, repeat=None, estimate="x", known_start=False, **options):
     env = gym.make("kkl_gym:" + ENV_IDS[name], max_episode_steps=steps, **options)
     if observer is not None:
-        env = KKLObservation(env, observer, estimate=estimate)
+        env = KKLObservation(env, observer, estimate=estimate, known_start=known_start)
     return env if repeat is None else ActionRepeat(env, repeat)
 
 
@@ -188,6 +188,19 @@ def test_the_observer_is_reset_row_by_row(name, mode, estimate, saved):
     assert ours.single_observation_space == theirs.single_observation_space
     assert ours.observation_space == theirs.observation_space
     assert len(compare(ours, theirs, 60, mode)) >= 2 * N
+
+
+@modes
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@pytest.mark.parametrize("make", [vector, sync])
+def test_known_starts_are_told_row_by_row(make, estimate, mode, saved):
+    path = saved(system="lorenz", forward=True)
+    ours = KKLVectorObservation(make("lorenz", mode), path, estimate=estimate, known_start=True)
+    theirs = sync("lorenz", mode, observer=path, estimate=estimate, known_start=True)
+    T = ours.observer.artifact.forward
+    _, info = ours.reset(seed=0)
+    assert np.allclose(info["z"][:, : T.mlp.outputs], T(info["x"]), rtol=1e-6)
+    assert len(compare(ours, theirs, 60, mode, (5,))) >= 2 * N
 
 
 @modes

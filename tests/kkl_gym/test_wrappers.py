@@ -23,7 +23,8 @@ def actions(steps, nu=1, seed=0):
 
 
 def wrapped(saved, name, estimate="x", env=None, **options):
-    kept = {key: options.pop(key) for key in ("ignore_input", "measurement_noise") if key in options}
+    wrappers = ("ignore_input", "measurement_noise", "known_start")
+    kept = {key: options.pop(key) for key in wrappers if key in options}
     env = gym.make(ENV_IDS[name], **(env or {}))
     return KKLObservation(env, saved(system=name, **options), estimate=estimate, **kept)
 
@@ -36,6 +37,13 @@ def test_checkers_are_content(name, observe, estimate, saved):
     env = wrapped(saved, name, estimate, {"observe": observe})
     check_env(env, skip_render_check=True)
     assert env.observation_space.shape == ((env.unwrapped.system.nx,) if estimate == "x" else env.observer.z.shape)
+
+
+@everyone
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@checking_wrapped
+def test_checkers_are_content_where_starts_are_known(name, estimate, saved):
+    check_env(wrapped(saved, name, estimate, forward=True, known_start=True), skip_render_check=True)
 
 
 @everyone
@@ -77,6 +85,31 @@ def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_a
     assert np.array_equal(shown, np.clip(x_hat, space.low, space.high).astype(np.float32))
     if inputs:
         assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), x_hat, rtol=1e-3)  # a shift by one would show
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_a_known_start_is_told_at_every_reset_and_no_other_state(estimate, saved):
+    env = wrapped(saved, "lorenz", estimate, forward=True, known_start=True)
+    bare = KKLObserver(env.observer.artifact)
+    for options in (None, {"x0": [1.0, -2.0, 20.0]}):
+        obs, info = env.reset(seed=1, options=options)
+        bare.reset(info["y"], info["x"])
+        assert np.array_equal(info["z"], bare.z)
+        for action in actions(5):
+            shown = info["z"] if estimate == "z" else bare.decode()
+            space = env.observation_space
+            assert np.array_equal(obs, np.clip(shown, space.low, space.high).astype(np.float32))
+            obs, *_, info = env.step(action)
+            bare.advance(info["y"], info["u"])
+            assert np.array_equal(info["z"], bare.z)
+
+
+def test_known_starts_need_a_map_with_T(saved):
+    with pytest.raises(ArtifactError, match=r"'lorenz' holds no forward map T; .* SYSTEM-spinn"):
+        KKLObservation(KKLEnv("lorenz"), known_start=True)
+    with pytest.raises(ArtifactError, match="holds no forward map T"):
+        KKLVectorObservation(KKLVectorEnv("lorenz", 2), known_start=True)
+    assert KKLObservation(KKLEnv("lorenz"), "lorenz-spinn", known_start=True).observer.artifact.forward is not None
 
 
 def test_the_environment_is_left_as_it_was(saved):
@@ -136,13 +169,15 @@ def test_specs_of_before_the_wrappers_had_rooms_of_their_own(saved):
     assert isinstance(gym.make(EnvSpec.from_json(text)), KKLObservation)
 
 
+@pytest.mark.parametrize("known_start", [False, True])
 @pytest.mark.parametrize("estimate", ["x", "z"])
-def test_spec_round_trip(estimate, saved):
+def test_spec_round_trip(estimate, known_start, saved):
     env = KKLObservation(
         gym.make("KKLLorenz-v0", measurement_noise=0.2, max_episode_steps=40),
-        saved(system="lorenz"),
+        saved(system="lorenz", forward=True),
         estimate=estimate,
         measurement_noise=0.4,
+        known_start=known_start,
     )
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())

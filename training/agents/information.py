@@ -157,7 +157,15 @@ class KalmanFilters:
         R = max(plant.measurement_noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
         self._filters = ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R)
         self.space = plant.state_space
-        self.reset, self.restart, self.advance = self._filters.reset, self._filters.restart, self._filters.advance
+        self.advance = self._filters.advance
+
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
+        """Begin with the first samples, (n, ny); these filters are not told the states x0, (n, nx)."""
+        self._filters.reset(y0)
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
+        """Begin anew in some rows, with their first samples and without their states."""
+        self._filters.restart(y0, rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """Report the estimates, (n, nx), of all rows or of those that a mask names."""

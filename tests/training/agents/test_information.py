@@ -140,7 +140,8 @@ def test_kalman_filters_follow_a_driven_state():
     ours = KalmanFilters(env.unwrapped)
     theirs = EKF().observer({"diffusion": np.array([1e-2])}, system, 0.01, 0.1)
     y = np.random.default_rng(0).normal(size=(20, N, 1))
-    ours.reset(y[0])
+    x0 = np.full((N, 2), np.nan)  # which they are not to look at
+    ours.reset(y[0], x0)
     theirs.reset(y[0])
     for yk in y[1:]:
         ours.advance(yk, np.zeros((N, 1)))
@@ -150,7 +151,7 @@ def test_kalman_filters_follow_a_driven_state():
     ours.advance(y[0], None, ~rows)
     assert np.array_equal(ours.report(rows)["x_hat"], kept[rows])
     assert (ours.report(~rows)["x_hat"] != kept[~rows]).any(1).all()
-    ours.restart(y[0, :1], rows)
+    ours.restart(y[0, :1], rows, x0[:1])
     theirs.reset(y[0])
     assert np.allclose(ours.report(rows)["x_hat"], theirs.decode(rows))
 

@@ -4,22 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from linear_system import Oscillator, sylvester
+from linear_system import Oscillator, exact_observer
 
-from observers import MLP, Artifact, ArtifactError, InverseMap, KKLObserver, LinearFilter
+from observers import ArtifactError, KKLObserver
 from training.evaluation.calibration import WARM_UP, calibrate, sound_trajectories
-
-ONES, ZEROS = np.ones, np.zeros
-
-
-def oscillator_observer():
-    linear = LinearFilter(np.diag([-1.0, -2.5, -4.0]), ONES((3, 1)), 0.05)
-    M_inv = np.linalg.pinv(sylvester(linear.A, linear.B))
-    inverse = InverseMap(
-        MLP([M_inv.astype(np.float32)], [ZEROS(2, np.float32)], "tanh"), ("z_y",), ZEROS(3), np.eye(3), ZEROS(3),
-        ZEROS(2), ONES(2),
-    )  # fmt: skip
-    return Artifact(linear, inverse, "oscillator", {}, C=np.array([[1.0, 0.0]]))
 
 
 class Noiseless(Oscillator):
@@ -31,7 +19,7 @@ class Noiseless(Oscillator):
 
 def test_calibration_keeps_its_promise():
     system = Noiseless()
-    calibrated = calibrate(oscillator_observer(), system, trajectories=600, duration=20.0)
+    calibrated = calibrate(exact_observer(), system, trajectories=600, duration=20.0)
     found = calibrated.limits
     assert (np.diff(found.mean[1:, 0]) > 0).all()  # more noise, wider limits
     assert found.low[0] == 0.0
@@ -52,7 +40,7 @@ def test_calibration_keeps_its_promise():
 @pytest.mark.parametrize("fault", ["bias", "drop-out", "freeze"])
 def test_faults_are_seen(fault):
     system = Noiseless()
-    calibrated = calibrate(oscillator_observer(), system, duration=20.0)
+    calibrated = calibrate(exact_observer(), system, duration=20.0)
     rng = np.random.default_rng(12)
     x, _ = sound_trajectories(calibrated, system, n=50, duration=30.0, rng=rng)
     x = x[:, np.abs(x[0]).max(-1) > 0.5]
@@ -72,10 +60,10 @@ def test_faults_are_seen(fault):
 
 
 def test_limits_reach_as_far_as_the_map_is_told():
-    told = dataclasses.replace(oscillator_observer().inverse, measurement_noise_max=3.0)
-    artifact = dataclasses.replace(oscillator_observer(), inverse=told)
+    told = dataclasses.replace(exact_observer().inverse, measurement_noise_max=3.0)
+    artifact = dataclasses.replace(exact_observer(), inverse=told)
     assert calibrate(artifact, Noiseless(), duration=6.0).limits.levels[-1] == 3.0
-    assert calibrate(oscillator_observer(), Noiseless(), duration=6.0).limits.levels[-1] == 1.0
+    assert calibrate(exact_observer(), Noiseless(), duration=6.0).limits.levels[-1] == 1.0
 
 
 def test_runs_that_leave_are_drawn_anew():
@@ -88,23 +76,23 @@ def test_runs_that_leave_are_drawn_anew():
         bounds = ((-1.0, 1.0), (-1.0, 1.0))
 
     rng = np.random.default_rng(0)
-    x, u = sound_trajectories(oscillator_observer(), Tight(), n=50, duration=10.0, rng=rng)
+    x, u = sound_trajectories(exact_observer(), Tight(), n=50, duration=10.0, rng=rng)
     assert x.shape[1] == u.shape[1] == 50
     assert np.isfinite(x).all()
 
     Leaving.process_noise = 30.0
     with pytest.raises(ValueError, match="leave bounds"):
-        sound_trajectories(oscillator_observer(), Leaving(), n=50, duration=10.0, rng=rng)
+        sound_trajectories(exact_observer(), Leaving(), n=50, duration=10.0, rng=rng)
 
 
 def test_impossible_calibrations():
     for wrong in ({"false_alarms": 0.0}, {"duration": 1.0}, {"trajectories": 599}, {"seed": -1}):
         with pytest.raises(ValueError, match=r"need|too few"):
-            calibrate(oscillator_observer(), Oscillator(), **wrong)
+            calibrate(exact_observer(), Oscillator(), **wrong)
     with pytest.raises(ValueError, match="not linear"):
-        calibrate(dataclasses.replace(oscillator_observer(), C=None), Oscillator())
+        calibrate(dataclasses.replace(exact_observer(), C=None), Oscillator())
     with pytest.raises(ArtifactError, match="system"):
-        calibrate(oscillator_observer(), Steep())
+        calibrate(exact_observer(), Steep())
 
 
 class Steep(Oscillator):

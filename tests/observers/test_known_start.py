@@ -1,0 +1,213 @@
+"""Starts at z_0 = T(x_0), and how far z is from T(x_hat)."""
+
+import math
+
+import numpy as np
+import pytest
+from linear_system import C, F, exact_observer, sylvester
+from scipy.linalg import expm
+
+import observers
+from kkl_gym import get_system
+from kkl_gym.simulate import simulate
+from observers import KKLObserver
+
+KINDS = [{"inputs": inputs, "age": age} for inputs in (0, 1) for age in (0, 1)] + [{"pair": True}]
+CLOSE = {"rtol": 1e-5, "atol": 1e-5}  # the networks work in float32
+
+
+def oscillations(steps, dt, n=6, seed=0):
+    """States (steps, n, 2) of the oscillator, in closed form, and its outputs."""
+    flow, x = expm(F * dt), [np.random.default_rng(seed).uniform(-1, 1, (n, 2))]
+    for _ in range(steps - 1):
+        x.append(x[-1] @ flow.T)
+    return np.array(x), np.array(x) @ C.T
+
+
+def observer_with_T(make_artifact, system="van_der_pol", **options):
+    return KKLObserver(make_artifact(system, forward=True, **options), 0.3)
+
+
+def test_a_known_start_has_no_transient_on_a_linear_system():
+    observer = KKLObserver(exact_observer(dt=0.01))
+    x, y = oscillations(300, 0.01)
+    known = [observer.reset(y[0], x[0])] + [observer.step(yk) for yk in y[1:]]
+    assert np.abs(known - x).max() < 5e-4  # of the first-order hold and of float32
+    assert np.array_equal(observer.estimate(y, x0=x[0]), known)
+    unknown = np.abs(observer.estimate(y) - x).max((1, 2))
+    assert unknown[0] > 0.3
+    assert unknown[100] > 0.05
+
+
+def test_what_is_left_of_a_known_start_is_of_second_order_in_dt():
+    def error(dt):
+        artifact = exact_observer(dt)
+        M, observer = sylvester(artifact.filter.A, artifact.filter.B), KKLObserver(artifact)
+        x, y = oscillations(round(4.0 / dt) + 1, dt)
+        observer.reset(y[0], x[0])
+        worst = 0.0
+        for xk, yk in zip(x[1:], y[1:], strict=True):
+            observer.advance(yk)
+            worst = max(worst, np.abs(observer.z - xk @ M.T).max())
+        return worst
+
+    assert math.log2(error(0.2) / error(0.1)) == pytest.approx(2.0, abs=0.1)
+
+
+def test_mismatch_is_what_of_the_transient_lies_beside_the_image_of_T():
+    dt, steps = 0.01, 150
+    artifact = exact_observer(dt)
+    A, M, observer = artifact.filter.A, sylvester(artifact.filter.A, artifact.filter.B), KKLObserver(artifact)
+    x, y = oscillations(steps, dt)
+    away = artifact.filter.start(y[0]) - x[0] @ M.T
+    beside = M @ np.linalg.pinv(M) - np.eye(3)
+    observer.reset(y[0])
+    for k in range(steps):
+        if k > 0:
+            observer.advance(y[k])
+        expected = np.linalg.norm(away @ expm(A * k * dt).T @ beside.T / artifact.forward.z_scale, axis=-1) / 3**0.5
+        assert observer.mismatch == pytest.approx(expected, abs=1e-5)
+        if k == 0:
+            assert (expected > 5e-3).all()
+    observer.reset(y[0], x[0])
+    assert (observer.mismatch < 1e-6).all()
+    observer.advance(y[0] + 5.0)  # a sensor that jumps
+    assert (observer.mismatch > 1e-3).all()
+
+
+@pytest.mark.parametrize("options", KINDS, ids=str)
+def test_z_is_T_of_the_start_and_the_map_is_told_that_no_transient_is_left(options, make_artifact):
+    observer = observer_with_T(make_artifact, **options)
+    artifact = observer.artifact
+    inverse, T = artifact.inverse, artifact.forward
+    x0 = np.array([0.7, -1.1])
+    x_hat = observer.reset([0.4], x0)
+    z0 = np.concatenate([T(x0), np.zeros(artifact.filter.size - T.mlp.outputs)])
+    assert np.array_equal(observer.z, z0)
+    modes = inverse.gain(0.3) * (inverse.whiten @ (z0 - inverse.z_offset))
+    told = [*inverse.noise_features(0.3, 0.0), *([inverse.age_feature(2.0)] if options.get("age", True) else [])]
+    expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told]))
+    assert np.allclose(x_hat, expected, **CLOSE)
+    observer.step([0.5])
+    z1 = artifact.filter.advance(z0, np.array([0.4]), np.zeros(artifact.nu), np.array([0.5]))
+    assert np.array_equal(observer.z, z1)
+
+
+def test_the_map_of_free_motion_is_in_use_until_an_input_acts(make_artifact):
+    observer = observer_with_T(make_artifact, free_inverse=True)
+    free, x0 = observer.artifact.free_inverse, np.array([0.7, -1.1])
+    modes = free.gain(0.3) * (free.whiten @ (observer.artifact.forward(x0) - free.z_offset))
+    expected = free.x_offset + free.x_scale * free.mlp(np.array([*modes, *free.noise_features(0.3, 0.0)]))
+    assert np.allclose(observer.reset([0.4], x0), expected, **CLOSE)
+    assert not np.allclose(observer.step([0.4], [1.0]), expected, atol=0.01)
+
+
+def test_rows_restart_with_known_and_unknown_starts(make_artifact):
+    """Row by row as observers of their own, whatever age the others have."""
+    rng = np.random.default_rng(0)
+    y, x0 = rng.normal(size=(6, 4, 1)), rng.normal(size=(4, 2))
+    together = observer_with_T(make_artifact)
+    alone = [observer_with_T(make_artifact) for _ in range(4)]
+    together.reset(y[0], x0)
+    for row in range(4):
+        alone[row].reset(y[0, row], x0[row])
+    for k in range(1, 6):
+        together.advance(y[k])
+        for row in range(4):
+            alone[row].advance(y[k, row])
+        if k == 2:
+            together.restart(y[k, 1:3], np.array([False, True, True, False]))
+            for row in (1, 2):
+                alone[row].reset(y[k, row])
+        if k == 4:
+            together.restart(y[k, 2:], np.array([False, False, True, True]), x0[:2])
+            for row in (2, 3):
+                alone[row].reset(y[k, row], x0[row - 2])
+        assert np.allclose(together.z, [one.z for one in alone], rtol=1e-6)
+        assert np.allclose(together.decode(), [one.decode() for one in alone], **CLOSE)
+        assert np.allclose(together.mismatch, [one.mismatch for one in alone], **CLOSE)
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (2, 3)])
+def test_shapes_are_the_batches(batch, make_artifact):
+    observer = observer_with_T(make_artifact, "lorenz")
+    y, x0 = np.ones((5, *batch, 1)), np.ones((*batch, 3))
+    steps = [observer.reset(y[0], x0)] + [observer.step(yk) for yk in y[1:]]
+    assert observer.mismatch.shape == batch
+    assert isinstance(observer.mismatch, np.ndarray)
+    assert np.allclose(observer.estimate(y, x0=x0), steps, **CLOSE)
+
+
+@pytest.mark.parametrize(
+    ("x0", "match"),
+    [
+        ([0.1], r"x0 must have shape \(.*2,?\), got \(.*1,?\)"),
+        ([[0.1, 0.2]], r"x0 must have shape \(.*2,?\), got \(.*1, 2\)"),
+        ([0.1, math.nan], "x0 holds NaN, infinity"),
+        ([0.1, -math.inf], "leave x0 out"),
+        (["a", "b"], "x0 must hold real numbers"),
+        (np.ma.masked_array([0.1, 0.2], [False, True]), "x0 holds masked entries"),
+    ],
+)
+def test_a_refused_start_changes_nothing(x0, match, make_artifact):
+    observer = observer_with_T(make_artifact)
+    observer.reset([0.5])
+    z = observer.z
+    for call in (
+        lambda: observer.reset([0.6], x0),
+        lambda: observer.restart([[0.6]], np.array(True), np.ma.stack([x0]) if np.ma.isMA(x0) else [x0]),
+        lambda: observer.estimate([[0.6]], x0=x0),
+    ):
+        with pytest.raises(ValueError, match=match):
+            call()
+    assert np.array_equal(observer.z, z)
+    assert np.array_equal(observer.decode(), KKLObserver(observer.artifact, 0.3).reset([0.5]))
+
+
+def test_artifacts_without_T_say_where_to_get_one(make_artifact):
+    observer = KKLObserver(make_artifact())
+    with pytest.raises(ValueError, match=r"'van_der_pol' holds no forward map T; .* SYSTEM-spinn"):
+        observer.reset([0.5], [0.1, 0.2])
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer.z  # it was not reset
+    observer.reset([0.5])
+    with pytest.raises(ValueError, match="no forward map"):
+        observer.restart([[0.5]], np.array(True), [[0.1, 0.2]])
+    with pytest.raises(ValueError, match="no forward map"):
+        _ = observer.mismatch
+
+
+def test_mismatch_needs_a_reset(make_artifact):
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer_with_T(make_artifact).mismatch
+
+
+def test_the_network_runs_for_mismatch_only_when_it_is_asked_for(make_artifact, monkeypatch):
+    observer, asked = observer_with_T(make_artifact), []
+    decode = KKLObserver.decode
+    monkeypatch.setattr(KKLObserver, "decode", lambda self, rows=None: asked.append(rows) or decode(self, rows))
+    observer.reset([0.5])
+    asked.clear()
+    observer.advance([0.5])
+    assert not asked
+    _ = observer.mismatch
+    assert len(asked) == 1
+
+
+def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
+    system, observer = get_system("reverse_duffing"), observers.load("reverse_duffing-spinn", 0.0)
+    x0 = np.random.default_rng(1).uniform(*system.box(), (50, 2))
+    x = simulate(system, x0, steps=100, dt=0.01)
+    y = system.output(x)
+
+    def errors(x_hat):
+        return np.median(np.linalg.norm(x_hat - x, axis=-1), axis=1)
+
+    known, unknown = errors(observer.estimate(y, x0=x0)), errors(observer.estimate(y))
+    assert known.max() < 0.1
+    assert (unknown[:50] > 4 * known[:50]).all()
+    scores = []
+    for start in (x0, None):
+        observer.reset(y[0], start)
+        scores.append(np.median(observer.mismatch))
+    assert scores[1] > 5 * scores[0]
