@@ -51,10 +51,11 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	mkdir -p docs/results/benchmark
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-ABLATION := ablation-spinn ablation-solved ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
+SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz random)
+ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
 	default ablation-tuned
 
-ablation: $(VENV)/ready  ## what each idea earns, half an hour on two cores; resumable
+ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
 	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
 	mkdir -p docs/results/ablation
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation

@@ -13,6 +13,8 @@ from pydantic.dataclasses import dataclass
 Pipeline = Literal["input-aware", "spinn"]
 Optimiser = Literal["adam", "soap"]
 Activation = Literal["tanh", "silu"]
+Collocation = Literal["motions", "box"]
+Scaling = Literal["relative", "range"]
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -52,7 +54,7 @@ class Config:
     pipeline: Pipeline
     """How the observer is learned. input-aware: T_inv(z_y, z_u) fitted along driven, noisy trajectories, transients
     included, and T_inv(z_y) along free ones. spinn: the paper's way, a physics-informed T and then T_inv on
-    z' = T(x')."""
+    z' = T(x'), without inputs."""
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
     """Real eigenvalues of A, in 1/s; B is all ones for each output."""
     pairs: tuple[tuple[Annotated[float, Field(lt=0)], Positive], ...] = ()
@@ -65,7 +67,7 @@ class Config:
     duration: Positive = 50.0
     """Length of each trajectory in seconds."""
     samples: Annotated[int, Field(ge=2)] = 200
-    """Points recorded along each trajectory; for spinn they begin where the filter has forgotten its start."""
+    """Points recorded along each trajectory."""
     width: Count = 128
     """Neurons in each hidden layer."""
     depth: Count = 3
@@ -85,9 +87,24 @@ class Config:
     random_features: Annotated[int, Field(ge=0)] = 0
     """Solve for the forward map by least squares with so many random features, 1500 say, instead of training it
     (spinn); 0 trains it."""
+    collocation: Collocation = "motions"
+    """Where the forward map's equation is asked to hold, and where x' lies (spinn). motions: along the trajectories,
+    from their starts on. box: uniform in X, as in the paper's sec. 8.1."""
     box_factor: Annotated[float, Field(ge=1)] = 1.0
-    """Where a solved forward map holds and is inverted: along motions that start in this multiple of the training box
-    X (spinn with random_features)."""
+    """Most trajectories start in this multiple of the training box X, the others in X (spinn)."""
+    adaptive: bool = False
+    """Whether points at which the equation is violated most are drawn more often (spinn)."""
+    solved_output_layer: bool = True
+    """Whether the output layer of a trained forward map is solved for by least squares in the end (spinn)."""
+    transients: bool = True
+    """Whether T_inv is fitted at every age since reset, where the filter holds T(x(t)) + e^{At} (z_0 - T(x_0)), and at
+    every level of measurement noise (spinn). Otherwise it is fitted to T(x) alone, and told neither."""
+    scaling: Scaling = "relative"
+    """How states are scaled. relative: in units of their standard deviation, and errors of T_inv count relative to the
+    state's size. range: in units of half their range, and all errors count alike. Input-aware maps are relative."""
+    lipschitz_penalty: NotNegative = 0.0
+    """How much a smaller Lipschitz constant of T_inv is worth: this part of the mean square error for each factor of
+    e."""
     physics_weight: NotNegative = 0.1
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
@@ -126,8 +143,6 @@ class Config:
         for modes in (self.eigenvalues, self.pairs):
             if len(set(modes)) < len(modes):
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
-        if self.pairs and self.random_features:
-            raise ValueError(f"solving for T (random_features) needs a diagonal A, without pairs = {self.pairs}")
         closed_loop = self.closed_loop_trajectories
         if closed_loop and (closed_loop < 10 or self.pipeline != "input-aware" or not self.inputs):
             raise ValueError(
@@ -143,8 +158,12 @@ class Config:
             raise ValueError(
                 f"random_features = {self.random_features} solve for T: forward_steps must be 0 beside them"
             )
-        if self.box_factor > 1 and not self.random_features:
-            raise ValueError(f"box_factor = {self.box_factor} needs random_features")
+        if self.pipeline != "spinn":
+            own = ("collocation", "box_factor", "adaptive", "solved_output_layer", "transients", "scaling")
+            defaults = {entry.name: entry.default for entry in dataclasses.fields(self)}
+            changed = [f"{name} = {getattr(self, name)!r}" for name in own if getattr(self, name) != defaults[name]]
+            if changed:
+                raise ValueError(f"{', '.join(changed)}: settings of the pipeline 'spinn', not {self.pipeline!r}")
         return self
 
 

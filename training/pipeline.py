@@ -21,13 +21,13 @@ from kkl_gym.system import System
 from observers import Artifact, ForwardMap, InverseMap, LinearFilter
 from training.config import Config
 from training.jobs import claimed_run, describe
-from training.maps.collocation import collocation
-from training.maps.forward import ForwardProblem, truncation_step
+from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import InverseProblem
 from training.maps.least_squares import solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
+from training.maps.scaling import StateScale
 from training.progress import progress_bars
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum
@@ -38,12 +38,10 @@ from training.trajectories.derivatives import output_matrix
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
 
-# Of each stage in the CPU time; those of input-aware maps have equal shares. A step of the forward map costs three of
-# the inverse map's.
-SPINN_SHARES = {"forward": 0.75, "inverse": 0.25}
+# Of each stage in the CPU time; those of input-aware maps have equal shares.
+SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-INVERTED = 200_000  # states on which a solved forward map is inverted
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
 
 
@@ -81,8 +79,9 @@ def train(
        simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
     3. The training trajectories are simulated with the filter beside them; those of input-aware maps have inputs and
        process noise.
-    4. Forward map (spinn): T is trained on them and on its equation, or solved for, and gives batches z' = T(x'). An
-       input-aware map has no T. Its batches are drawn along the trajectories, with measurement noise added to z.
+    4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
+       the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
+       added to z.
     5. The inverse is fitted on these batches, and the observer is put together.
     6. Closed loop (if the configuration has it): a controller acts on that observer's estimates, and the same inverse
        is fitted again, on these trajectories too.
@@ -128,14 +127,16 @@ def train(
         forward: ForwardMap | None = None
         sampler: Sampler
         if config.pipeline == "input-aware":
-            sampler = run.transients(trajectories, run.linear)
+            sampler = run.along(trajectories, run.linear)
         else:
-            forward, sampler = run.learn_forward(trajectories)
+            points = run.points(trajectories)
+            forward = run.learn_forward(trajectories, points)
+            sampler = run.by_forward_map(forward, trajectories, points)
         inverse = run.fit_inverse("inverse", sampler)
         artifact = run.artifact(sampler.inverse_map(inverse, run.linear), forward, free)
         if feedback is not None and isinstance(sampler, TrajectorySampler):
             both = run.close_the_loop(sampler, artifact, feedback)
-            run.minimise("closed-loop", InverseProblem(inverse, both, device), config.inverse_steps)
+            run.fit("closed-loop", inverse, both)
             artifact = run.artifact(both.inverse_map(inverse, run.linear), forward, free)
     return Result(artifact, run.losses)
 
@@ -165,23 +166,24 @@ class _Run:
         self.linear = self.spectrum.filter(system.ny, config.dt, nu)
         self.shares = _shares(config, nu)
         self.steps = max(1, round(config.duration / config.dt))
-        first = 0
-        if config.pipeline == "spinn":
-            first = truncation_step(system, self.linear, steps=self.steps, epsilon=config.truncation)
-        self.ages = recording_ages(first, self.steps, config.samples)
+        self.process_noise_share = config.process_noise_share if config.pipeline == "input-aware" else 0.0
+        self.ages = recording_ages(self.steps, config.samples)
 
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
         """Training trajectories with a filter beside them."""
         config, report = self.config, self._bar(f"simulating {what}", self.config.trajectories)
-        if config.pipeline == "input-aware":
-            motions = dataclasses.replace(motions, process_noise_share=config.process_noise_share)
+        motions = dataclasses.replace(
+            motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
+        )
         n, steps = config.trajectories, self.steps
         return record(
             self.system, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
         )
 
-    def transients(self, trajectories: Trajectories, linear: LinearFilter) -> TrajectorySampler:
-        """Batches along trajectories, transients and noise included."""
+    def along(
+        self, trajectories: Trajectories, linear: LinearFilter, error: np.ndarray | None = None
+    ) -> TrajectorySampler:
+        """Batches along trajectories, transients and noise included; z may have an error of some covariance beside."""
         config = self.config
         return TrajectorySampler(
             trajectories,
@@ -191,47 +193,64 @@ class _Run:
             device=self.device,
             noise_free_share=config.noise_free_share,
             high_noise_emphasis=config.high_noise_emphasis,
-            process_noise_max=self.system.process_noise if config.process_noise_share else 0.0,
+            process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
+            error=error,
+            scaling=config.scaling,
         )
 
     def learn_free_inverse(self) -> InverseMap:
         """T_inv of z_y alone, fitted along motions without input, some of them from beyond X."""
         unforced = self.spectrum.filter(self.system.ny, self.config.dt)
         motions = Motions(lead_in_share=LEAD_IN_SHARE, lead_in_input=self.config.lead_in_input)
-        sampler = self.transients(self.simulate(unforced, f"{self.system.name}, free", motions), unforced)
+        sampler = self.along(self.simulate(unforced, f"{self.system.name}, free", motions), unforced)
         return sampler.inverse_map(self.fit_inverse("free", sampler), unforced)
 
-    def learn_forward(self, trajectories: Trajectories) -> tuple[ForwardMap, ForwardMapSampler]:
-        """T, trained or solved for, and the batches z' = T(x') on which it is to be inverted."""
-        system, config, linear, device = self.system, self.config, self.linear, self.device
-        x, z = trajectories.x.reshape(-1, system.nx), trajectories.z.reshape(-1, linear.size)
+    def points(self, trajectories: Trajectories) -> np.ndarray:
+        """States at which T's equation is asked to hold, and x' where there are no transients: (n, nx)."""
+        x = trajectories.x.reshape(-1, self.system.nx)
+        return x if self.config.collocation == "motions" else self.rng.uniform(*self.system.box(), x.shape)
+
+    def learn_forward(self, trajectories: Trajectories, points: np.ndarray) -> ForwardMap:
+        """T, trained or solved for."""
+        system, config, linear = self.system, self.config, self.linear
         if config.random_features:
             report = self._bar(f"solving for T with {config.random_features} features", 1)
-            forward = solve_forward(
-                system, linear, features=config.random_features, box_factor=config.box_factor, rng=self.rng
-            )
+            forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
             report(1)
-            some = np.random.default_rng(0).permutation(len(x))[:100_000]
-            T, error = on_torch(forward, device), z[some] - forward(x[some])
-            points = collocation(system, INVERTED, box_factor=config.box_factor, rng=self.rng)
-            return forward, ForwardMapSampler(
-                T, error, box=system.box(), batch=config.batch, device=device, points=points
-            )
+            return forward
+        settled = trajectories.ages >= truncation_step(
+            system, linear, steps=self.steps, epsilon=config.truncation, box_factor=config.box_factor
+        )
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
         problem = ForwardProblem(
             network,
             system,
             linear=linear,
-            x=x,
-            z=z,
+            pairs=(trajectories.x[settled].reshape(-1, system.nx), trajectories.z[settled].reshape(-1, linear.size)),
+            points=points,
+            scale=StateScale.of(points, config.scaling),
             physics_weight=config.physics_weight,
             batch=config.batch,
-            device=device,
+            device=self.device,
+            adaptive=config.adaptive,
         )
         self.minimise("forward", problem, config.forward_steps)
-        return problem.forward_map(), ForwardMapSampler(
-            problem.T, problem.error(), box=system.box(), batch=config.batch, device=device
-        )
+        if config.solved_output_layer:
+            problem.solve_output_layer(self.rng)
+        return problem.forward_map()
+
+    def by_forward_map(
+        self, forward: ForwardMap, trajectories: Trajectories, points: np.ndarray
+    ) -> TrajectorySampler | ForwardMapSampler:
+        """Batches z' = T(x'), blurred by the error of T that the simulated z shows."""
+        linear = self.linear
+        T_x = np.stack([forward(x) for x in trajectories.x])
+        z = transients(T_x, trajectories.z[0], linear=linear, ages=self.ages)
+        error = (trajectories.z - z).reshape(-1, linear.size)
+        if self.config.transients:
+            return self.along(dataclasses.replace(trajectories, z=z), linear, error.T @ error / len(error))
+        T, config, device = on_torch(forward, self.device), self.config, self.device
+        return ForwardMapSampler(T, error, points=points, batch=config.batch, device=device, scaling=config.scaling)
 
     def fit_inverse(self, stage: str, sampler: Sampler) -> Network:
         """A network that gives x on the sampler's batches."""
@@ -240,8 +259,13 @@ class _Run:
         network = Network(
             inputs, self.system.nx, width=config.width, depth=config.depth, activation=config.activation
         ).to(self.device)
-        self.minimise(stage, InverseProblem(network, sampler, self.device), config.inverse_steps)
+        self.fit(stage, network, sampler)
         return network
+
+    def fit(self, stage: str, network: Network, sampler: Sampler) -> None:
+        """Train a network on the sampler's batches."""
+        problem = InverseProblem(network, sampler, self.device, lipschitz_penalty=self.config.lipschitz_penalty)
+        self.minimise(stage, problem, self.config.inverse_steps)
 
     def close_the_loop(self, sampler: TrajectorySampler, artifact: Artifact, feedback: Controller) -> ClosedLoopSampler:
         """Batches half from trajectories of a controller that acts on the artifact's estimate."""
@@ -253,7 +277,7 @@ class _Run:
             feedback,
             n=config.closed_loop_trajectories,
             steps=steps,
-            ages=recording_ages(0, steps, config.samples),
+            ages=recording_ages(steps, config.samples),
             rng=self.rng,
             noise_free_share=config.noise_free_share,
             high_noise_emphasis=config.high_noise_emphasis,

@@ -4,8 +4,7 @@ What differs from system to system, the spectrum above all, comes from the syste
 :mod:`training.systems`.
 """
 
-from dataclasses import replace
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -49,21 +48,35 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
         raise ValueError(
             f"no preset {name!r} for pipeline {pipeline!r}; there are {get_args(Preset)}, {get_args(Pipeline)}"
         )
-    large = {"width": 512, "depth": 4, "activation": "silu", "optimiser": "adam", "batch": 4096, "learning_rate": 1e-3}
+    large: dict[str, Any] = {
+        "width": 512,
+        "depth": 4,
+        "activation": "silu",
+        "optimiser": "adam",
+        "batch": 4096,
+        "learning_rate": 1e-3,
+    }
     if pipeline == "input-aware":
         fast = override(Config(pipeline, eigenvalues(system)), profile(system).settings)
         return fast if name == "fast" else override(fast, {**large, "inverse_steps": 244_140})
-    paper = Config(
-        pipeline,
-        papers_spectrum(system),
-        trajectories=500,
-        samples=5001,
-        forward_steps=200 * 3_000_000 // 4096,
-        process_noise_share=0.0,
-    )
     if name == "paper":
-        return override(paper, {**large, "inverse_steps": 200 * 5_000_000 // 4096})
-    return replace(paper, samples=500, optimiser="adam", batch=2048, forward_steps=8000, inverse_steps=6000)
+        return Config(
+            pipeline,
+            papers_spectrum(system),
+            trajectories=500,
+            samples=5001,
+            **large,
+            forward_steps=200 * 3_000_000 // 4096,
+            inverse_steps=200 * 5_000_000 // 4096,
+            collocation="box",
+            scaling="range",
+            solved_output_layer=False,
+            transients=False,
+        )
+    chosen = profile(system).smooth_eigenvalues or papers_spectrum(system)
+    return Config(
+        pipeline, tuple(np.round(chosen, 6).tolist()), box_factor=2.0, forward_steps=10_000, noise_free_share=0.35
+    )
 
 
 def eigenvalues(system: System) -> tuple[float, ...]:

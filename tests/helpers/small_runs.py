@@ -30,7 +30,7 @@ def open_loop(process_noise_share=0.0):
     """Batches along trajectories of Van der Pol's oscillator, the trajectories, and the filter beside them."""
     linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
     motions = Motions(KINDS, process_noise_share=process_noise_share)
-    ages, rng = recording_ages(0, 500, 40), np.random.default_rng(0)
+    ages, rng = recording_ages(500, 40), np.random.default_rng(0)
     data = record(VanDerPol(), linear, n=50, steps=500, ages=ages, rng=rng, motions=motions)
     sampler = TrajectorySampler(
         data,
@@ -62,6 +62,6 @@ def closed_loop(process_noise_share=0.0):
         seen.append(x_hat)
         return np.tanh(x_hat[:, :1])
 
-    ages, rng = recording_ages(0, 200, 30), np.random.default_rng(1)
+    ages, rng = recording_ages(200, 30), np.random.default_rng(1)
     data = record_closed_loop(VanDerPol(), artifact, act, n=60, steps=200, ages=ages, rng=rng, process_noise_share=0.5)
     return ClosedLoopSampler(sampler, data, dt=linear.dt, device=CPU), data, artifact, seen

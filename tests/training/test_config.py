@@ -40,9 +40,11 @@ def test_impossible_configurations(change, message):
         replace(preset(Oscillator(), "input-aware", "fast"), **change)
 
 
-def test_settings_that_do_not_go_with_solving_for_the_forward_map():
-    for wrong in ({"box_factor": 0.5}, {"box_factor": 2.0}, {"random_features": -1}, {"random_features": 10}):
-        with pytest.raises(ValueError, match=r"features|box_factor"):
+def test_settings_that_do_not_go_with_the_pipeline():
+    for wrong in ({"box_factor": 0.5}, {"random_features": -1}, {"random_features": 10}, {"collocation": "ball"}):
+        with pytest.raises(ValueError, match=r"features|box_factor|collocation"):
             replace(preset(Oscillator(), "spinn", "fast"), **wrong)
     with pytest.raises(ValueError, match="does not go with"):
         replace(preset(Oscillator(), "input-aware", "fast"), random_features=10)
+    with pytest.raises(ValueError, match=r"box_factor = 2.0, adaptive = True: settings of the pipeline 'spinn'"):
+        replace(preset(Oscillator(), "input-aware", "fast"), box_factor=2.0, adaptive=True)

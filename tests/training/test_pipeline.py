@@ -55,6 +55,8 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
         "device": CPU,
         "noise_free_share": 0.3,
         "high_noise_emphasis": 3.0,
+        "error": None,
+        "scaling": "relative",
     }
     assert seen == {"record": 0.5, "sampler": {**told, "process_noise_max": 0.05}}
     with pytest.raises(ReachedError):
@@ -63,8 +65,10 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
     spinn = replace(
         preset(VanDerPol(), "spinn", "fast"), process_noise_share=0.5, trajectories=5, duration=20.0, forward_steps=1
     )
-    train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
+    with pytest.raises(ReachedError):
+        train(VanDerPol(), replace(spinn, inverse_steps=1), tmp_path / "spinn", device=CPU)
     assert seen["record"] == 0.0
+    assert seen["sampler"]["process_noise_max"] == 0.0
 
 
 def test_training_makes_the_error_fall(tmp_path):
@@ -82,10 +86,13 @@ def test_training_makes_the_error_fall(tmp_path):
     assert np.median(errors(after, system, driven, measurement_noise=0.0, seed=0).late) < 10.0
 
 
-@pytest.mark.parametrize("method", ["input-aware", "spinn"])
-def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method):
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [("input-aware", {}), ("spinn", {}), ("spinn", {"adaptive": True, "lipschitz_penalty": 0.1})],
+)
+def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method, options):
     system = Oscillator()
-    config = toy(system, method, duration=20.0, inverse_steps=400)
+    config = toy(system, method, duration=20.0, inverse_steps=400, **options)
     whole = train(system, config, tmp_path / "whole").artifact
 
     monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
@@ -200,6 +207,15 @@ def test_training_on_a_solved_map(tmp_path):
     runs = unseen_trajectories(Oscillator(), config.dt, n=20, duration=20.0, seed=0, domain="1.5X")
     # long after the start, whose last traces in z an inverse of exact T(x) magnifies
     assert np.median(errors(result.artifact, Oscillator(), runs, measurement_noise=0.0, seed=0, skip=12.0).late) < 5.0
+
+
+def test_the_papers_own_way_is_told_neither_noise_nor_age(tmp_path):
+    papers = {"collocation": "box", "box_factor": 1.0, "scaling": "range", "transients": False}
+    config = toy(Oscillator(), "spinn", duration=20.0, solved_output_layer=False, **papers)
+    artifact = train(Oscillator(), config, tmp_path).artifact
+    assert artifact.inverse.features == ("z_y",)
+    np.testing.assert_allclose(artifact.forward.x_scale, 1.0, atol=0.01)  # the box, not the motions beyond it
+    np.testing.assert_allclose(artifact.inverse.x_scale, 1.0, atol=0.01)
 
 
 def test_artifact_of_a_run_records_what_made_it(tmp_path):

@@ -8,8 +8,14 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
+from training.maps.least_squares import output_layer
 from training.maps.networks import Network, tensor
-from training.maps.pde import on_tensors, residual
+from training.maps.pde import along, on_tensors, residual
+from training.maps.scaling import StateScale
+
+REFRESH = 500  # batches after which the residual decides anew where collocation points are drawn
+CANDIDATES = 20_000  # points among which it decides
+SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 
 
 def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> float:
@@ -39,11 +45,10 @@ def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> flo
 class ForwardProblem(nn.Module):
     """The physics-informed risk R_S1(theta) (paper, eq. emp-risk-theta) of a forward network.
 
-    mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points, drawn
-    anew for every batch, uniformly from the training box. States are scaled to [-1, 1] and each z to unit
-    variance, in both terms; the residual at each point is divided by the local speed of the scaled motion plus the
-    filter's slowest rate, so that fast corners of the box do not drown the rest (the authors' released code
-    weights by the speed as well).
+    mean |z - T(x)|^2 over simulated pairs + nu * mean |dT/dx f(x) - A T(x) - B h(x)|^2 over collocation points. Each z
+    counts in units of its standard deviation, in both terms. The residual of each component is divided by the local
+    speed of the scaled motion plus the rate of its mode, so that fast regions do not drown the rest (the authors'
+    released code weights by the speed as well).
 
     Parameters
     ----------
@@ -53,16 +58,21 @@ class ForwardProblem(nn.Module):
         Its equations.
     linear : LinearFilter
         The filter.
-    x : ndarray, shape (n, nx)
-        States of the pairs.
-    z : ndarray, shape (n, nz)
-        Filter states of the pairs.
+    pairs : tuple of ndarray, shapes (n, nx) and (n, nz)
+        States, and the filter's beside them.
+    points : ndarray, shape (m, nx)
+        States at which the equation is asked to hold.
+    scale : StateScale
+        Of the states that the network sees.
     physics_weight : float
         Weight nu of the residual.
     batch : int
         Number of pairs, and of collocation points, in a batch.
     device : torch.device
         Where the network is trained.
+    adaptive : bool, default False
+        Whether points are drawn in proportion to the residual plus its mean, instead of alike. This is RAD with k = c
+        = 1 (Wu et al., Comput. Methods Appl. Mech. Eng. 403, 115671, 2023).
     """
 
     def __init__(
@@ -71,36 +81,76 @@ class ForwardProblem(nn.Module):
         system: System,
         *,
         linear: LinearFilter,
-        x: np.ndarray,
-        z: np.ndarray,
+        pairs: tuple[np.ndarray, np.ndarray],
+        points: np.ndarray,
+        scale: StateScale,
         physics_weight: float,
         batch: int,
         device: torch.device,
+        adaptive: bool = False,
     ) -> None:
         super().__init__()
-        low, high = system.box()
-        lowest, highest = np.minimum(low, x.min(0)), np.maximum(high, x.max(0))
+        x, z = pairs
         self.network, self.system, self.linear = network.to(device), system, linear
-        self.x_offset, self.x_scale = (lowest + highest) / 2, (highest - lowest) / 2
+        self.scale = scale
         self.z_offset, self.z_scale = z.mean(0), np.maximum(z.std(0), 1e-12)
-        self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
+        self._xo, self._xs = tensor(scale.offset, device), tensor(scale.scale, device)
         self._zo, self._zs = tensor(self.z_offset, device), tensor(self.z_scale, device)
         self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)
-        self._x = tensor((x - self.x_offset) / self.x_scale, device)
+        self._x = tensor(scale(x), device)
         self._z = tensor((z - self.z_offset) / self.z_scale, device)
-        self._low, self._span = tensor(low, device), tensor(high - low, device)
-        self._slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
-        self._physics_weight, self._batch = physics_weight, batch
+        self._points = tensor(points, device)
+        self._rates = tensor(np.linalg.norm(linear.A, axis=1), device)
+        self._physics_weight, self._batch, self._adaptive = physics_weight, batch, adaptive
+        self.register_buffer("batches", torch.zeros((), dtype=torch.long, device=device))
+        self.register_buffer("candidates", torch.zeros(CANDIDATES, dtype=torch.long, device=device))
+        self.register_buffer("cumulative", torch.zeros(CANDIDATES, dtype=torch.double, device=device))
+        self.batches: torch.Tensor
+        self.candidates: torch.Tensor
+        self.cumulative: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """The risk on a batch of data and as many fresh collocation points."""
+        """The risk on a batch of pairs and as many collocation points.
+
+        Parameters
+        ----------
+        generator : torch.Generator
+            Of the batch.
+
+        Returns
+        -------
+        dict of str to Tensor
+            "loss", its parts "data" and "physics", and "error", the root mean square of z - T(x) in standard deviations
+            of z.
+        """
         device = self._x.device
         rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
         data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
-        x = self._low + self._span * torch.rand((self._batch, len(self._low)), generator=generator, device=device)
+        physics = (self._weighted_residual(self._points[self._drawn(generator)]) ** 2).mean()
+        self.batches += 1
+        return {
+            "loss": data + self._physics_weight * physics,
+            "data": data.detach(),
+            "physics": physics.detach(),
+            "error": data.detach().sqrt(),
+        }
+
+    def _drawn(self, generator: torch.Generator) -> torch.Tensor:
+        """Rows of collocation points."""
+        device = self._points.device
+        if not self._adaptive:
+            return torch.randint(len(self._points), (self._batch,), generator=generator, device=device)
+        if self.batches % REFRESH == 0:
+            self.candidates = torch.randint(len(self._points), (CANDIDATES,), generator=generator, device=device)
+            with torch.no_grad():
+                size = self._weighted_residual(self._points[self.candidates]).norm(dim=-1).double()
+            self.cumulative = (size + size.mean()).cumsum(0)
+        at = torch.rand(self._batch, generator=generator, device=device, dtype=torch.double) * self.cumulative[-1]
+        return self.candidates[torch.searchsorted(self.cumulative, at).clamp(max=CANDIDATES - 1)]
+
+    def _weighted_residual(self, x: torch.Tensor) -> torch.Tensor:
         residual, speed = self.residual(x)
-        physics = ((residual / self._zs / (speed + self._slowest)[:, None]) ** 2).mean()
-        return {"loss": data + self._physics_weight * physics, "data": data.detach(), "physics": physics.detach()}
+        return residual / self._zs / (speed[:, None] + self._rates)
 
     def residual(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """PDE residual (n, nz) in units of z per second, and the speed |f| in scaled states (n,), at states (n, nx)."""
@@ -113,19 +163,47 @@ class ForwardProblem(nn.Module):
         return z
 
     @torch.no_grad()
-    def error(self, n: int = 100_000) -> np.ndarray:
-        """Misfit z - T(x) on up to n of the data pairs, (n, nz)."""
-        rows = np.random.default_rng(0).permutation(len(self._x))[:n]
-        difference = self._zs * (self._z[rows] - self.network(self._x[rows]))
-        return np.asarray(difference.cpu().numpy(), dtype=float)
+    def solve_output_layer(self, rng: np.random.Generator) -> None:
+        """Put the output layer where it minimises the risk for the features that the other layers have learned.
+
+        That is linear least squares, in float64 and on more samples than a batch has; gradients come close to it.
+
+        Parameters
+        ----------
+        rng : Generator
+            Of the samples.
+        """
+        *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
+        assert isinstance(last, nn.Linear)
+        features = nn.Sequential(*hidden)
+        some = torch.as_tensor(rng.permutation(len(self._x))[:SOLVED])
+        at = torch.as_tensor(rng.permutation(len(self._points))[:SOLVED])
+        device, x = self._x.device, self._points.cpu()[at].double()
+        q, f = (x - self._xo.cpu()) / self._xs.cpu(), on_tensors(self.system.f, x) / self._xs.cpu()
+        value, derivative = along(features, q, f)
+        weights = output_layer(
+            self.linear,
+            equation=(value.numpy(), derivative.numpy(), on_tensors(self.system.h, x).numpy()),
+            speed=f.norm(dim=-1).numpy(),
+            pairs=(
+                features(self._x.cpu()[some].double()).numpy(),
+                self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy(),
+            ),
+            physics_weight=self._physics_weight,
+        )
+        weights[:, -1] -= self.z_offset
+        weights /= self.z_scale[:, None]
+        last.weight.copy_(torch.as_tensor(weights[:, :-1]))
+        last.bias.copy_(torch.as_tensor(weights[:, -1]))
+        self.network.to(device=device, dtype=torch.float32)
 
     def forward_map(self) -> ForwardMap:
         """The learned map for NumPy."""
-        return ForwardMap(self.network.export(), self.x_offset, self.x_scale, self.z_offset, self.z_scale)
+        return ForwardMap(self.network.export(), self.scale.offset, self.scale.scale, self.z_offset, self.z_scale)
 
 
-def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float) -> int:
-    """First sample k* by which the filter has forgotten its start along every trajectory from X.
+def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
+    """First sample k* by which the filter has forgotten its start along every trajectory.
 
     Parameters
     ----------
@@ -137,6 +215,8 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
         Length of the trajectories in sampling intervals.
     epsilon : float
         What may be left of the start, in units of z.
+    box_factor : float
+        Trajectories start in this multiple of X.
 
     Returns
     -------
@@ -148,7 +228,7 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
     ValueError
         If the trajectories end before.
     """
-    x0 = np.random.default_rng(0).uniform(*system.box(), (10_000, system.nx))
+    x0 = np.random.default_rng(0).uniform(*system.box(box_factor), (10_000, system.nx))
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
     t = truncation_time(linear, z0, epsilon)
     if t >= steps * linear.dt:
@@ -157,3 +237,30 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
             "make them longer"
         )
     return math.ceil(t / linear.dt)
+
+
+def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
+    """What the filter holds along trajectories by T alone: z(t) = T(x(t)) + e^{At} (z_0 - T(x_0)).
+
+    For an exact T this is the filter's own state at every age, so that none needs to be simulated (paper, sec. 3).
+
+    Parameters
+    ----------
+    T : ndarray, shape (m, n, nz)
+        T(x) at each age; the first age is 0.
+    z0 : ndarray, shape (n, nz)
+        Where the filter starts.
+    linear : LinearFilter
+        The filter.
+    ages : ndarray of int, shape (m,)
+        Samples since the start, sorted.
+
+    Returns
+    -------
+    ndarray, shape (m, n, nz)
+        z.
+    """
+    poles, V = np.linalg.eig(linear.A)
+    left = np.exp(ages[:, None] * linear.dt * poles)  # of each mode
+    start = np.linalg.solve(V, (z0 - T[0]).T).T
+    return T + np.real((left[:, None] * start) @ V.T)

@@ -18,16 +18,32 @@ class InverseProblem(nn.Module):
         Where batches are from.
     device : torch.device
         Where the network is trained.
+    lipschitz_penalty : float, default 0
+        What the logarithm of a bound of T_inv's Lipschitz constant costs, in parts of the mean square error.
+
+    Notes
+    -----
+    The bound is the product of the layers' spectral norms, the first one's with respect to z without noise. A penalty
+    on such a product is that of Liu et al. (arXiv:2202.08345), with spectral norms by power iteration (Yoshida and
+    Miyato, arXiv:1705.10941). The loss being relative, its weight means the same on every system.
     """
 
-    def __init__(self, network: Network, sampler: Sampler, device: torch.device) -> None:
+    def __init__(
+        self, network: Network, sampler: Sampler, device: torch.device, *, lipschitz_penalty: float = 0.0
+    ) -> None:
         super().__init__()
         self.network = network
         self.sampler = sampler
+        self._lipschitz_penalty = lipschitz_penalty
         self.register_buffer("error", torch.ones(sampler.cells, device=device))
         self.register_buffer("visited", torch.zeros(sampler.cells, dtype=torch.bool, device=device))
         self.error: torch.Tensor
         self.visited: torch.Tensor
+        if lipschitz_penalty:
+            self._whiten = torch.as_tensor(sampler.coordinates.whiten, dtype=torch.float32, device=device)
+            for i, weight in enumerate(self._slopes()):
+                start = torch.ones(weight.shape[1], device=device) / weight.shape[1] ** 0.5
+                self.register_buffer(f"direction{i}", start)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
         """Mean square error of a batch, each cell relative to its own running error.
@@ -45,8 +61,6 @@ class InverseProblem(nn.Module):
         """
         inputs, x, weight, cell = self.sampler(generator)
         square = weight * ((self.network(inputs) - x) ** 2).mean(-1)
-        if len(self.error) == 1:
-            return {"loss": square.mean(), "error": square.detach().mean().sqrt()}
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
         mean = torch.zeros_like(self.error).index_add_(0, cell, detached) / count.clamp(min=1.0)
@@ -54,4 +68,23 @@ class InverseProblem(nn.Module):
         self.error.mul_(keep).add_((1 - keep) * mean)
         self.visited |= count > 0  # there may be cells without data
         error = self.error[self.visited].log().mean().exp().sqrt()
-        return {"loss": (square / self.error[cell]).mean(), "error": error}
+        loss = (square / self.error[cell]).mean()
+        if self._lipschitz_penalty:
+            bound = self._log_lipschitz()
+            return {"loss": loss + self._lipschitz_penalty * bound, "error": error, "log_lipschitz": bound.detach()}
+        return {"loss": loss, "error": error}
+
+    def _slopes(self) -> list[torch.Tensor]:
+        """Matrices of which the product of norms bounds the scaled estimate's Lipschitz constant with respect to z."""
+        first, *others = (layer.weight for layer in self.network.linear_layers())
+        return [first[:, : len(self._whiten)] @ self._whiten, *others]
+
+    def _log_lipschitz(self) -> torch.Tensor:
+        """Logarithm of that product; directions of largest gain are followed from batch to batch."""
+        total = torch.zeros((), device=self.error.device)
+        for i, weight in enumerate(self._slopes()):
+            direction = getattr(self, f"direction{i}")
+            with torch.no_grad():
+                direction.copy_(nn.functional.normalize(weight.T @ (weight @ direction), dim=0))
+            total = total + (weight @ direction).norm().log()
+        return total

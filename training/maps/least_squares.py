@@ -1,4 +1,4 @@
-"""The forward map T by linear least squares, in place of gradients."""
+"""The output layer of the forward map T by linear least squares, in place of gradients."""
 
 import numpy as np
 import torch
@@ -6,37 +6,84 @@ from scipy.linalg import qr, solve_triangular
 
 from kkl_gym.system import System
 from observers import MLP, ForwardMap, LinearFilter
-from training.maps.collocation import collocation
 from training.maps.pde import along
 
-POINTS = 8  # collocation points for each feature
+POINTS = 8  # collocation points for each random feature
 STEEPNESS = 5.0  # of the features at the centre of the points; it falls with the distance from there
 RIDGE = 1e-5
 
 
+def output_layer(
+    linear: LinearFilter,
+    *,
+    equation: tuple[np.ndarray, np.ndarray, np.ndarray],
+    speed: np.ndarray,
+    pairs: tuple[np.ndarray, np.ndarray] | None = None,
+    physics_weight: float = 1.0,
+) -> np.ndarray:
+    """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
+
+    In the coordinates of A's eigenvectors, dT/dx f = A T + B h is one linear equation for each component of T: with
+    T_i = w . phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point. Pairs add T_i = z_i.
+    Both are solved in the mean square, in float64 by a QR factorisation with a small ridge. As in
+    :class:`training.maps.forward.ForwardProblem`, the equation's rows are divided by the local speed plus the rate of
+    the mode.
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    equation : tuple of ndarray, shapes (m, features), (m, features) and (m, ny)
+        At collocation points: the features, their derivatives along f, and h.
+    speed : ndarray, shape (m,)
+        Of the scaled motion there.
+    pairs : tuple of ndarray, shapes (n, features) and (n, nz), optional
+        The features at states of which the filter's state is known, and that.
+    physics_weight : float
+        Weight of the equation where there are pairs.
+
+    Returns
+    -------
+    ndarray, shape (nz, features + 1)
+        W; the last column is the bias.
+    """
+    value, derivative, h = equation
+    phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
+    poles, V = np.linalg.eig(linear.A)
+    driven = np.linalg.solve(V, linear.B @ h.T).T
+    known, target = np.empty((0, phi.shape[1])), np.empty((0, len(poles)))
+    if pairs is not None:
+        known = np.column_stack([pairs[0], np.ones(len(pairs[0]))]) / np.sqrt(len(pairs[0]))
+        target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
+    solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
+    for i, pole in enumerate(poles):
+        row = np.sqrt(physics_weight / len(phi)) / (speed + abs(pole))
+        matrix = np.vstack([(phi_along - pole * phi) * row[:, None], known])
+        ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
+        right = np.concatenate([driven[:, i] * row, target[:, i]])
+        Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
+        solved[i] = solve_triangular(R, Q[: len(right)].conj().T @ right)
+    return np.real(V @ solved)
+
+
 def solve_forward(
-    system: System, linear: LinearFilter, *, features: int, box_factor: float, rng: np.random.Generator
+    system: System, linear: LinearFilter, *, features: int, points: np.ndarray, rng: np.random.Generator
 ) -> ForwardMap:
-    """Solve for T with random features and an output layer that fulfils the PDE in the mean square.
+    """Solve for T with random features, from its equation alone.
 
-    With A diagonal, dT/dx f = A T + B h is one linear equation for each component of T. For T_i = w . phi(x) with fixed
-    features phi it becomes (dphi/dx f - lambda_i phi) . w = (B h)_i at every collocation point: linear least squares,
-    solved in float64 by a QR factorisation with a small ridge. Rows are divided by the local speed plus the rate of the
-    mode, as in :class:`training.maps.forward.ForwardProblem`. No filter is simulated.
-
-    Collocation points lie along motions, because the equation transports T along them: a box that motions leave and
-    enter holds T only up to what came in, and its corners are where it then goes wrong.
+    Collocation points should lie along motions, because the equation transports T along them: a box that motions leave
+    and enter holds T only up to what came in, and its corners are where it then goes wrong.
 
     Parameters
     ----------
     system : System
         The system.
     linear : LinearFilter
-        Its filter, A diagonal.
+        Its filter.
     features : int
         Number of tanh units; the time grows with their cube, a minute for 1,500.
-    box_factor : float
-        Motions start in this multiple of X.
+    points : ndarray, shape (n, nx)
+        States from which collocation points are taken.
     rng : Generator
         Of features and points.
 
@@ -44,17 +91,10 @@ def solve_forward(
     -------
     ForwardMap
         T.
-
-    Raises
-    ------
-    ValueError
-        If A is not diagonal, or hardly any motion stays within the system's bounds.
     """
-    if np.count_nonzero(linear.A - np.diag(linear.A.diagonal())):
-        raise ValueError("solving for T component by component needs a diagonal A")
-    x = collocation(system, POINTS * features, box_factor=box_factor, rng=rng)
-    f, offset, scale = system.drift(x), x.mean(0), x.std(0)
-    q = (x - offset) / scale
+    x = points[rng.permutation(len(points))[: POINTS * features]]
+    offset, scale = x.mean(0), np.where(x.std(0) > 0, x.std(0), 1.0)
+    q, f = (x - offset) / scale, system.drift(x) / scale
     centres = q[rng.integers(len(q), size=features)]
     weights = rng.standard_normal((features, system.nx))
     weights *= (STEEPNESS / (1.0 + np.linalg.norm(centres, axis=1)))[:, None]
@@ -63,20 +103,17 @@ def solve_forward(
     def hidden(q: torch.Tensor) -> torch.Tensor:
         return torch.tanh(q @ torch.as_tensor(weights.T) + torch.as_tensor(biases))
 
-    value, derivative = along(hidden, torch.as_tensor(q), torch.as_tensor(f / scale))
-    phi, phi_along = np.column_stack([value, np.ones(len(x))]), np.column_stack([derivative, np.zeros(len(x))])
-    speed, driven = np.linalg.norm(f / scale, axis=1), system.output(x) @ linear.B.T
-    solved = np.empty((len(linear.A), features + 1))
-    for i, pole in enumerate(linear.A.diagonal()):
-        row = 1.0 / (speed + abs(pole))
-        matrix = (phi_along - pole * phi) * row[:, None]
-        ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(features) * np.eye(features + 1)
-        Q, R = qr(np.vstack([matrix, ridge]), mode="economic", overwrite_a=True, check_finite=False)
-        solved[i] = solve_triangular(R, Q[: len(x)].T @ (driven[:, i] * row))
-    size = np.maximum(np.abs(solved).max(1), 1e-12)
+    value, derivative = along(hidden, torch.as_tensor(q), torch.as_tensor(f))
+    solved = output_layer(
+        linear,
+        equation=(value.numpy(), derivative.numpy(), system.output(x)),
+        speed=np.linalg.norm(f, axis=1),
+    )
+    z = value.numpy() @ solved[:, :-1].T + solved[:, -1]
+    middle, spread = z.mean(0), np.maximum(z.std(0), 1e-12)
     mlp = MLP(
-        [weights.astype(np.float32), (solved[:, :-1] / size[:, None]).astype(np.float32)],
-        [biases.astype(np.float32), (solved[:, -1] / size).astype(np.float32)],
+        [weights.astype(np.float32), (solved[:, :-1] / spread[:, None]).astype(np.float32)],
+        [biases.astype(np.float32), ((solved[:, -1] - middle) / spread).astype(np.float32)],
         "tanh",
     )
-    return ForwardMap(mlp, offset, scale, np.zeros(len(size)), size)
+    return ForwardMap(mlp, offset, scale, middle, spread)

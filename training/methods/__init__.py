@@ -4,7 +4,24 @@ from inspect import isabstract
 from typing import Any
 
 from kkl_gym.loading import load_class
-from training.methods.ablation import BySOAP, MoreModes, NoiseAware, OwnFree, PapersSPINN, Solved, Transients, Tuned
+from training.methods.ablation import (
+    AdaptiveSPINN,
+    BySOAP,
+    LipschitzSPINN,
+    MoreModes,
+    MovingSPINN,
+    NoiseAware,
+    OwnFree,
+    PapersSPINN,
+    ScaledSPINN,
+    SmoothSPINN,
+    Solved,
+    SolvedSPINN,
+    SPINNBySOAP,
+    SPINNOfAnyAge,
+    Transients,
+    Tuned,
+)
 from training.methods.autoencoder import AE
 from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task
 from training.methods.dmf import DMF, DMFNoise
@@ -18,7 +35,26 @@ METHODS: dict[str, type[Method[Any]]] = {
 }
 # Steps from the paper's pipeline to the package's and past it, which ``make ablation`` compares in this order.
 ABLATION: dict[str, type[Method[Any]]] = {
-    cls.name: cls for cls in (PapersSPINN, Solved, Transients, NoiseAware, MoreModes, BySOAP, OwnFree, Default, Tuned)
+    cls.name: cls
+    for cls in (
+        PapersSPINN,
+        SPINNBySOAP,
+        SmoothSPINN,
+        MovingSPINN,
+        ScaledSPINN,
+        SolvedSPINN,
+        SPINNOfAnyAge,
+        AdaptiveSPINN,
+        LipschitzSPINN,
+        Solved,
+        Transients,
+        NoiseAware,
+        MoreModes,
+        BySOAP,
+        OwnFree,
+        Default,
+        Tuned,
+    )
 }
 
 

@@ -1,4 +1,7 @@
-"""What each idea earns: from the paper's pipeline to this package's, step by step, networks trained for equal times."""
+"""What each idea earns, step by step, networks trained for equal times.
+
+One staircase leads from the paper's SPINN to the package's, the other from inverses without T to the default.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -16,6 +19,7 @@ from training.spectrum import papers_spectrum
 from training.tuning import Probe, Spectrum
 
 FEATURES = 1500
+PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
 TUNED_FOR = 0.5
 # How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
@@ -56,23 +60,112 @@ class Ablation(KKLMethod):
 
 
 class PapersSPINN(Ablation):
-    """SPINN with the spectrum of the paper (the benchmark's chooses among three)."""
+    """The paper's SPINN as its sec. 8.1 describes it: points uniform in X, and its spectrum, all at a small budget."""
 
     name: ClassVar[str] = "ablation-spinn"
     label: ClassVar[str] = "SPINN"
     pipeline: ClassVar[Pipeline] = "spinn"
 
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """All that the package's SPINN has beyond the paper's; each class below gives one of it back."""
+        papers = {
+            **super().changes(task),
+            "optimiser": "adam",
+            "learning_rate": 1e-3,
+            "batch": 2048,
+            "collocation": "box",
+            "box_factor": 1.0,
+            "scaling": "range",
+            "transients": False,
+            "solved_output_layer": False,
+        }
+        return {name: value for name, value in papers.items() if name not in self.given_back()}
 
-class Solved(Ablation):
-    """The same, but the output layer of T by least squares, along motions from 2X, on which T is then inverted."""
+    @classmethod
+    def given_back(cls) -> set[str]:
+        """Settings that are the preset's, those of the classes before included."""
+        return {name for each in cls.__mro__ for name in vars(each).get("own", ())}
 
-    name: ClassVar[str] = "ablation-solved"
-    label: ClassVar[str] = "SPINN, T solved"
-    pipeline: ClassVar[Pipeline] = "spinn"
+
+class SPINNBySOAP(PapersSPINN):
+    """The same by SOAP."""
+
+    name: ClassVar[str] = "ablation-spinn-soap"
+    label: ClassVar[str] = "... by SOAP"
+    own: ClassVar[tuple[str, ...]] = ("optimiser", "learning_rate", "batch")
+
+
+class SmoothSPINN(SPINNBySOAP):
+    """The same with a spectrum that makes T smooth."""
+
+    name: ClassVar[str] = "ablation-spinn-spectrum"
+    label: ClassVar[str] = "... smooth T"
+    own: ClassVar[tuple[str, ...]] = ("eigenvalues", "pairs")
+
+
+class MovingSPINN(SmoothSPINN):
+    """The same along motions, most of them from 2X, instead of uniform points in X."""
+
+    name: ClassVar[str] = "ablation-spinn-motions"
+    label: ClassVar[str] = "... along motions"
+    own: ClassVar[tuple[str, ...]] = ("collocation", "box_factor")
+
+
+class ScaledSPINN(MovingSPINN):
+    """The same with states in standard deviations, and relative errors."""
+
+    name: ClassVar[str] = "ablation-spinn-scaling"
+    label: ClassVar[str] = "... relative errors"
+    own: ClassVar[tuple[str, ...]] = ("scaling",)
+
+
+class SolvedSPINN(ScaledSPINN):
+    """The same, the output layer of T solved for in the end."""
+
+    name: ClassVar[str] = "ablation-spinn-solved"
+    label: ClassVar[str] = "... output layer solved"
+    own: ClassVar[tuple[str, ...]] = ("solved_output_layer",)
+
+
+class SPINNOfAnyAge(SolvedSPINN):
+    """The same at every age and level of noise: the preset."""
+
+    name: ClassVar[str] = "ablation-spinn-transients"
+    label: ClassVar[str] = "... transients and noise"
+    own: ClassVar[tuple[str, ...]] = ("transients",)
+
+
+class AdaptiveSPINN(SPINNOfAnyAge):
+    """The preset, with points where the residual is large drawn more often."""
+
+    name: ClassVar[str] = "ablation-spinn-adaptive"
+    label: ClassVar[str] = "... adaptive points"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """One setting."""
+        return {"adaptive": True}
+
+
+class LipschitzSPINN(SPINNOfAnyAge):
+    """The preset with a penalty on the Lipschitz constant of T_inv."""
+
+    name: ClassVar[str] = "ablation-spinn-lipschitz"
+    label: ClassVar[str] = "... or Lipschitz penalty"
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """One setting."""
+        return {"lipschitz_penalty": PENALTY}
+
+
+class Solved(SPINNOfAnyAge):
+    """The preset with a T of random features, solved for by least squares."""
+
+    name: ClassVar[str] = "ablation-spinn-random"
+    label: ClassVar[str] = "... or T of random features"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """Random features in place of a trained network."""
-        return {"forward_steps": 0, "random_features": FEATURES, "box_factor": 2.0, **super().changes(task)}
+        return {"forward_steps": 0, "random_features": FEATURES}
 
 
 class Transients(Ablation):

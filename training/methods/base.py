@@ -144,7 +144,7 @@ def simulated(system: System, n: int, *, duration: float, samples: int, dt: floa
     """
     rng = generator(Stream.TRAINING, seed)
     steps = max(1, round(duration / dt))
-    ages = recording_ages(0, steps, samples)
+    ages = recording_ages(steps, samples)
     xs, ys = [], []
     for x, *_ in trajectories(system, n=n, steps=steps, dt=dt, rng=rng):
         xs.append(x[ages])

@@ -20,6 +20,9 @@ class Profile:
     eigenvalues : tuple of float, optional
         Real eigenvalues of A for an input-aware map, in 1/s; by default they follow from how fast f changes in X, see
         :func:`training.presets.eigenvalues`.
+    smooth_eigenvalues : tuple of float, optional
+        Real eigenvalues of A for a map of the paper's pipeline, fast enough for T to be smooth; by default the
+        paper's.
     settings : mapping of str to object
         Settings of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
     controller : callable
@@ -40,6 +43,7 @@ class Profile:
     """
 
     eigenvalues: tuple[float, ...] | None = None
+    smooth_eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     controller: Callable[[System], Controller] = linear_quadratic
     fault_deadline: float | None = None

@@ -15,6 +15,7 @@ from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 CHUNK = 500  # trajectories simulated at once
 RANDOM_LEAD_IN = 10.0  # seconds for which random inputs lead starts out of the training box
 CONSTANT_LEAD_IN = 20.0  # seconds for which constant ones do
+NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 
 @dataclass(frozen=True)
@@ -54,21 +55,22 @@ class Motions:
         they are random within their bounds, for RANDOM_LEAD_IN seconds.
     process_noise_share : float, default 0
         Share of the trajectories with process noise, at any level up to the system's own, high ones more often.
+    box_factor : float, default 1
+        If larger, most trajectories start in this multiple of X.
     """
 
     kinds: tuple[str, ...] = ()
     lead_in_share: float = 0.0
     lead_in_input: float = 0.0
     process_noise_share: float = 0.0
+    box_factor: float = 1.0
 
 
-def recording_ages(first: int, steps: int, n: int) -> np.ndarray:
-    """Ages at which to record trajectories.
+def recording_ages(steps: int, n: int) -> np.ndarray:
+    """Ages at which to record trajectories: half of them even in the logarithm, which catches the transient.
 
     Parameters
     ----------
-    first : int
-        The least age in samples. From 0, half of the ages are even in the logarithm, which catches the transient.
     steps : int
         The greatest age.
     n : int
@@ -77,10 +79,8 @@ def recording_ages(first: int, steps: int, n: int) -> np.ndarray:
     Returns
     -------
     ndarray of int, shape (at most n,)
-        Samples since reset, sorted, otherwise even in time.
+        Samples since reset, sorted; the other half is even in time.
     """
-    if first > 0:
-        return np.unique(np.linspace(first, steps, n).round()).astype(int)
     early = np.geomspace(1, steps, n // 2).round()
     late = np.linspace(0, steps, n - n // 2).round()
     return np.unique(np.concatenate([early, late])).astype(int)
@@ -193,6 +193,9 @@ def trajectories(
         rows, pending = pending[:CHUNK], pending[CHUNK:]
         count, led = len(rows), np.array([beyond for _, beyond in rows])
         x0 = rng.uniform(*system.box(), (count, system.nx))
+        if motions.box_factor > 1:
+            far = rng.random(count) >= NEAR
+            x0[far] = rng.uniform(*system.box(motions.box_factor), (int(far.sum()), system.nx))
         if system.nu and led.any():
             end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
             x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])

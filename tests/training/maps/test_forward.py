@@ -3,13 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from linear_system import Autonomous, sylvester
 from quadrature import backward_quadrature
 from small_runs import CPU
 
 from kkl_gym import ReverseDuffing, get_system
+from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
-from training.maps.forward import ForwardProblem, on_tensors, truncation_time
+from training.maps.forward import ForwardProblem, on_tensors, transients, truncation_time
 from training.maps.networks import Network
+from training.maps.scaling import StateScale
+from training.spectrum import Spectrum
 
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
@@ -24,8 +28,9 @@ def test_residual_is_the_pde_by_finite_differences(name):
         Network(system.nx, 3, width=16, depth=2, activation="tanh"),
         system,
         linear=linear,
-        x=x,
-        z=z,
+        pairs=(x, z),
+        points=x,
+        scale=StateScale.of(x, "relative"),
         physics_weight=1.0,
         batch=64,
         device=CPU,
@@ -69,3 +74,67 @@ def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature():
     truth = np.array([backward_quadrature(point, eigenvalues) for point in x])
     error = artifact.forward(x) - truth
     assert np.sqrt((error**2).mean()) < 2e-2 * np.sqrt((truth**2).mean())
+
+
+def problem_of_the_oscillator(**options):
+    """An untrained T of the linear oscillator, with exact pairs."""
+    system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.01)
+    x = np.random.default_rng(0).uniform(-1, 1, (3000, 2))
+    exact = sylvester(linear.A, linear.B)
+    torch.manual_seed(0)
+    problem = ForwardProblem(
+        Network(2, 3, width=40, depth=2, activation="tanh"),
+        system,
+        linear=linear,
+        pairs=(x, x @ exact.T),
+        points=x,
+        scale=StateScale.of(x, "relative"),
+        physics_weight=0.1,
+        batch=256,
+        device=CPU,
+        **options,
+    )
+    return problem, exact
+
+
+def test_solved_output_layer_minimises_the_risk_over_it():
+    problem, exact = problem_of_the_oscillator()
+    problem.solve_output_layer(np.random.default_rng(0))
+    x = np.random.default_rng(1).uniform(-1, 1, (500, 2))
+    expected = x @ exact.T
+    assert np.abs(problem.forward_map()(x) - expected).max() < 2e-3 * np.abs(expected).max()
+
+    def risk():
+        return problem.loss(torch.Generator().manual_seed(1))["loss"].item()
+
+    least, last = risk(), problem.network.linear_layers()[-1]
+    for _ in range(3):
+        with torch.no_grad():
+            step = 3e-3 * torch.randn(last.weight.shape)
+            last.weight += step
+            assert risk() > least
+            last.weight -= step
+
+
+def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_mean():
+    problem, _ = problem_of_the_oscillator(adaptive=True)
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.cat([problem._drawn(generator) for _ in range(400)])
+    with torch.no_grad():
+        size = problem._weighted_residual(problem._points).norm(dim=-1).numpy()
+    drawn = np.bincount(rows.numpy(), minlength=len(size))
+    strong, weak = size > np.quantile(size, 0.9), size < np.quantile(size, 0.1)
+    expected = (size[strong] + size.mean()).mean() / (size[weak] + size.mean()).mean()
+    assert expected > 1.5
+    assert drawn[strong].mean() / drawn[weak].mean() == pytest.approx(expected, rel=0.05)
+
+
+def test_filter_state_from_T_and_what_is_left_of_its_start():
+    system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.001)
+    ages = np.array([0, 1, 100, 1000])
+    x = simulate(system, np.random.default_rng(0).uniform(-1, 1, (5, 2)), 1000, 0.001)
+    simulated = linear.run(system.output(x), np.zeros((1000, 5, 0)), ages)
+    T = x[ages] @ sylvester(linear.A, linear.B).T
+    found = transients(T, simulated[0], linear=linear, ages=ages)
+    assert np.abs(T[1] - simulated[1]).max() > 0.1  # the start is far from T
+    np.testing.assert_allclose(found, simulated, atol=1e-6)

@@ -14,6 +14,7 @@ from observers import ForwardMap
 from training.maps.forward import ForwardProblem
 from training.maps.networks import Network, from_mlp
 from training.maps.pde import along, on_tensors, residual
+from training.maps.scaling import StateScale
 from training.maps.smooth import Smooth, encoder
 from training.maps.smooth import residual as residual_of
 
@@ -82,8 +83,9 @@ def test_the_residual_is_the_same_in_training_and_in_a_certificate():
         Network(3, linear.size, width=16, depth=2, activation="tanh"),
         system,
         linear=linear,
-        x=x,
-        z=rng.normal(size=(50, linear.size)),
+        pairs=(x, rng.normal(size=(50, linear.size))),
+        points=x,
+        scale=StateScale.of(x, "relative"),
         physics_weight=1.0,
         batch=64,
         device=torch.device("cpu"),
@@ -91,7 +93,7 @@ def test_the_residual_is_the_same_in_training_and_in_a_certificate():
     found, speed = problem.residual(torch.as_tensor(x, dtype=torch.float32))
     expected = residual_of(dataclasses.replace(artifact, forward=problem.forward_map()), system, x)
     np.testing.assert_allclose(found.detach(), expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
-    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.x_scale, axis=1), rtol=1e-5)
+    np.testing.assert_allclose(speed, np.linalg.norm(system.drift(x) / problem.scale.scale, axis=1), rtol=1e-5)
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])

@@ -85,10 +85,10 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
     inputs, x, _, _ = sampler(torch.Generator().manual_seed(0))
     network, artifact = untrained(sampler, linear)
     with torch.no_grad():
-        x_hat = network(inputs).numpy() * sampler.x_scale + sampler.x_offset
+        x_hat = network(inputs).numpy() * sampler.scale.scale + sampler.scale.offset
     observer = KKLObserver(artifact, measurement_noise=0.0)
     for row in (torch.nonzero(inputs[:, -2] == 0)[::500, 0]).tolist():
-        state = x[row].numpy() * sampler.x_scale + sampler.x_offset
+        state = x[row].numpy() * sampler.scale.scale + sampler.scale.offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
@@ -102,9 +102,9 @@ def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler
     network, artifact = untrained(sampler, linear)
     assert artifact.inverse.features == ("z_y", "z_u", "measurement_noise", "process_noise", "age")
     with torch.no_grad():
-        x_hat = network(inputs).numpy() * sampler.x_scale + sampler.x_offset
+        x_hat = network(inputs).numpy() * sampler.scale.scale + sampler.scale.offset
     for row in (torch.nonzero(inputs[:, -3] == 0)[::50, 0]).tolist():  # without measurement noise
-        state = x[row].numpy() * sampler.x_scale + sampler.x_offset
+        state = x[row].numpy() * sampler.scale.scale + sampler.scale.offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         level = data.process_noise[trajectory]
         observer = KKLObserver(artifact, 0.0, process_noise=level)

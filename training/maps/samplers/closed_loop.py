@@ -26,19 +26,21 @@ class ClosedLoopSampler:
 
     Attributes
     ----------
+    coordinates : Coordinates
+        In which the network sees z.
     cells : int
         Number of cells of like samples, those of the two halves apart.
     """
 
     def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
-        self.open_loop = open_loop
+        self.open_loop, self.coordinates = open_loop, open_loop.coordinates
         coordinates, gain = open_loop.coordinates, open_loop.coordinates.noise_gain
         shrink = 1.0 + (data.measurement_noise[:, None] * gain) ** 2
         self._modes = tensor(coordinates(data.z) / shrink, device)
-        self._x = tensor((data.x - open_loop.x_offset) / open_loop.x_scale, device)
+        self._x = tensor(open_loop.scale(data.x), device)
         self._level = tensor(np.log1p(data.measurement_noise / MEASUREMENT_NOISE_UNIT), device)
         self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / AGE_UNIT), device)
-        self._weight = open_loop.weight(data.x, device)
+        self._weight = tensor(open_loop.scale.weight(data.x), device)
         self._age_cell = open_loop.age_cell(data.ages, device)
         position = (
             np.log10(np.maximum(data.measurement_noise / open_loop.measurement_noise_max, 1e-9)) / 2 + 1

@@ -7,10 +7,12 @@ import numpy as np
 import torch
 
 from observers import InverseMap, LinearFilter
+from training.config import Scaling
 from training.filter_noise import noise_covariance, root, stationary_covariance
 from training.maps.coordinates import coordinates, settling_time
 from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
+from training.maps.scaling import StateScale
 from training.trajectories.record import Trajectories
 
 MEASUREMENT_NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
@@ -48,13 +50,17 @@ class TrajectorySampler:
     process_noise_max : float, default 0
         If positive, the network is told the level of process noise as well, up to this one, in multiples of the
         system's scale per second.
+    error : ndarray, shape (size, size), optional
+        Covariance of an error of z that is there at every noise level, where z comes from a learned T.
+    scaling : {"relative", "range"}, default "relative"
+        Of states and their errors, see :class:`training.maps.scaling.StateScale`.
 
     Attributes
     ----------
     coordinates : Coordinates
         In which the network sees z.
-    x_offset, x_scale : ndarray, shape (nx,)
-        Mean and standard deviation of the states.
+    scale : StateScale
+        Of the states.
     age_max : float
         Seconds since reset beyond which the network is told no difference.
     cells : int
@@ -77,13 +83,14 @@ class TrajectorySampler:
         noise_free_share: float = 0.2,
         high_noise_emphasis: float = 2.0,
         process_noise_max: float = 0.0,
+        error: np.ndarray | None = None,
+        scaling: Scaling = "relative",
     ) -> None:
         m, n, size = data.z.shape
         rows = np.random.default_rng(0).permutation(m * n)[:100_000]
         self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], stationary_covariance(linear))
         gain = self.coordinates.noise_gain
-        self.x_offset = data.x.mean((0, 1))
-        self.x_scale = data.x.std((0, 1))
+        self.scale = StateScale.of(data.x, scaling)
         self.measurement_noise_max, self.process_noise_max = measurement_noise_max, process_noise_max
         self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
@@ -91,14 +98,16 @@ class TrajectorySampler:
         self._modes = torch.empty((m, n, len(gain)), device=device)
         for i in range(m):
             self._modes[i] = tensor(self.coordinates(data.z[i]), device)
-        self._x = tensor((data.x - self.x_offset) / self.x_scale, device)
-        self._weight = self.weight(data.x, device)
+        self._x = tensor(self.scale(data.x), device)
+        self._weight = tensor(self.scale.weight(data.x), device)
         self._gain = tensor(gain, device)
         # Noise in units of the stationary one, so that its covariances are well conditioned.
         unit = self.coordinates.whiten / np.where(gain > 0, gain, 1.0)[:, None]
         late = int(np.ceil(2 * settling_time(linear) / linear.dt))
         saturated = np.minimum(data.ages, late)
         self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
+        whiten = self.coordinates.whiten
+        self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
         self._age = tensor(data.ages * linear.dt, device)
         self._oldest = data.ages[-1]
         self._age_cell = self.age_cell(data.ages, device)
@@ -124,6 +133,8 @@ class TrajectorySampler:
         white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)
         noise = white @ self._noise_root[ages[:, 0]].mT
         modes = self._modes[ages, rows] + level * self._gain * noise
+        if self._error_root is not None:
+            modes = modes + torch.randn(modes.shape, generator=generator, device=device) @ self._error_root.mT
         modes = modes / (1.0 + (level * self._gain) ** 2)
         conditions = [torch.log1p(level / MEASUREMENT_NOISE_UNIT)]
         if self.process_noise_max:
@@ -150,11 +161,6 @@ class TrajectorySampler:
         """Number of the cell where those of age, measurement noise and process noise meet."""
         return (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
 
-    def weight(self, x: np.ndarray, device: torch.device) -> torch.Tensor:
-        """Of states (..., nx) in the loss: errors count relative to the state's size."""
-        nx = x.shape[-1]
-        return tensor(nx / (((x / self.x_scale) ** 2).sum(-1) + 0.1 * nx), device)
-
     def age_cell(self, ages: np.ndarray, device: torch.device) -> torch.Tensor:
         """Cells of ages in samples."""
         position = np.log1p(ages) / np.log1p(self._oldest)
@@ -175,8 +181,8 @@ class TrajectorySampler:
             z_offset=self.coordinates.offset,
             whiten=self.coordinates.whiten,
             noise_gain=self.coordinates.noise_gain,
-            x_offset=self.x_offset,
-            x_scale=self.x_scale,
+            x_offset=self.scale.offset,
+            x_scale=self.scale.scale,
             measurement_noise_unit=MEASUREMENT_NOISE_UNIT,
             measurement_noise_max=self.measurement_noise_max,
             process_noise_unit=PROCESS_NOISE_UNIT * self.process_noise_max or 1.0,

@@ -1,0 +1,63 @@
+"""How states are scaled for networks, and how their errors are weighed."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from training.config import Scaling
+
+LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smaller states are not taken relative
+
+
+@dataclass(frozen=True)
+class StateScale:
+    """Scaled states are (x - offset) / scale.
+
+    Parameters
+    ----------
+    offset : ndarray, shape (nx,)
+        Mean of the states, or the middle of their range.
+    scale : ndarray, shape (nx,)
+        Their standard deviation, or half their range; 1 where that is 0.
+    relative : bool
+        Whether errors count relative to the state's size.
+    """
+
+    offset: np.ndarray
+    scale: np.ndarray
+    relative: bool
+
+    @classmethod
+    def of(cls, x: np.ndarray, scaling: Scaling) -> Self:
+        """Find the scale of some states.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., nx)
+            The states.
+        scaling : {"relative", "range"}
+            As in a configuration.
+
+        Returns
+        -------
+        StateScale
+            Theirs.
+        """
+        axes = tuple(range(x.ndim - 1))
+        if scaling == "relative":
+            offset, scale = x.mean(axes), x.std(axes)
+        else:
+            low, high = x.min(axes), x.max(axes)
+            offset, scale = (low + high) / 2, (high - low) / 2
+        return cls(offset, np.where(scale > 0, scale, 1.0), scaling == "relative")
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Scale states (..., nx)."""
+        return np.asarray((x - self.offset) / self.scale)
+
+    def weight(self, x: np.ndarray) -> np.ndarray:
+        """Of the errors at states (..., nx), (...,)."""
+        if not self.relative:
+            return np.ones(x.shape[:-1])
+        return np.asarray(1.0 / (((x / self.scale) ** 2).mean(-1) + LEAST))
