@@ -42,7 +42,7 @@ maps: $(VENV)/ready  ## train the shipped maps of both versions again, three hou
 results: $(VENV)/ready  ## the figures and the accuracy in the README and in docs/
 	$(BIN)/kkl-gym demo --out docs/figures
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 

@@ -8,6 +8,7 @@ import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +206,15 @@ class _Run:
         sampler = self.along(self.simulate(unforced, f"{self.system.name}, free", motions), unforced)
         return sampler.inverse_map(self.fit_inverse("free", sampler), unforced)
 
+    @cached_property
+    def settled(self) -> np.ndarray:
+        """Which of the recorded ages the filter's start no longer matters at."""
+        config = self.config
+        first = truncation_step(
+            self.system, self.linear, steps=self.steps, epsilon=config.truncation, box_factor=config.box_factor
+        )
+        return np.asarray(self.ages >= first)
+
     def points(self, trajectories: Trajectories) -> np.ndarray:
         """States at which T's equation is asked to hold, and x' where there are no transients: (n, nx)."""
         x = trajectories.x.reshape(-1, self.system.nx)
@@ -218,15 +228,13 @@ class _Run:
             forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
             report(1)
             return forward
-        settled = trajectories.ages >= truncation_step(
-            system, linear, steps=self.steps, epsilon=config.truncation, box_factor=config.box_factor
-        )
+        late = self.settled
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
         problem = ForwardProblem(
             network,
             system,
             linear=linear,
-            pairs=(trajectories.x[settled].reshape(-1, system.nx), trajectories.z[settled].reshape(-1, linear.size)),
+            pairs=(trajectories.x[late].reshape(-1, system.nx), trajectories.z[late].reshape(-1, linear.size)),
             points=points,
             scale=StateScale.of(points, config.scaling),
             physics_weight=config.physics_weight,
@@ -246,7 +254,7 @@ class _Run:
         linear = self.linear
         T_x = np.stack([forward(x) for x in trajectories.x])
         z = transients(T_x, trajectories.z[0], linear=linear, ages=self.ages)
-        error = (trajectories.z - z).reshape(-1, linear.size)
+        error = (trajectories.z - z)[self.settled].reshape(-1, linear.size)
         if self.config.transients:
             return self.along(dataclasses.replace(trajectories, z=z), linear, error.T @ error / len(error))
         T, config, device = on_torch(forward, self.device), self.config, self.device

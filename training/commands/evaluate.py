@@ -24,7 +24,8 @@ class Evaluate:
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
     after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines. Observers are
     told the levels of noise if they can use them. Trajectories that leave the system's declared bounds are counted, and
-    left out.
+    left out. The column "driven" is there for observers that take inputs, "process noise" where there is any; the CSV
+    file always has both.
     """
 
     observers: Observers
@@ -76,15 +77,17 @@ class Evaluate:
         return found
 
     def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> pd.DataFrame:
-        suffix = f", process noise {self.process_noise:g}" if self.process_noise else ""
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
             cases.append(("X", "X", True))
-        table = Table(
-            title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s{suffix}"
-        )
+        table = Table(title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s")
         table.add_column("starts")
-        for column in ("noise", "all steps", "after transient", "escaped"):
+        if artifact.nu:
+            table.add_column("driven")
+        process = [f"{self.process_noise:g}"] if self.process_noise else []
+        if process:
+            table.add_column("process\nnoise", justify="right")
+        for column in ("noise\non y", "all steps", "after transient", "escaped"):
             table.add_column(column, justify="right")
         frames = []
         for starts, domain, driven in cases:
@@ -107,8 +110,8 @@ class Evaluate:
                     seed=self.seed,
                     skip=min(5.0, self.duration / 2) if driven else None,
                 )
-                label = f"{starts}, driven" if driven else starts
-                table.add_row(label, f"{level:g}", spread(found.full), spread(found.late), str(found.escaped))
+                case = [starts, *(["yes" if driven else "no"] if artifact.nu else []), *process, f"{level:g}"]
+                table.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
                 columns = {
                     "observer": name,
                     "starts": starts,
