@@ -6,7 +6,9 @@ import json
 import math
 import platform
 import time
-from collections.abc import Callable
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -56,10 +58,13 @@ class Result:
         The observer; nothing has written it to a file.
     losses : dict of str to list of (int, float)
         For each stage that trained a network, its error after so many batches.
+    seconds : dict of str to float
+        What each of these stages took, and "simulating".
     """
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
+    seconds: dict[str, float]
 
 
 def train(
@@ -139,7 +144,7 @@ def train(
             both = run.close_the_loop(sampler, artifact, feedback)
             run.fit("closed-loop", inverse, both)
             artifact = run.artifact(both.inverse_map(inverse, run.linear), forward, free)
-    return Result(artifact, run.losses)
+    return Result(artifact, run.losses, run.seconds)
 
 
 @dataclass
@@ -155,6 +160,7 @@ class _Run:
     log: Log | None
     identity: dict[str, Any]
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
 
     def __post_init__(self) -> None:
         system, config = self.system, self.config
@@ -177,9 +183,10 @@ class _Run:
             motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
         )
         n, steps = config.trajectories, self.steps
-        return record(
-            self.system, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
-        )
+        with self.timed("simulating"):
+            return record(
+                self.system, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
+            )
 
     def along(
         self, trajectories: Trajectories, linear: LinearFilter, error: np.ndarray | None = None
@@ -308,7 +315,15 @@ class _Run:
             cpu_seconds=seconds,
             optimiser=config.optimiser,
         )
-        self.losses[name] = optimise(stage, problem, problem.loss, self.progress, log=self.log, resume=self.resume)
+        with self.timed(name):
+            self.losses[name] = optimise(stage, problem, problem.loss, self.progress, log=self.log, resume=self.resume)
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Adds what happens inside to the seconds of a stage."""
+        began = time.monotonic()
+        yield
+        self.seconds[name] += time.monotonic() - began
 
     def artifact(self, inverse: InverseMap, forward: ForwardMap | None, free: InverseMap | None) -> Artifact:
         """The observer, with how it was made."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 import torch
 import tyro
 from rich.console import Console
+from rich.table import Table
 
 from kkl_gym.systems import get_system
 from training.config import Config, Pipeline, override, read_changes, setting_types
@@ -32,6 +33,8 @@ def _options() -> type[Any]:
 
 
 if TYPE_CHECKING:
+    from training.dry_run import Estimate
+
     Settings = Any
 else:
     Settings = _options()
@@ -69,11 +72,14 @@ class Train:
     """CPU threads."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
+    dry_run: bool = False
+    """Train nothing; say what it would take on this machine, by a few batches of the same sizes."""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
     """What of the preset's configuration is to differ."""
 
-    def run(self, console: Console) -> Path:
-        """Train; returns the artifact's path."""
+    def run(self, console: Console) -> Path | None:
+        """Train; returns the artifact's path, None if the run is a dry one."""
+        from training.dry_run import estimate
         from training.evaluation.calibration import calibrate
         from training.evaluation.report import write_report
         from training.pipeline import train
@@ -95,6 +101,10 @@ class Train:
         name += "-closed-loop" if config.closed_loop_trajectories else ""
         folder = self.out or Path("runs") / name
         device = None if self.device == "auto" else torch.device(self.device)
+        if self.dry_run:
+            with console.status("timing a few batches"):
+                console.print(expected(config, estimate(system, config, device=device)))
+            return None
         result = train(system, config, folder, resume=self.resume, device=device, console=console)
         path = folder / f"{name}.safetensors"
         result.artifact.save(path)  # before anything else may fail
@@ -110,3 +120,43 @@ class Train:
         write_report(folder / "report.png", result, system)
         console.print(f"wrote {folder / 'report.png'}")
         return path
+
+
+def expected(config: Config, found: "Estimate") -> Table:
+    """What a run will take, stage by stage.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    found : Estimate
+        What was estimated.
+
+    Returns
+    -------
+    Table
+        For the console.
+    """
+    batches = {"forward": config.forward_steps}
+    table = Table(
+        "stage",
+        "size",
+        "time",
+        title=f"{found.pairs:,} states, {found.parameters:,} weights, about {found.bytes / 1e9:.1f} GB of memory",
+    )
+    for stage, seconds in found.seconds.items():
+        size = f"{batches.get(stage, config.inverse_steps):,} batches of {config.batch:,}"
+        if stage == "simulating":
+            size = f"{config.trajectories:,} trajectories of {config.duration:g} s"
+        table.add_row(stage, size, duration(seconds))
+    table.add_section()
+    table.add_row("all", "", duration(sum(found.seconds.values())))
+    return table
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people say them: 40 s, 12 min, 3.5 h, 2.1 days."""
+    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400), ("h", 3600, 48 * 3600)):
+        if seconds < limit:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{seconds / 86400:.3g} days"

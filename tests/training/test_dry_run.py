@@ -1,0 +1,47 @@
+"""What a run will take."""
+
+import numpy as np
+from linear_system import Oscillator
+from small_runs import CPU, toy
+
+import training.dry_run
+from training.cli import main
+from training.dry_run import estimate
+from training.pipeline import Result, train
+
+
+def test_times_grow_with_batches_and_trajectories(monkeypatch):
+    """On runs whose times are known: 2 s for everything else, 0.1 s a batch, 3 s for simulating."""
+
+    def timed(system, config, folder, *, device):
+        result = train(system, config, folder, device=device)
+        batches = {"forward": config.forward_steps, "inverse": config.inverse_steps}
+        seconds = {stage: 2.0 + 0.1 * batches[stage] for stage in result.losses} | {"simulating": 3.0}
+        return Result(result.artifact, result.losses, seconds)
+
+    monkeypatch.setattr(training.dry_run, "train", timed)
+    monkeypatch.setattr(training.dry_run, "CHUNK", 20)
+    config = toy(Oscillator(), "spinn", trajectories=60, duration=20.0, forward_steps=1000, inverse_steps=4000)
+    found = estimate(Oscillator(), config, device=CPU)
+    assert {name: round(value, 6) for name, value in found.seconds.items()} == {
+        "simulating": 9.0,
+        "forward": 102.0,
+        "inverse": 402.0,
+    }
+    assert found.pairs == 60 * len(
+        np.unique(np.r_[np.geomspace(1, 2000, 20).round(), np.linspace(0, 2000, 20).round()])
+    )
+    T = (2 * 16 + 16) + (16 * 16 + 16) + (16 * 5 + 5)
+    T_inv = (5 + 2) * 16 + 16 + (16 * 16 + 16) + (16 * 2 + 2)
+    assert found.parameters == T + T_inv
+    assert found.bytes > training.dry_run.PROGRAM
+
+
+def test_a_dry_run_says_what_the_papers_sizes_take_and_writes_nothing(tmp_path, capsys):
+    sizes = ["--trajectories", "5", "--duration", "12", "--width", "16", "--batch", "64", "--samples", "50"]
+    out = ["--out", str(tmp_path / "run")]
+    main(["train", "reverse_duffing", "--pipeline", "spinn", "--preset", "paper", "--dry-run", *sizes, *out])
+    text = capsys.readouterr().out
+    assert "146,484 batches of 64" in text
+    assert "5 trajectories of 12 s" in text
+    assert not (tmp_path / "run").exists()

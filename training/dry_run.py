@@ -1,0 +1,92 @@
+"""What a training run will take, before it is started: ``kkl-gym train --dry-run``."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import torch
+
+from kkl_gym.system import System
+from training.config import Config
+from training.pipeline import Result, train
+from training.trajectories.record import CHUNK, recording_ages
+
+FEW, MORE = 10, 50  # batches of the two short runs whose difference is timed
+# Arrays that exist at once in the largest stage, as counted in training/pipeline.py: those of states in NumPy and in
+# torch, and those of the filter's states.
+STATES, TORCH_STATES, FILTER_STATES, TORCH_FILTER_STATES = 3, 3, 5, 2
+PROGRAM = 0.5e9  # bytes of Python, torch and one chunk of trajectories
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a run will take.
+
+    Parameters
+    ----------
+    pairs : int
+        States that are recorded, each with the filter's beside it.
+    parameters : int
+        Weights of all networks.
+    bytes : float
+        Memory, roughly.
+    seconds : dict of str to float
+        Of each stage, at the speed that short runs had on this machine.
+    """
+
+    pairs: int
+    parameters: int
+    bytes: float
+    seconds: dict[str, float]
+
+
+def estimate(system: System, config: Config, *, device: torch.device | None = None) -> Estimate:
+    """Estimate a run by short ones of the same sizes: a few trajectories and batches.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    config : Config
+        Of the run.
+    device : torch.device, optional
+        As for :func:`training.train`.
+
+    Returns
+    -------
+    Estimate
+        Monitor and report aside.
+
+    Raises
+    ------
+    ValueError
+        As :func:`training.train`.
+    """
+    few, more = (_short_run(system, config, batches=batches, device=device) for batches in (FEW, MORE))
+    seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
+    for stage in few.losses:
+        batches = config.forward_steps if stage == "forward" else config.inverse_steps
+        seconds[stage] = few.seconds[stage] + (batches - FEW) * (more.seconds[stage] - few.seconds[stage]) / (MORE - FEW)
+    pairs = config.trajectories * len(recording_ages(max(1, round(config.duration / config.dt)), config.samples))
+    size = few.artifact.filter.size
+    maps = (few.artifact.inverse, few.artifact.free_inverse, few.artifact.forward)
+    return Estimate(
+        pairs=pairs,
+        parameters=sum(part.size for found in maps if found for part in (*found.mlp.weights, *found.mlp.biases)),
+        bytes=PROGRAM
+        + pairs * (system.nx * (8 * STATES + 4 * TORCH_STATES) + size * (8 * FILTER_STATES + 4 * TORCH_FILTER_STATES)),
+        seconds=seconds,
+    )
+
+
+def _short_run(system: System, config: Config, *, batches: int, device: torch.device | None) -> Result:
+    """The same with few batches, on no more trajectories than are simulated at once."""
+    short = replace(
+        config,
+        trajectories=min(CHUNK, config.trajectories),
+        forward_steps=min(batches, config.forward_steps),
+        inverse_steps=batches,
+        closed_loop_trajectories=min(CHUNK, config.closed_loop_trajectories),
+    )
+    with TemporaryDirectory() as folder:
+        return train(system, short, Path(folder), device=device)
