@@ -66,7 +66,9 @@ def estimate(system: System, config: Config, *, device: torch.device | None = No
     seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
     for stage in few.losses:
         batches = config.forward_steps if stage == "forward" else config.inverse_steps
-        seconds[stage] = few.seconds[stage] + (batches - FEW) * (more.seconds[stage] - few.seconds[stage]) / (MORE - FEW)
+        seconds[stage] = few.seconds[stage] + (batches - FEW) * (more.seconds[stage] - few.seconds[stage]) / (
+            MORE - FEW
+        )
     pairs = config.trajectories * len(recording_ages(max(1, round(config.duration / config.dt)), config.samples))
     size = few.artifact.filter.size
     maps = (few.artifact.inverse, few.artifact.free_inverse, few.artifact.forward)

@@ -10,6 +10,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from training.config import Config, Pipeline, override
+from training.smoothness import smooth_spectrum
 from training.spectrum import evenly_spaced, papers_spectrum, typical_rate
 from training.systems import profile
 
@@ -73,10 +74,11 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
             solved_output_layer=False,
             transients=False,
         )
-    chosen = profile(system).smooth_eigenvalues or papers_spectrum(system)
-    return Config(
-        pipeline, tuple(np.round(chosen, 6).tolist()), box_factor=2.0, forward_steps=10_000, noise_free_share=0.35
-    )
+    chosen = profile(system).smooth_eigenvalues
+    if chosen is None:
+        chosen = smooth_spectrum(system, Config.dt).eigenvalues
+    smooth = tuple(np.round(chosen, 6).tolist())
+    return Config(pipeline, smooth, box_factor=2.0, forward_steps=10_000, adaptive=True, noise_free_share=0.35)
 
 
 def eigenvalues(system: System) -> tuple[float, ...]:

@@ -15,10 +15,12 @@ from rich.table import Table
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.storage import replacing, write
+from training.config import Pipeline
 from training.presets import preset
 from training.progress import progress_bars
 from training.spectrum import Spectrum, papers_spectrum
 from training.tuning.check import rank_correlation, settings, trained_error
+from training.tuning.intervals import judge
 from training.tuning.probe import Choice, Probe
 
 if TYPE_CHECKING:
@@ -34,16 +36,19 @@ class Tune:
 
     Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`: the real modes of the system's default and
     what adds most to them. front.csv and front.png show the predicted error against the number of modes chosen anew,
-    for this noise and others. docs/tuning.md says what the prediction rests on.
+    for this noise and others. For spinn it chooses an interval of real eigenvalues for which T is smooth, and writes
+    intervals.csv instead. docs/tuning.md says what the prediction rests on.
     """
 
     system: tyro.conf.Positional[str]
     """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    pipeline: Pipeline = "input-aware"
+    """What is to be trained with the spectrum, as for `kkl-gym train`."""
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y."""
     modes: int = 21
     """Most modes for each output. They cost time in every step, and training. Below the number of the default's real
-    ones, all are chosen anew."""
+    ones, all are chosen anew. spinn has 2 nx + 1."""
     dt: float = 0.01
     """Sampling interval in seconds."""
     duration: float = 50.0
@@ -55,7 +60,7 @@ class Tune:
     check: float | None = None
     """Also train an observer for some of the spectra, for this many CPU seconds each, and compare what they leave with
     what was predicted: check.csv."""
-    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/tuning/SYSTEM-NOISE)")] = None
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/tuning/NAME-NOISE)")] = None
     """Folder for what is written."""
 
     def run(self, console: Console) -> Choice:
@@ -82,18 +87,39 @@ class Tune:
             )
         if self.check is not None and not 0 < self.check < np.inf:
             raise ValueError(f"check = {self.check} must be a positive number of seconds")
+        if self.check is not None and self.pipeline == "spinn":
+            raise ValueError("check trains input-aware maps: it must be left out with --pipeline spinn")
         system = get_system(self.system, self.parameters)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
-        name = f"{system.name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
-        folder = self.out or Path("runs") / "tuning" / name
+        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
+        folder = self.out or Path("runs") / "tuning" / f"{name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
+        again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
+        again += f" --pipeline {self.pipeline}" if self.pipeline != "input-aware" else ""
+        again += f" --parameters{given}" if given else ""
+        if self.pipeline == "spinn":
+            return self._intervals(system, console, folder=folder, again=again)
         found = self._compare(system, console)
         console.print(found.table())
         found.save(folder, {"dt": self.dt})
-        again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
-        again += f" --parameters{given}" if given else ""
         console.print(f"wrote config.json, front.csv and front.png in {folder}; to train an observer with it:\n{again}")
         if self.check is not None:
             self._check(console, found, folder)
+        return found.best
+
+    def _intervals(self, system: System, console: Console, *, folder: Path, again: str) -> Choice:
+        """Judge intervals for a physics-informed map, print and write."""
+        with console.status(f"following motions of {system.name}"):
+            found = judge(
+                system, self.dt, duration=self.duration, measurement_noise=self.measurement_noise, seed=self.seed
+            )
+        console.print(found.table(f"{system.name}, measurement noise {self.measurement_noise:g}"))
+        found.save(folder, self.dt)
+        if not any(one.smooth for one in found.smoothness):
+            console.print("[yellow]no interval makes T smooth;[/yellow] the written one comes closest")
+        best, papers = found.best.spectrum.eigenvalues, papers_spectrum(system)
+        if best[0] > papers[0] or best[-1] < papers[-1]:
+            console.print(f"the written interval lies outside the paper's, [{papers[-1]:g}, {papers[0]:g}]")
+        console.print(f"wrote config.json and intervals.csv in {folder}; to train an observer with it:\n{again}")
         return found.best
 
     def _compare(self, system: System, console: Console) -> "_Found":

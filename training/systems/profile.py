@@ -21,8 +21,8 @@ class Profile:
         Real eigenvalues of A for an input-aware map, in 1/s; by default they follow from how fast f changes in X, see
         :func:`training.presets.eigenvalues`.
     smooth_eigenvalues : tuple of float, optional
-        Real eigenvalues of A for a map of the paper's pipeline, fast enough for T to be smooth; by default the
-        paper's.
+        Real eigenvalues of A for a map of the paper's pipeline, fast enough for T to be smooth; by default they follow
+        from motions, see :func:`training.smoothness.smooth_spectrum`.
     settings : mapping of str to object
         Settings of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
     controller : callable

@@ -1,0 +1,166 @@
+"""How smooth T is, judged by the z of neighbouring states."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from linear_system import Oscillator
+
+import training.smoothness
+from kkl_gym import get_system
+from training.smoothness import Smoothness, intervals, smooth_spectrum, smoothest, smoothness
+from training.spectrum import Spectrum, evenly_spaced, papers_spectrum, typical_rate
+
+
+def judged(system, *spectra, dt=0.05, **options):
+    return list(smoothness(system, spectra, dt, **options))
+
+
+def test_a_linear_map_is_as_rough_as_its_neighbours_are_far():
+    """Motions are circles, so z = m x varies along each direction alike: |dz| / std(z) is |dx| / std(x)."""
+    slow, fast = judged(Oscillator(), Spectrum((-0.5, -1.0)), Spectrum((-2.0,), ((-1.5, 1.0),)))
+    for one in (slow, fast):
+        assert one.smooth
+        np.testing.assert_allclose(one.roughness, one.distance, rtol=0.05)
+        np.testing.assert_allclose(one.exponent, 1.0, atol=0.05)
+    assert (slow.roughness.shape, fast.roughness.shape) == ((2,), (3,))
+
+
+def test_slow_modes_of_a_chaotic_system_are_rough():
+    system = get_system("lorenz")
+    papers, fast = judged(system, Spectrum(papers_spectrum(system)), Spectrum(evenly_spaced(7, -10.0, -40.0)), dt=0.01)
+    assert not papers.smooth
+    assert (np.diff(papers.roughness) < 0).all()  # the slowest most
+    assert papers.roughness[0] > 20 * papers.distance
+    assert papers.exponent.max() < 0.4
+    assert fast.smooth
+    assert fast.roughness.max() < 1.2 * fast.distance
+
+
+def test_differences_that_do_not_fall_with_distance(monkeypatch):
+    """Filter states that are no function of x have exponent 0, and are rough by the root of two."""
+    rng = np.random.default_rng(0)
+    x, known = rng.normal(size=(40, 300, 2)), np.ones((40, 300), dtype=bool)
+    z = np.concatenate([rng.normal(size=(40, 300, 1)), x[..., :1] - 3.0 * x[..., 1:]], axis=-1)
+    found = training.smoothness._compared(Oscillator(), Spectrum((-1.0, -2.0)), x=x, z=z, known=known)
+    assert found.roughness[0] == pytest.approx(np.sqrt(2.0), rel=0.05)
+    np.testing.assert_allclose(found.exponent, [0.0, 1.0], atol=0.05)
+
+
+@dataclass(frozen=True)
+class Large(Oscillator):
+    """The oscillator in units a thousandth as large, about a point far from the origin."""
+
+    name = "large"
+    X = ((9000, 11000), (19000, 21000))
+    bounds = ((-50000, 70000), (-50000, 70000))
+
+    def f(self, x):
+        return x[1] - 20000.0, -(x[0] - 10000.0)
+
+    def h(self, x):
+        return (x[0] - 10000.0,)
+
+
+def test_units_and_the_place_of_the_origin_do_not_matter():
+    spectrum = Spectrum((-0.5, -1.0))
+    (small,), (large,) = (judged(system, spectrum, box_factor=1.0) for system in (Oscillator(), Large()))
+    assert large.distance == pytest.approx(small.distance, rel=1e-3)
+    np.testing.assert_allclose(large.roughness, small.roughness, rtol=1e-3)
+    np.testing.assert_allclose(large.exponent, small.exponent, rtol=1e-3)
+
+
+@dataclass(frozen=True)
+class Constant(Oscillator):
+    """Has a second output that tells nothing."""
+
+    name = "constant"
+
+    def h(self, x):
+        return x[0], 5.0 + 0.0 * x[0]
+
+
+def test_a_constant_output_is_no_rougher_than_any():
+    (found,) = judged(Constant(), Spectrum((-0.5, -1.0)))
+    assert found.smooth
+    np.testing.assert_allclose(found.roughness[2:], 0.0, atol=1e-6)
+
+
+def test_intervals_follow_the_rate_up_to_what_dt_resolves():
+    system = Oscillator()
+    found = intervals(system, 0.01)
+    rate = typical_rate(system)
+    ends = np.array([(one.eigenvalues[0], one.eigenvalues[-1]) for one in found])
+    assert ends[0, 0] == pytest.approx(-rate / 6, rel=1e-5)
+    np.testing.assert_allclose(ends[:, 1] / ends[:, 0], 4.0, rtol=1e-5)
+    np.testing.assert_allclose(ends[1:, 0] / ends[:-1, 0], np.sqrt(2.0), rtol=0.01)
+    assert ends[-1, 0] == pytest.approx(-8 * rate, rel=1e-5)
+    assert {one.modes for one in found} == {5}
+    coarse = intervals(system, 0.2)
+    assert -0.5 / 0.2 * (1 + 1e-5) < coarse[-1].eigenvalues[-1] < coarse[0].eigenvalues[-1]
+    assert intervals(system, 10.0) == found[:1]
+
+
+@pytest.mark.parametrize(
+    ("name", "slowest", "fastest"),
+    [("reverse_duffing", -0.7, -3.1), ("van_der_pol", -5, -27), ("rossler", -2.8, -20), ("lorenz", -8.5, -40)],
+)
+def test_the_spectra_of_the_shipped_systems(name, slowest, fastest):
+    found = smooth_spectrum(get_system(name), 0.01)
+    assert fastest < found.eigenvalues[-1] < found.eigenvalues[0] < slowest
+    assert found.modes == 2 * get_system(name).nx + 1
+
+
+def test_the_slowest_smooth_spectrum_is_chosen_and_always_the_same():
+    system = Oscillator()
+    assert smooth_spectrum(system, 0.02) == intervals(system, 0.02)[0]
+    assert smooth_spectrum.__wrapped__(system, 0.02) == smooth_spectrum(Oscillator(), 0.02)
+
+
+def exponents(*values):
+    return Smoothness(Spectrum((-1.0,)), 0.1, np.ones(len(values)), np.array(values))
+
+
+def test_the_smoothest():
+    assert smoothest([exponents(0.9, 0.2), exponents(0.5, 0.4), exponents(0.1, 0.9)]) == 1
+    assert smoothest([exponents(np.nan), exponents(0.1), exponents(np.nan)]) == 1
+    assert smoothest([exponents(np.nan), exponents(np.nan)]) == 1  # the fastest of those of which nothing is known
+    assert not exponents(np.nan).smooth
+
+
+@dataclass(frozen=True)
+class Resting(Oscillator):
+    """All motions end in a point, at once."""
+
+    name = "resting"
+
+    def f(self, x):
+        return -400.0 * (x[0] - 0.5), -500.0 * x[1]
+
+
+@dataclass(frozen=True)
+class Saddle(Oscillator):
+    """All motions leave; fast filters forget their start before."""
+
+    name = "saddle"
+    bounds = ((-3, 3), (-3, 3))
+
+    def f(self, x):
+        return x[1], x[0]
+
+
+@dataclass(frozen=True)
+class Escaping(Oscillator):
+    name = "escaping"
+
+    def f(self, x):
+        return 50.0 * x[0], 50.0 * x[1]
+
+
+def test_motions_that_rest_or_leave():
+    assert smooth_spectrum(Resting(), 0.01) == intervals(Resting(), 0.01)[-1]
+    slow, fast = judged(Saddle(), intervals(Saddle(), 0.01)[0], intervals(Saddle(), 0.01)[-1])
+    assert np.isnan(slow.distance)
+    assert fast.smooth
+    with pytest.raises(ValueError, match="motions of escaping leave"):
+        smooth_spectrum(Escaping(), 0.01)

@@ -1,0 +1,208 @@
+"""Whether a spectrum makes T smooth, before any training: how much z differs between states that are close."""
+
+import functools
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.maps.coordinates import settling_time
+from training.seeds import Stream, generator
+from training.spectrum import Spectrum, evenly_spaced, typical_rate
+from training.trajectories.record import recording_ages
+
+SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
+MOTIONS = 300  # that are followed
+ASKING = 40  # of them whose states look for neighbours, among the states of the others
+SAMPLES = 160  # states along a motion
+FAR = 64  # the nearest neighbour is compared with the one of this rank
+FEWEST_STATES = 1000  # that must be known for a judgement
+FOLLOWED = 300.0  # length of motions in multiples of 1 / rate
+FINEST = 0.05  # least sampling interval in multiples of 1 / rate; finer ones only cost time
+AT_REST = 1e-6  # part of X's half-width below which the variation of a state no longer counts
+SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and the last interval, in multiples of the rate
+STEP = 2**0.5  # from one interval to the next
+SPREAD = 4.0  # fast end of an interval over its slow end
+FASTEST_MODE = 0.5  # bound of |fast end| * dt
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """What the z of neighbouring states say of T.
+
+    Parameters
+    ----------
+    spectrum : Spectrum
+        Modes for each output.
+    distance : float
+        Root mean square distance between nearest neighbours from different motions, per component, in standard
+        deviations of x. NaN, as all else, where too few states are known or all are at rest.
+    roughness : ndarray, shape (ny * modes,)
+        Root mean square difference between their z, in standard deviations of z: about the least error of a map that
+        cannot tell such neighbours apart.
+    exponent : ndarray, shape (ny * modes,)
+        With which differences in z fall where neighbours come closer, as distance^exponent: 1 where T is smooth,
+        0 where z does not follow from x.
+    """
+
+    spectrum: Spectrum
+    distance: float
+    roughness: np.ndarray
+    exponent: np.ndarray
+
+    @property
+    def smooth(self) -> bool:
+        """Whether the exponents of all modes are at least SMOOTH."""
+        return bool((self.exponent >= SMOOTH).all())
+
+
+def smoothness(
+    system: System, spectra: Iterable[Spectrum], dt: float, *, box_factor: float = 1.5, seed: int = 0
+) -> Iterator[Smoothness]:
+    """Compare z between neighbouring states of different motions, for several spectra.
+
+    Motions without input are simulated once, half of them from X and half from a larger box, and the filters run beside
+    them. Those states count at which a filter has forgotten its start to one part in a million.
+
+    Parameters
+    ----------
+    system : System
+        What moves.
+    spectra : iterable of Spectrum
+        The spectra, each with its modes for each output.
+    dt : float
+        Sampling interval in seconds. One below FINEST / rate is replaced by that.
+    box_factor : float, default 1.5
+        The larger box is this multiple of X.
+    seed : int, default 0
+        Of the starts.
+
+    Yields
+    ------
+    Smoothness
+        Of each spectrum in turn.
+
+    Raises
+    ------
+    ValueError
+        If the system does not say how fast f changes, or motions leave its bounds before any of the filters has
+        forgotten its start.
+    """
+    spectra, rate = list(spectra), typical_rate(system)
+    step = max(dt, FINEST / rate)
+    filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
+    settled = [2.0 * settling_time(linear) for linear in filters]
+    steps = int(np.ceil((FOLLOWED / rate + max(settled)) / step))
+    ages, rng = recording_ages(steps, SAMPLES), generator(Stream.TUNING, seed)
+    x0 = np.concatenate([rng.uniform(*system.box(factor), (MOTIONS // 2, system.nx)) for factor in (1.0, box_factor)])
+    x = simulate(system, rng.permutation(x0), steps, step)
+    inside = np.isfinite(x).all(-1)
+    x = np.where(inside[..., None], x, x[0])  # states beyond the bounds do not count; h and the filter need numbers
+    y, no_input = system.output(x), np.zeros((steps, MOTIONS, 0))
+    x, known = x[ages], [inside[ages] & (ages * step >= time)[:, None] for time in settled]
+    if max(one.sum() for one in known) < FEWEST_STATES:
+        raise ValueError(
+            f"motions of {system.name} leave bounds = {system.bounds} within {min(settled):.3g} s, before the filter "
+            "of any spectrum has forgotten its start; widen the bounds or shrink X"
+        )
+    for spectrum, linear, rows in zip(spectra, filters, known, strict=True):
+        yield _compared(system, spectrum, x=x, z=linear.run(y, no_input, ages), known=rows)
+
+
+def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarray, known: np.ndarray) -> Smoothness:
+    """Compare the z (ages, motions, size) of the known among states x (ages, motions, nx)."""
+    asking, others = known[:, :ASKING], known[:, ASKING:]  # neighbours are of different motions
+    low, high = system.box()
+    least = AT_REST * (high - low) / 2
+    too_few = known.sum() < FEWEST_STATES or not asking.any()
+    if too_few or (x[known].std(0) <= least).all():
+        return Smoothness(spectrum, np.nan, *np.full((2, z.shape[-1]), np.nan))
+    x = x / np.maximum(x[known].std(0), least)
+    z_scale = z[known].std(0)
+    z = z / np.where(z_scale > 0, z_scale, 1.0)
+    distances, rows = cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
+    differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
+    near, roughness = np.sqrt((distances[:, 0] ** 2).mean() / system.nx), np.sqrt((differences[:, 0] ** 2).mean(0))
+    # By the distance to the far neighbour, so that few states far from all others do not outweigh the rest.
+    reach = np.maximum(distances[:, 1:], np.finfo(float).tiny)
+    closer = np.sqrt(((distances[:, :1] / reach) ** 2).mean(0))
+    first, last = np.sqrt(((differences / reach[..., None]) ** 2).mean(0))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        exponent = np.where(last > 0, np.log(first / last) / np.log(closer), 1.0)  # of a constant output: 1
+    return Smoothness(spectrum, float(near), roughness, exponent)
+
+
+def intervals(system: System, dt: float) -> list[Spectrum]:
+    """Spectra to choose from, slow ones first: 2 nx + 1 real eigenvalues for each output, even in the logarithm.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    dt : float
+        Sampling interval in seconds, which bounds the fast ones.
+
+    Returns
+    -------
+    list of Spectrum
+        At least one.
+
+    Raises
+    ------
+    ValueError
+        If the system does not say how fast f changes.
+    """
+    slowest, rate = SLOWEST, typical_rate(system)
+    fastest = max(slowest, min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate)))
+    slow = rate * np.geomspace(slowest, fastest, 1 + round(np.log(fastest / slowest) / np.log(STEP)))
+    return [Spectrum(tuple(float(f"{v:.6g}") for v in evenly_spaced(2 * system.nx + 1, -a, -SPREAD * a))) for a in slow]
+
+
+@functools.cache
+def smooth_spectrum(system: System, dt: float) -> Spectrum:
+    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    dt : float
+        Sampling interval in seconds.
+
+    Returns
+    -------
+    Spectrum
+        Always the same for the same system and dt. If no interval makes T smooth, the one that comes closest to it; if
+        all motions are at rest before, the fastest.
+
+    Raises
+    ------
+    ValueError
+        If the system does not say how fast f changes, or motions leave its bounds too soon.
+    """
+    found = []
+    for one in smoothness(system, intervals(system, dt), dt):
+        if one.smooth:
+            return one.spectrum
+        found.append(one)
+    return found[smoothest(found)].spectrum
+
+
+def smoothest(found: Sequence[Smoothness]) -> int:
+    """Find the spectrum that comes closest to a smooth T.
+
+    Parameters
+    ----------
+    found : sequence of Smoothness
+        At least one, slow spectra first.
+
+    Returns
+    -------
+    int
+        Its index; the last one's where nothing is known of any, as motions have come to rest before.
+    """
+    least = [float(np.nan_to_num(one.exponent, nan=-np.inf).min()) for one in found]
+    return max(range(len(found)), key=lambda i: (least[i], i))
