@@ -26,7 +26,7 @@ from training.config import Config
 from training.jobs import claimed_run, describe
 from training.maps.forward import ForwardProblem, transients, truncation_step
 from training.maps.inverse import InverseProblem
-from training.maps.least_squares import solve_forward
+from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
@@ -137,6 +137,7 @@ def train(
         else:
             points = run.points(trajectories)
             forward = run.learn_forward(trajectories, points)
+            run.samples["inverse_samples"] = len(points)
             sampler = run.by_forward_map(forward, trajectories, points)
         inverse = run.fit_inverse("inverse", sampler)
         artifact = run.artifact(sampler.inverse_map(inverse, run.linear), forward, free)
@@ -161,6 +162,7 @@ class _Run:
     identity: dict[str, Any]
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    samples: dict[str, int] = field(default_factory=dict)  # distinct ones, for certificates
 
     def __post_init__(self) -> None:
         system, config = self.system, self.config
@@ -232,10 +234,12 @@ class _Run:
         system, config, linear = self.system, self.config, self.linear
         if config.random_features:
             report = self._bar(f"solving for T with {config.random_features} features", 1)
+            self.samples["forward_samples"] = min(POINTS * config.random_features, len(points))
             forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
             report(1)
             return forward
         late = self.settled
+        self.samples["forward_samples"] = int(late.sum()) * config.trajectories + len(points)
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
         problem = ForwardProblem(
             network,
@@ -337,6 +341,7 @@ class _Run:
             free_inverse=free,
             training={
                 **dataclasses.asdict(self.config),
+                **self.samples,
                 "seconds": round(time.monotonic() - self.started),
                 "device": self.device.type,
                 "threads": torch.get_num_threads(),
