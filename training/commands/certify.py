@@ -16,7 +16,8 @@ from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
 from training.commands.options import Observers, OwnSystem, read_observers
-from training.evaluation.certificates.certificate import QUANTILES, Certificate, certify
+from training.evaluation.certificates.certificate import Certificate, certify
+from training.evaluation.certificates.forward import AGES, QUANTILES
 from training.evaluation.certificates.gains import noise_variance
 from training.evaluation.certificates.settled import SettledTrajectories, record_settled
 from training.evaluation.report import draw_residual
@@ -135,6 +136,7 @@ def lines(found: Certificate) -> list[dict[str, str]]:
         return number((bound / error) ** 0.5 if error > 0 else None)
 
     residual = {f"\\|P\\|, {100 * level:g} % of X below": level for level in QUANTILES}
+    start = {f"start's \\|z - T(x)\\|, at most, at {age:g} s": age for age in AGES}
     return [
         {
             "rms error in the long run, no noise": number(found.error**0.5),
@@ -147,27 +149,45 @@ def lines(found: Certificate) -> list[dict[str, str]]:
             "the same, at most": number(found.lipschitz_upper),
             "product of the layers' norms": number(found.norm_product),
             "largest norm of dh/dx over X": number(found.output_lipschitz),
+            "least singular value of [A - s I, B]": number(found.controllability),
             "gain from v to z, the theorem's": number(found.gain_theorem),
             "H-infinity norm": number(found.gain_h_infinity),
             "H2 norm": number(found.gain_h2),
         },
         {
-            "risk of T on its data": of("data_risk"),
+            "R_T, z - T(x) along the motion, mean square": of("forward_risk"),
             "PDE residual P, mean square over X": of("pde_risk"),
             **{label: number(forward.residual[level] if forward else None) for label, level in residual.items()},
-            "reconstruction x - T_inv(T(x)), mean square": of("reconstruction_risk"),
+            "R_2, x - T_inv(T(x)) along the motion, mean square": of("reconstruction_risk"),
             "the same over X": of("reconstruction_risk_over_box"),
+            "T_inv(T(x)) - T_inv(z) along the motion, mean square": of("propagated_risk"),
+        },
+        {
+            **{label: number(forward.envelope[age] if forward else None) for label, age in start.items()},
+            "start forgotten after, s": of("forgets_start"),
         },
         {
             "psi": number(found.psi),
             "bound of the rms error, no noise": number(forward.bound**0.5 if forward else None),
             "bound / measured": number(None) if forward is None else ratio(forward.bound, found.error),
+            "share of T in the bound, %": number(100 * forward.forward_share if forward else None),
+            "Lipschitz constant of T_inv from T(x) to z, at most": of("lipschitz_between"),
+            "sharp bound, no noise": number(forward.sharp_bound**0.5 if forward else None),
+            "share of T in it, %": number(100 * (1 - (forward.reconstruction_risk / forward.sharp_bound) ** 0.5))
+            if forward and forward.sharp_bound > 0
+            else number(None),
+            "sharp bound / measured": number(None) if forward is None else ratio(forward.sharp_bound, found.error),
             "what the theorem adds for noise, as rms": number(found.noise_term**0.5),
             "bound with noise / measured": number(None)
             if forward is None
             else ratio(forward.noisy_bound, found.noisy_error),
+            "sharp bound with noise / measured": number(None)
+            if forward is None
+            else ratio(forward.sharp_noisy_bound, found.noisy_error),
         },
         {
+            "N_1, samples of T": of("forward_samples"),
+            "N_2, samples of T_inv": number(found.inverse_samples),
             "pseudo-dimension of T_inv's losses, at most": number(found.inverse_dimension),
             "generalisation term C of T_inv": number(found.inverse_term),
             "generalisation term C of T": of("forward_term"),

@@ -13,18 +13,25 @@ from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov, sol
 
 import observers
 from kkl_gym import get_system
+from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.artifact import resolve
 from training import certify
 from training.cli import main
-from training.evaluation.certificates.gains import h2, h_infinity, theorem_gain
-from training.evaluation.certificates.generalisation import generalisation_term, pseudo_dimension_bound
+from training.evaluation.certificates.gains import controllability, envelope, h2, h_infinity, theorem_gain
+from training.evaluation.certificates.generalisation import (
+    forward_samples,
+    generalisation_term,
+    inverse_samples,
+    pseudo_dimension_bound,
+)
 from training.evaluation.certificates.lipschitz import (
     lipschitz_lower,
     lipschitz_upper,
     norm_product,
     output_lipschitz,
 )
+from training.evaluation.certificates.segments import segment_lipschitz, slopes
 from training.evaluation.certificates.settled import record_settled
 from training.maps.smooth import Smooth, decoder, encoder, residual
 
@@ -59,7 +66,7 @@ def exact():
 def test_exact_maps_have_no_risk(exact):
     # what is left is the hold's error between samples, of order dt^2, and float32
     assert exact.error < 1e-9
-    assert exact.forward.data_risk < 1e-9
+    assert exact.forward.forward_risk < 1e-9
     assert exact.forward.pde_risk < 1e-12
     assert exact.forward.reconstruction_risk < 1e-12
     assert list(exact.forward.residual.values()) == sorted(exact.forward.residual.values())
@@ -98,6 +105,53 @@ def test_h2_tends_to_the_continuous_one():
     P = solve_continuous_lyapunov(A, -B @ B.T)
     for dt, tolerance in ((0.01, 0.02), (0.001, 0.002)):
         assert h2(LinearFilter(A, B, dt)) == pytest.approx(np.sqrt(dt * np.trace(P)), rel=tolerance)
+
+
+COUPLED = np.array([[-1.0, 6.0, 0.0], [0.0, -2.5, 6.0], [0.0, 0.0, -4.0]])  # far from normal
+
+
+@pytest.mark.parametrize("poles", [A, COUPLED, np.array([[-0.5, 4.0, 0.0], [-4.0, -0.5, 0.0], [0.0, 0.0, -2.0]])])
+def test_transients_stay_in_the_envelope(poles):
+    linear, system = LinearFilter(poles, B, 0.01), Oscillator()
+    T = sylvester(poles, B)
+    rng = np.random.default_rng(0)
+    x = simulate(system, rng.uniform(-1, 1, (40, 2)), 1000, 0.01)
+    ages = np.arange(len(x))
+    for disturbance in (0.0, 0.3):
+        v = disturbance * rng.choice([-1.0, 1.0], (len(x), 40, 1))
+        z = linear.run(system.output(x) + v, np.zeros((1000, 40, 0)), ages)
+        wrong = np.linalg.norm(z - x @ T.T, axis=-1)
+        bound = envelope(linear, 0.01 * ages, start=wrong[0].max(), disturbance=disturbance)
+        assert (wrong.max(1) <= bound + 2e-5).all()  # the hold's error of order dt^2
+
+
+def test_the_envelope_of_one_mode_is_reached():
+    linear = LinearFilter(np.array([[-2.0]]), np.array([[3.0]]), 0.01)
+    ages = np.array([0.0, 0.5, 2.0])
+    expected = 0.7 * np.exp(-2 * ages) + 3 * 0.2 / 2 * (1 - np.exp(-2 * ages))
+    assert envelope(linear, ages, start=0.7, disturbance=0.2) == pytest.approx(expected)
+    # the worst disturbance, a constant of the start's sign, leads there
+    z = linear.run(np.full((201, 1, 1), 0.2), np.zeros((200, 1, 0)), np.arange(201))
+    ran = np.exp(-2 * 0.01 * np.arange(201)) * (0.7 - 0.3) + z[:, 0, 0]  # from 0.7 in place of where a run starts
+    assert ran[[0, 50, 200]] == pytest.approx(expected, rel=1e-9)
+
+
+def test_what_is_left_of_the_start(exact):
+    forward = exact.forward
+    corner = np.linalg.norm((LinearFilter(A, B, 0.01).equilibrium @ C - M) @ [1.0, 1.0])
+    other = np.linalg.norm((LinearFilter(A, B, 0.01).equilibrium @ C - M) @ [1.0, -1.0])
+    assert forward.start_error == pytest.approx(max(corner, other), rel=0.02)  # the largest of states drawn in X
+    assert forward.envelope[2.0] == pytest.approx(np.exp(-2.0) * forward.start_error)
+    left = exact.lipschitz_upper * forward.start_error * np.exp(-forward.forgets_start)
+    assert left == pytest.approx(np.sqrt(exact.error))
+
+
+def test_controllability():
+    assert controllability(LinearFilter(A, B, 0.01)) > 0.1
+    unseen = np.array([[1.0], [0.0], [1.0]])
+    assert controllability(LinearFilter(A, unseen, 0.01)) < 1e-12
+    twice = LinearFilter(np.diag([-1.0, -1.0 - 1e-6]), np.ones((2, 1)), 0.01)  # nearly one mode
+    assert controllability(twice) == pytest.approx(1e-6 / np.sqrt(2), rel=1e-3)
 
 
 @pytest.mark.parametrize("poles", [A, *(
@@ -166,6 +220,39 @@ def test_the_steepest_place_of_silu():
 
 
 @pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_slopes_on_intervals(activation):
+    rng = np.random.default_rng(0)
+    low = rng.uniform(-5, 5, 300)
+    high = low + rng.exponential(1.0, 300)
+    least, greatest = slopes(low, high, activation)
+    v = np.linspace(low, high, 401)
+    step = 1e-6
+    one = Smooth(MLP([np.ones((1, 1)), np.ones((1, 1))], [np.zeros(1), np.zeros(1)], activation))
+    slope = (one(v.reshape(-1, 1) + step) - one(v.reshape(-1, 1) - step)).reshape(v.shape) / (2 * step)
+    assert (least <= slope.min(0) + 1e-8).all()
+    assert (greatest >= slope.max(0) - 1e-8).all()
+    assert np.abs(least - slope.min(0)).max() < 1e-3
+    assert np.abs(greatest - slope.max(0)).max() < 1e-3
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
+def test_lipschitz_constants_on_segments(activation):
+    rng = np.random.default_rng(0)
+    sizes = (4, 20, 15, 3)
+    weights = tuple(rng.normal(size=(b, a)) for a, b in pairwise(sizes))
+    network = Smooth(MLP(weights, [rng.normal(size=b) for b in sizes[1:]], activation))
+    start = rng.normal(size=(30, 4))
+    end = start + rng.normal(size=(30, 4)) * np.geomspace(1e-3, 1.0, 30)[:, None]
+    upper = segment_lipschitz(network, start, end)
+    on = start + np.linspace(0, 1, 201)[:, None, None] * (end - start)
+    norms = np.linalg.norm(network.jacobian(on.reshape(-1, 4)), ord=2, axis=(1, 2)).reshape(201, 30)
+    assert (norms.max(0) <= upper).all()
+    assert (upper < 2.0 * norms.max(0)).all()
+    assert np.median(upper) < 0.5 * lipschitz_upper(network, 100)  # which is what it is for
+    assert segment_lipschitz(network, start, start) == pytest.approx(norms[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("activation", ["tanh", "silu"])
 def test_jacobians_by_differences(activation):
     rng = np.random.default_rng(1)
     network = Smooth(MLP([rng.normal(size=(7, 3)), rng.normal(size=(5, 7)), rng.normal(size=(2, 5))],
@@ -197,7 +284,7 @@ def test_a_wrong_filter_violates_the_bound_without_noise(exact):
         linear_observer(1.05, A=1.3 * A), Oscillator(), measurement_noise=0.0, process_noise=0.0, trajectories=50
     )
     assert wrong.error > 5 * spoiled.forward.bound
-    assert wrong.forward.data_risk > 1e-3  # which a certificate of that observer says
+    assert wrong.forward.forward_risk > 1e-3  # which a certificate of that observer says
 
 
 def test_bounds_of_the_paper_are_put_together_as_printed():
@@ -207,13 +294,35 @@ def test_bounds_of_the_paper_are_put_together_as_printed():
     forward = found.forward
     assert found.noise_bound == pytest.approx(0.6)
     assert found.process_noise_bound == pytest.approx(0.1 * np.sqrt(2))
-    assert forward.physics_risk == pytest.approx(forward.data_risk + 0.5 * forward.pde_risk)
+    assert forward.physics_risk == pytest.approx(forward.forward_risk + 0.5 * forward.pde_risk)
     l2 = found.lipschitz_upper**2
     assert forward.bound == pytest.approx(4 * forward.reconstruction_risk + 4 * l2 * forward.physics_risk)
     noise = 2 * l2 * found.gain_theorem**2 * (found.output_lipschitz * 0.7 + 0.6) ** 2
     assert found.noise_term == pytest.approx(noise)
     assert forward.noisy_bound == pytest.approx(forward.bound + noise)
     assert found.noisy_error < forward.noisy_bound
+    assert forward.forward_share == pytest.approx(1.0 - 4 * forward.reconstruction_risk / forward.bound)
+
+
+def test_the_sharp_bounds_hold_and_are_sharper():
+    """T_inv is linear, so that its constant on a segment is that everywhere; T is wrong by an offset."""
+    offset = ForwardMap(
+        MLP([M.astype(np.float32)], [np.full(3, 0.05, np.float32)], "tanh"),
+        np.zeros(2), np.ones(2), np.zeros(3), np.ones(3),
+    )  # fmt: skip
+    shifted = dataclasses.replace(linear_observer(1.1), forward=offset)
+    found = certify(shifted, Oscillator(), measurement_noise=0.2, process_noise=0.1, psi=0.7, trajectories=20)
+    forward, steepest = found.forward, 1.1 * np.linalg.norm(M_inv, 2)
+    assert forward.forward_risk == pytest.approx(3 * 0.05**2, rel=1e-2)
+    assert forward.lipschitz_between == pytest.approx(steepest, rel=1e-6)
+    assert forward.steep_risk == pytest.approx(steepest**2 * forward.forward_risk, rel=1e-3)
+    assert forward.propagated_risk == pytest.approx(((1.1 * M_inv @ np.full(3, 0.05)) ** 2).sum(), rel=1e-2)
+    rms = np.sqrt(forward.reconstruction_risk) + np.sqrt(forward.steep_risk)
+    assert forward.sharp_bound == pytest.approx(rms**2)
+    assert found.error < forward.sharp_bound < forward.bound
+    noise = found.lipschitz_upper * found.gain_theorem * (0.7 + 0.6)
+    assert forward.sharp_noisy_bound == pytest.approx((0.7 + rms + noise) ** 2)
+    assert found.noisy_error < forward.sharp_noisy_bound
 
 
 @pytest.mark.parametrize("name", [
@@ -231,6 +340,9 @@ def test_shipped_maps(name):
     if found.forward is not None:
         assert found.error <= found.forward.bound
         assert found.noisy_error <= found.forward.noisy_bound
+        assert found.error <= found.forward.sharp_bound <= found.forward.bound
+        assert found.noisy_error <= found.forward.sharp_noisy_bound
+        assert found.forward.propagated_risk < 1.5 * found.forward.steep_risk  # the second of fewer states
     text = json.dumps(found.as_json(), allow_nan=False)
     assert json.loads(text)["inverse_term"] is None  # infinite
 
@@ -293,6 +405,10 @@ def test_generalisation_terms():
     expected = (d * (q + 1)) ** 2 + 11 * d * (q + 1) * (t + np.log2(9 * d * (q + 1)))
     assert pseudo_dimension_bound(mlp) == pytest.approx(expected)
     assert generalisation_term(2.0, pseudo_dimension=100, samples=99, delta=0.05) == np.inf
+    new = {"trajectories": 10, "samples": 20, "forward_samples": 700, "inverse_samples": 900}
+    old = {"trajectories": 10, "samples": 20}
+    assert (forward_samples(new), inverse_samples(new)) == (700, 900)
+    assert (forward_samples(old), inverse_samples(old), forward_samples({})) == (200, 200, 0)
     by_hand = 2 * np.sqrt(200 * np.log(np.e * 100) / 1e4) + 2 * np.sqrt(np.log(20) / 2e4)
     assert generalisation_term(2.0, pseudo_dimension=100, samples=10_000, delta=0.05) == pytest.approx(by_hand)
 
@@ -345,8 +461,8 @@ def test_command(tmp_path, capsys):
     assert "bound of the rms error" in printed
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
-    main(["certify", "reverse_duffing-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
+    main(["certify", "van_der_pol-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
           "--out", str(tmp_path / "quiet")])  # fmt: skip
-    assert (tmp_path / "quiet" / "reverse_duffing-spinn.png").exists()
+    assert (tmp_path / "quiet" / "van_der_pol-spinn.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])

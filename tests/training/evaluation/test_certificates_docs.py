@@ -39,6 +39,19 @@ def test_ratios(sentence, larger, smaller):
     assert (low, high) == pytest.approx((min(ratios), max(ratios)), rel=0.05)
 
 
+def test_the_sharp_bound():
+    sentence = (
+        r"the sharp bound is (\d+) to ([\d,]+) times the measured rms error, "
+        r"where the printed one is ([\d,]+) to ([\d,]+)"
+    )
+    said = [float(value.replace(",", "")) for value in re.search(sentence, page()).groups()]
+    for (low, high), name in zip((said[:2], said[2:]), ("sharp_bound", "bound"), strict=True):
+        ratios = [(one["forward"][name] / one["error"]) ** 0.5 for one in committed() if one["forward"]]
+        assert (low, high) == pytest.approx((min(ratios), max(ratios)), rel=0.05)
+    shares = [one["forward"]["forward_share"] for one in committed() if one["forward"]]
+    assert min(shares) > 0.9  # "Nearly all of the first bound is T's term."
+
+
 def test_the_right_observer_beside_a_wrong_filter():
     right = json.loads((DOCS / "results" / "certificates" / "reverse_duffing-spinn.json").read_text())
     forward = right["forward"]

@@ -1,7 +1,6 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -10,58 +9,17 @@ import numpy as np
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.config import current_names
-from training.evaluation.certificates.gains import h2, h_infinity, noise_variance, theorem_gain
-from training.evaluation.certificates.generalisation import generalisation_term, pseudo_dimension_bound
+from training.evaluation.certificates.forward import Forward, Inverse, certify_forward, squared
+from training.evaluation.certificates.gains import controllability, h2, h_infinity, noise_variance, theorem_gain
+from training.evaluation.certificates.generalisation import (
+    generalisation_term,
+    inverse_samples,
+    pseudo_dimension_bound,
+)
 from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product, output_lipschitz
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
-from training.maps.smooth import Smooth, decoder, encoder, residual
+from training.maps.smooth import decoder
 from training.seeds import Stream, generator
-
-QUANTILES = (0.5, 0.9, 0.99, 1.0)
-
-
-@dataclass(frozen=True)
-class Forward:
-    """What is known where a forward map T was learned.
-
-    Parameters
-    ----------
-    data_risk : float
-        Mean |z - T(x)|^2 along the trajectories.
-    pde_risk : float
-        Mean |P(x)|^2 of the PDE's residual P = dT/dx f - A T - B h over X.
-    physics_risk : float
-        ``data_risk`` plus the physics weight times ``pde_risk``, R_S1 (paper, eq. emp-risk-theta).
-    reconstruction_risk : float
-        Mean |x - T_inv(T(x))|^2 along the trajectories, R_S2 (paper, eq. emp-risk-eta).
-    reconstruction_risk_over_box : float
-        The same uniformly over X.
-    residual : mapping of float to float
-        Quantiles of |P| over X, by their level.
-    residual_worst : tuple of float, length nx
-        Where in X it is largest.
-    forward_dimension : float
-        Bound of the pseudo-dimension of |z - T(x)|^2; with the residual beside it, as in R_S1, it would be larger
-        still.
-    forward_term : float
-        The term C_theta with that.
-    bound : float
-        Right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_S2 + 2 l^2 R_S1).
-    noisy_bound : float
-        Right-hand side of the theorem on noise, with the T_inv that is told the noise.
-    """
-
-    data_risk: float
-    pde_risk: float
-    physics_risk: float
-    reconstruction_risk: float
-    reconstruction_risk_over_box: float
-    residual: Mapping[float, float]
-    residual_worst: tuple[float, ...]
-    forward_dimension: float
-    forward_term: float
-    bound: float
-    noisy_bound: float
 
 
 @dataclass(frozen=True)
@@ -99,18 +57,22 @@ class Certificate:
         Of the layers of T_inv, the bound that costs no work.
     output_lipschitz : float
         Largest norm of dh/dx at random points of X; where h is not linear there may be larger ones.
+    controllability : float
+        Smallest singular value of [A - s I, B] over the eigenvalues s of A: how far (A, B) is from losing a mode.
     gain_theorem, gain_h_infinity, gain_h2 : float
         Of the filter from noise to z, see :mod:`training.evaluation.certificates.gains`.
     noise_term : float
-        What the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2.
+        What the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2, as printed.
     predicted_noise_error : float
         Rms of what measurement noise alone does to the estimate, from the stationary covariance through the Jacobian.
     measured_noise_error : float
         The same by simulation.
+    inverse_samples : int
+        N_2, the states that T_inv was trained with.
     inverse_dimension : float
         Bound of the pseudo-dimension of T_inv's losses.
     inverse_term : float
-        The term C_eta, the largest loss that was seen standing for the bound of all.
+        The term C_eta with these, the largest loss that was seen standing for the bound of all.
     forward : Forward or None
         What needs a learned T; None where there is none.
     """
@@ -129,12 +91,14 @@ class Certificate:
     lipschitz_upper: float
     norm_product: float
     output_lipschitz: float
+    controllability: float
     gain_theorem: float
     gain_h_infinity: float
     gain_h2: float
     noise_term: float
     predicted_noise_error: float
     measured_noise_error: float
+    inverse_samples: int
     inverse_dimension: float
     inverse_term: float
     forward: Forward | None
@@ -211,9 +175,12 @@ def certify(
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
     measured, sample = recorded.halves()
-    told, noise_free = decoder(artifact, **noise), decoder(artifact, 0.0)
+    told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)
     upper = lipschitz_upper(told)
+    free = decoder(artifact, 0.0)
+    if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
+        free = told  # a map that is not told the noise is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
     l_h = output_lipschitz(system, generator(Stream.CERTIFICATE, seed, 1).uniform(*system.box(), (2_000, system.nx)))
@@ -221,8 +188,9 @@ def certify(
     if psi is None:
         everywhere = np.concatenate([recorded.x, recorded.noisy_x])
         psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
-    noise_term = 2 * (upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)) ** 2
-    losses = _squared(measured.x - noise_free(measured.z))
+    noise_error = upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)
+    losses = squared(measured.x - free(measured.z))
+    samples = inverse_samples(artifact.training)
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
     return Certificate(
         observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
@@ -233,94 +201,37 @@ def certify(
         psi=psi,
         samples=len(recorded.x),
         error=float(losses.mean()),
-        noisy_error=float(_squared(measured.noisy_x - told(measured.noisy_z)).mean()),
+        noisy_error=float(squared(measured.noisy_x - told(measured.noisy_z)).mean()),
         lipschitz_lower=lower,
         lipschitz_at=tuple(at.tolist()),
         lipschitz_upper=upper,
         norm_product=norm_product(told),
         output_lipschitz=l_h,
+        controllability=controllability(linear),
         gain_theorem=gain,
         gain_h_infinity=h_infinity(linear),
         gain_h2=h2(linear),
-        noise_term=noise_term,
+        noise_term=2 * noise_error**2,
         predicted_noise_error=float(np.sqrt(noise_variance(artifact, recorded.z, **noise).mean())),
-        measured_noise_error=float(np.sqrt(_squared(told(recorded.z + recorded.noise) - told(recorded.z)).mean())),
+        measured_noise_error=float(np.sqrt(squared(told(recorded.z + recorded.noise) - told(recorded.z)).mean())),
+        inverse_samples=samples,
         inverse_dimension=inverse_dimension,
         inverse_term=generalisation_term(
-            float(losses.max()), pseudo_dimension=inverse_dimension, samples=_training_samples(artifact), delta=delta
+            float(losses.max()), pseudo_dimension=inverse_dimension, samples=samples, delta=delta
         ),
-        forward=_forward(
+        forward=certify_forward(
             artifact,
             system,
             sample,
-            told=told,
-            noise_free=noise_free,
-            lipschitz=upper,
-            noise_term=noise_term,
+            told=Inverse(told, upper),
+            noise_free=Inverse(free, upper if free is told or artifact.forward is None else lipschitz_upper(free)),
+            noise_error=noise_error,
+            psi=psi,
+            error=float(losses.mean()),
             delta=delta,
-            seed=seed,
+            rng=generator(Stream.CERTIFICATE, seed, 2),
         ),
     )
-
-
-def _forward(
-    artifact: Artifact,
-    system: System,
-    recorded: SettledTrajectories,
-    *,
-    told: Smooth,
-    noise_free: Smooth,
-    lipschitz: float,
-    noise_term: float,
-    delta: float,
-    seed: int,
-) -> Forward | None:
-    """What a learned T allows to say of T_inv told the noise, with its Lipschitz constant, and of T_inv told none."""
-    if artifact.forward is None:
-        return None
-    T = encoder(artifact.forward)
-    x = generator(Stream.CERTIFICATE, seed, 2).uniform(*system.box(), (20_000, system.nx))
-    size = np.linalg.norm(residual(artifact, system, x), axis=1)
-    weight = float(artifact.training.get("physics_weight", 0.0))
-    data_losses = _squared(recorded.z - T(recorded.x))
-    data_risk, pde_risk = float(data_losses.mean()), float(np.square(size).mean())
-    physics_risk = data_risk + weight * pde_risk
-
-    def bound(T_inv: Smooth, constant: float) -> float:
-        reconstruction = float(_squared(recorded.x - T_inv(T(recorded.x))).mean())
-        return 2 * (2 * reconstruction + 2 * constant**2 * physics_risk)
-
-    same = all(
-        (a == b).all()
-        for a, b in zip((*told.mlp.weights, *told.mlp.biases), (*noise_free.mlp.weights, *noise_free.mlp.biases))
-    )
-    dimension = pseudo_dimension_bound(artifact.forward.mlp)
-    largest = float(data_losses.max()) + weight * float(size.max()) ** 2
-    return Forward(
-        data_risk=data_risk,
-        pde_risk=pde_risk,
-        physics_risk=physics_risk,
-        reconstruction_risk=float(_squared(recorded.x - noise_free(T(recorded.x))).mean()),
-        reconstruction_risk_over_box=float(_squared(x - noise_free(T(x))).mean()),
-        residual={level: float(np.quantile(size, level)) for level in QUANTILES},
-        residual_worst=tuple(x[size.argmax()].tolist()),
-        forward_dimension=dimension,
-        forward_term=generalisation_term(
-            largest, pseudo_dimension=dimension, samples=_training_samples(artifact), delta=delta
-        ),
-        bound=bound(noise_free, lipschitz if same else lipschitz_upper(noise_free)),
-        noisy_bound=bound(told, lipschitz) + noise_term,
-    )
-
-
-def _training_samples(artifact: Artifact) -> int:
-    """Pairs that training recorded, as far as the artifact says."""
-    trained = artifact.training
-    return int(trained.get("trajectories", 0)) * int(trained.get("samples", 0))
-
-
-def _squared(difference: np.ndarray) -> np.ndarray:
-    return np.asarray(np.square(difference).sum(-1))
 
 
 def _plain(value: Any) -> Any:

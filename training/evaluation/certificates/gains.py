@@ -10,8 +10,50 @@ from training.maps.smooth import decoder
 
 def theorem_gain(linear: LinearFilter) -> float:
     """Most that a bounded noise may move z by the paper's theorem 4 (sec. 7): cond(V) |B| / |lambda_min(A)|."""
-    poles, V = np.linalg.eig(linear.A)
-    return float(np.linalg.cond(V) * np.linalg.norm(linear.B, 2) / np.abs(poles.real).min())
+    return _conditioning(linear) * float(np.linalg.norm(linear.B, 2)) / slowest(linear)
+
+
+def slowest(linear: LinearFilter) -> float:
+    """Slowest rate at which the filter forgets, |lambda_min(A)| in 1/s: the least |Re| of its eigenvalues."""
+    return float(np.abs(np.linalg.eigvals(linear.A).real).min())
+
+
+def envelope(linear: LinearFilter, ages: np.ndarray, *, start: float, disturbance: float = 0.0) -> np.ndarray:
+    """Bound |z(t) - T(x(t))| from the reset on (paper, lemma zeta_bound, with the sign of its exponent put right).
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    ages : ndarray, shape (m,)
+        Seconds since the reset.
+    start : float
+        Bound of |z - T(x)| at the reset.
+    disturbance : float, default 0
+        Bound of |y - h(x)| at all times, l_h psi + sqrt(ny) v in the paper.
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        cond(V) e^{-|lambda_min| t} start + gain (1 - e^{-|lambda_min| t}) disturbance, gain being the theorem's.
+    """
+    left = np.exp(-slowest(linear) * ages)
+    return np.asarray(_conditioning(linear) * left * start + theorem_gain(linear) * (1.0 - left) * disturbance)
+
+
+def controllability(linear: LinearFilter) -> float:
+    """Smallest singular value of [A - s I, B] over the eigenvalues s of A; (A, B) is controllable if it is not zero.
+
+    This is the test of Popov, Belevitch and Hautus. The rank of [B, A B, ...], which the paper asks for, is the same
+    in exact arithmetic, but floats cannot tell it.
+    """
+    identity = np.eye(len(linear.A))
+    pencils = [np.hstack([linear.A - s * identity, linear.B]) for s in np.linalg.eigvals(linear.A)]
+    return float(min(np.linalg.svd(pencil, compute_uv=False)[-1] for pencil in pencils))
+
+
+def _conditioning(linear: LinearFilter) -> float:
+    return float(np.linalg.cond(np.linalg.eig(linear.A)[1]))
 
 
 def h_infinity(linear: LinearFilter, points: int = 2000) -> float:

@@ -1,6 +1,8 @@
 """The terms C_eta and C_theta of the paper's theorem 1: what may be lost between the sample and the population."""
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from observers import MLP
 
@@ -34,7 +36,7 @@ def pseudo_dimension_bound(mlp: MLP) -> float:
 
 
 def generalisation_term(largest_loss: float, *, pseudo_dimension: float, samples: int, delta: float) -> float:
-    """Bound how far the risk may lie above its mean on a sample (paper, sec. 4.2).
+    """Bound how far the risk may lie above its mean on a sample (paper, sec. 4.3).
 
     Parameters
     ----------
@@ -56,3 +58,23 @@ def generalisation_term(largest_loss: float, *, pseudo_dimension: float, samples
         return math.inf
     complexity = math.sqrt(2 * pseudo_dimension * math.log(math.e * samples / pseudo_dimension) / samples)
     return largest_loss * (complexity + math.sqrt(math.log(1 / delta) / (2 * samples)))
+
+
+def forward_samples(training: Mapping[str, Any]) -> int:
+    """N_1, the samples of S_1: what an artifact's training says of distinct pairs (x, z) and collocation points.
+
+    Files that do not say it count as many as they recorded, trajectories times samples, without collocation points.
+    """
+    return int(training.get("forward_samples", _recorded(training)))
+
+
+def inverse_samples(training: Mapping[str, Any]) -> int:
+    """N_2, the samples of S_2: what an artifact's training says of distinct x' that its T_inv could see.
+
+    Files that do not say it count as many as they recorded; so do maps that are fitted along trajectories.
+    """
+    return int(training.get("inverse_samples", _recorded(training)))
+
+
+def _recorded(training: Mapping[str, Any]) -> int:
+    return int(training.get("trajectories", 0)) * int(training.get("samples", 0))

@@ -1,0 +1,213 @@
+"""What a learned T allows to say: its risks, its residual, what stands in the way of T_inv, and the paper's bounds."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers import Artifact
+from training.evaluation.certificates.gains import envelope, slowest
+from training.evaluation.certificates.generalisation import (
+    forward_samples,
+    generalisation_term,
+    pseudo_dimension_bound,
+)
+from training.evaluation.certificates.segments import segment_lipschitz
+from training.evaluation.certificates.settled import SettledTrajectories
+from training.maps.smooth import Smooth, encoder, residual
+
+QUANTILES = (0.5, 0.9, 0.99, 1.0)
+AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s, at which the envelope of the start is reported
+SEGMENTS = 400  # recorded states at which T_inv is bounded between T(x) and z
+DRAWN = 20_000  # states in X
+
+
+@dataclass(frozen=True)
+class Forward:
+    """What is known where a forward map T was learned.
+
+    Risks "along the motion" are means over recorded states that no training saw: over the measure of the theorems on
+    the observer, not over the samples S_1 and S_2 of the training.
+
+    Parameters
+    ----------
+    forward_risk : float
+        Mean |z - T(x)|^2 along the motion, z being the filter's: the forward error R_T (paper, eq. forward-error-RT).
+    pde_risk : float
+        Mean |P(x)|^2 of the PDE's residual P = dT/dx f - A T - B h uniformly over X, R_PDE.
+    physics_risk : float
+        ``forward_risk`` plus the physics weight times ``pde_risk``: the paper's R_1, which stands for its R_S1.
+    reconstruction_risk : float
+        Mean |x - T_inv(T(x))|^2 along the motion, R_2 (paper, eq. true-risk-R2-eta). It is not the R_S2 of the
+        training, whose states x' are drawn in another way.
+    reconstruction_risk_over_box : float
+        The same uniformly over X.
+    propagated_risk : float
+        Mean |T_inv(T(x)) - T_inv(z)|^2 along the motion: what the error of T does to the estimate.
+    residual : mapping of float to float
+        Quantiles of |P| over X, by their level.
+    residual_worst : tuple of float, length nx
+        Where in X it is largest.
+    lipschitz_between : float
+        Largest upper bound l(x) of T_inv's Lipschitz constant on the segments from T(x) to z, of some states along the
+        motion.
+    steep_risk : float
+        Mean l(x)^2 |z - T(x)|^2 of the same states, which is at least ``propagated_risk`` of them.
+    forward_samples : int
+        N_1, the training's pairs (x, z) and collocation points.
+    forward_dimension : float
+        Bound of the pseudo-dimension of |z - T(x)|^2; with the residual beside it, as in R_S1, it would be larger
+        still.
+    forward_term : float
+        The term C_theta with these.
+    start_error : float
+        Largest |z - T(x)| at reset without noise, of states drawn in X.
+    envelope : mapping of float to float
+        Bound of what is left of ``start_error`` at some ages, in seconds, without noise.
+    forgets_start : float
+        Age in seconds after which the start can no longer add more to the estimate than the long run's rms error.
+    bound : float
+        Right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_2 + 2 l^2 R_1), as printed.
+    forward_share : float
+        Share of 2 l^2 R_1 in it, 0 to 1; the rest is R_2's.
+    noisy_bound : float
+        Right-hand side of the theorem on noise as printed, with the T_inv that is told the noise. It lacks |x - x_bar|.
+    sharp_bound : float
+        The noise-free theorem with l(x) in place of l, R_T in place of R_1, and no squares of sums,
+        (sqrt(R_2) + sqrt(steep_risk))^2.
+    sharp_noisy_bound : float
+        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + sqrt(ny) v))^2; s is the root
+        of the sharp bound of the T_inv that is told the noise.
+    """
+
+    forward_risk: float
+    pde_risk: float
+    physics_risk: float
+    reconstruction_risk: float
+    reconstruction_risk_over_box: float
+    propagated_risk: float
+    residual: Mapping[float, float]
+    residual_worst: tuple[float, ...]
+    lipschitz_between: float
+    steep_risk: float
+    forward_samples: int
+    forward_dimension: float
+    forward_term: float
+    start_error: float
+    envelope: Mapping[float, float]
+    forgets_start: float
+    bound: float
+    forward_share: float
+    noisy_bound: float
+    sharp_bound: float
+    sharp_noisy_bound: float
+
+
+@dataclass(frozen=True)
+class Inverse:
+    """A T_inv as its observer uses it at some noise, with an upper bound of its Lipschitz constant everywhere."""
+
+    T_inv: Smooth
+    lipschitz: float
+
+
+def certify_forward(
+    artifact: Artifact,
+    system: System,
+    recorded: SettledTrajectories,
+    *,
+    told: Inverse,
+    noise_free: Inverse,
+    noise_error: float,
+    psi: float,
+    error: float,
+    delta: float,
+    rng: np.random.Generator,
+) -> Forward | None:
+    """Say what a learned T allows to say.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    recorded : SettledTrajectories
+        Motions that ``error`` is not from.
+    told, noise_free : Inverse
+        T_inv that is told the noise, and that there is none.
+    noise_error : float
+        Most that noise and psi can do to the estimate through z, l gain (l_h psi + sqrt(ny) v).
+    psi : float
+        Bound of how far process noise moves the state.
+    error : float
+        Mean square error in the long run, without noise.
+    delta : float
+        Probability with which the generalisation term may fail.
+    rng : Generator
+        Of the states drawn in X.
+
+    Returns
+    -------
+    Forward or None
+        None if the observer holds no T.
+    """
+    if artifact.forward is None:
+        return None
+    T, T_inv, linear = encoder(artifact.forward), noise_free.T_inv, artifact.filter
+    x = rng.uniform(*system.box(), (DRAWN, system.nx))
+    size = np.linalg.norm(residual(artifact, system, x), axis=1)
+    weight = float(artifact.training.get("physics_weight", 0.0))
+    images, z = T(recorded.x), recorded.z
+    data_losses = squared(z - images)
+    forward_risk, pde_risk = float(data_losses.mean()), float(np.square(size).mean())
+    physics_risk = forward_risk + weight * pde_risk
+    dimension, samples = pseudo_dimension_bound(artifact.forward.mlp), forward_samples(artifact.training)
+    largest = float(data_losses.max()) + weight * float(size.max()) ** 2
+
+    def sharp(used: Inverse) -> tuple[float, float, float, float]:
+        some = np.linspace(0, len(z) - 1, min(SEGMENTS, len(z))).astype(int)
+        between = np.minimum(segment_lipschitz(used.T_inv, images[some], z[some]), used.lipschitz)
+        reconstruction = float(squared(recorded.x - used.T_inv(images)).mean())
+        steep = float((between**2 * data_losses[some]).mean())
+        return reconstruction, float(between.max()), steep, (math.sqrt(reconstruction) + math.sqrt(steep)) ** 2
+
+    reconstruction_risk, lipschitz_between, steep_risk, sharp_bound = sharp(noise_free)
+    same = told.T_inv is noise_free.T_inv
+    told_reconstruction, _, _, told_sharp = (reconstruction_risk, 0.0, 0.0, sharp_bound) if same else sharp(told)
+    forward_part = 2 * noise_free.lipschitz**2 * physics_risk
+    total = 2 * reconstruction_risk + forward_part
+    told_bound = 2 * (2 * told_reconstruction + 2 * told.lipschitz**2 * physics_risk)
+    start_error = float(np.sqrt(squared(linear.start(system.output(x)) - T(x)).max()))
+    left = envelope(linear, np.array(AGES), start=start_error)
+    added = noise_free.lipschitz * float(left[0])  # at first; it then decays with the slowest mode
+    return Forward(
+        forward_risk=forward_risk,
+        pde_risk=pde_risk,
+        physics_risk=physics_risk,
+        reconstruction_risk=reconstruction_risk,
+        reconstruction_risk_over_box=float(squared(x - T_inv(T(x))).mean()),
+        propagated_risk=float(squared(T_inv(images) - T_inv(z)).mean()),
+        residual={level: float(np.quantile(size, level)) for level in QUANTILES},
+        residual_worst=tuple(x[size.argmax()].tolist()),
+        lipschitz_between=lipschitz_between,
+        steep_risk=steep_risk,
+        forward_samples=samples,
+        forward_dimension=dimension,
+        forward_term=generalisation_term(largest, pseudo_dimension=dimension, samples=samples, delta=delta),
+        start_error=start_error,
+        envelope=dict(zip(AGES, left.tolist(), strict=True)),
+        forgets_start=max(0.0, math.log(added / math.sqrt(error)) / slowest(linear)) if added * error > 0 else math.inf,
+        bound=2 * total,
+        forward_share=forward_part / total if total > 0 else math.nan,
+        noisy_bound=told_bound + 2 * noise_error**2,
+        sharp_bound=sharp_bound,
+        sharp_noisy_bound=(psi + math.sqrt(told_sharp) + noise_error) ** 2,
+    )
+
+
+def squared(difference: np.ndarray) -> np.ndarray:
+    """Squared norms, (n, k) to (n,)."""
+    return np.asarray(np.square(difference).sum(-1))
