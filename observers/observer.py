@@ -165,7 +165,6 @@ class KKLObserver:
 
         The root mean square of (T(x_hat) - z_y) / z_scale over the modes, where z_scale is that of
         :class:`observers.ForwardMap`, each mode's spread over the motions that T was trained on: 0.1 is a tenth of it.
-        (A T that was solved for, with ``random_features``, has another scale: its values compare with each other only.)
 
         It is near 0 where z_y is the T of some state, and T_inv finds that state. It is large in the transient, under
         sensor faults and inputs (T is that of motions without), on another plant, and where the maps are bad, such as

@@ -27,11 +27,26 @@ from training.methods.base import Budget, CausalObserver, Configuration, Data, M
 from training.methods.dmf import DMF, DMFNoise
 from training.methods.gru import GRU
 from training.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
-from training.methods.kkl import SPINN, Default
+from training.methods.kkl import SPINN, Default, SPINNPreset
 from training.methods.node import NODE, NODENoise
 
 METHODS: dict[str, type[Method[Any]]] = {
-    cls.name: cls for cls in (Default, SPINN, AE, DMF, DMFNoise, NODE, NODENoise, GRU, EKF, UKF, WrongEKF, UntunedEKF)
+    cls.name: cls
+    for cls in (
+        Default,
+        SPINN,
+        SPINNPreset,
+        AE,
+        DMF,
+        DMFNoise,
+        NODE,
+        NODENoise,
+        GRU,
+        EKF,
+        UKF,
+        WrongEKF,
+        UntunedEKF,
+    )
 }
 # Steps from the paper's pipeline to the package's and past it, which ``make ablation`` compares in this order.
 ABLATION: dict[str, type[Method[Any]]] = {

@@ -120,12 +120,11 @@ class Shipped(KKLMethod):
 class SPINN(KKLMethod):
     """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
 
-    It simulates trajectories of its own, as many as everyone gets, most of which start in 2X.
+    It simulates as many trajectories as everyone gets, from starts in X as theirs.
     """
 
     name: ClassVar[str] = "spinn"
     label: ClassVar[str] = "SPINN"
-    tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three spectra."""
@@ -135,5 +134,17 @@ class SPINN(KKLMethod):
         """The package's pipeline."""
         config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
         fastest, slowest = configuration["spectrum"]
-        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest))
+        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest), box_factor=1.0)
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class SPINNPreset(KKLMethod):
+    """The same as its maps ship: with the preset's spectrum, and trajectories most of which start in 2X."""
+
+    name: ClassVar[str] = "spinn-preset"
+    label: ClassVar[str] = "SPINN, from 2X"
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact

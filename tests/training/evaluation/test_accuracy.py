@@ -1,7 +1,7 @@
 """Shipped maps on unseen trajectories."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ import pytest
 import observers
 from kkl_gym import SYSTEMS, get_system
 from observers.artifact import resolve
-from training.config import current_names
+from training.config import Config, current_names
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape
 from training.presets import preset
@@ -22,6 +22,14 @@ PROMISED = {
     "van_der_pol": (0.4, 1.6, 0.3, 0.3),
     "rossler": (0.8, 1.8, 0.6, 1.0),
     "lorenz": (0.5, 0.9, 0.3, 0.6),
+}
+# The same of SPINN's: all steps from X without noise and at 0.5 (told), and component-wise. The notebooks that were
+# released with the paper print 1.96, 0.35, 4.77 and 8.64 for the last.
+PROMISED_OF_SPINN = {
+    "reverse_duffing": (0.8, 7.0, 0.3),
+    "van_der_pol": (0.35, 5.0, 0.2),
+    "rossler": (0.7, 4.0, 2.0),
+    "lorenz": (0.6, 2.5, 0.5),
 }
 NAMES = sorted(SYSTEMS)
 
@@ -43,10 +51,28 @@ def test_default_maps_are_as_accurate_as_promised(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_default_maps_are_what_the_preset_makes(name):
-    made = current_names(observers.load(name).artifact.training)
-    config = json.loads(json.dumps(asdict(preset(get_system(name), "input-aware", "fast"))))
-    assert {key: made[key] for key in config} == config
+def test_spinn_maps_are_as_accurate_as_promised(name):
+    system, artifact = get_system(name), observers.Artifact.read(resolve(f"{name}-spinn"))
+    noise_free, noisy, beyond = PROMISED_OF_SPINN[name]
+    runs = unseen_trajectories(system, 0.01, n=60, duration=50.0, seed=1)
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.0, seed=1).full) <= noise_free
+    assert np.median(errors(artifact, system, runs, measurement_noise=0.5, seed=1).full) <= noisy
+    runs = unseen_trajectories(system, 0.01, n=60, duration=50.0, seed=1, domain="1.5X")
+    y, late = system.output(runs.x), np.arange(1000, 5001, 10)
+    x_hat = observers.KKLObserver(artifact, 0.0).estimate(y)
+    assert np.median(component_smape(runs.x, x_hat, skip=1000)) <= beyond
+    z = artifact.filter.run(y, np.zeros((5000, y.shape[1], 0)), late)
+    error = artifact.forward(runs.x[late]) - z
+    assert np.square(error).sum() <= 1e-4 * np.square(z).sum()
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("pipeline", ["input-aware", "spinn"])
+def test_shipped_maps_are_what_the_preset_makes(name, pipeline):
+    made = current_names(observers.load(name if pipeline == "input-aware" else f"{name}-spinn").artifact.training)
+    config = json.loads(json.dumps(asdict(preset(get_system(name), pipeline, "fast"))))
+    later = {entry.name: entry.default for entry in fields(Config) if entry.name not in made}  # they change nothing
+    assert {key: made.get(key, later.get(key)) for key in config} == config
     assert made["optimiser"] == "soap"
 
 

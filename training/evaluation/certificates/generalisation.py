@@ -1,4 +1,4 @@
-"""The terms C_eta and C_theta of the paper's theorem 1: what may be lost between the sample and the population."""
+"""The terms C_eta and C_theta of the paper's theorem 2: what may be lost between the sample and the population."""
 
 import math
 from collections.abc import Mapping
