@@ -51,7 +51,7 @@ benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; r
 	mkdir -p docs/results/benchmark
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
 
-SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz random)
+SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz)
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
 	default ablation-tuned
 

@@ -74,11 +74,17 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
             solved_output_layer=False,
             transients=False,
         )
-    chosen = profile(system).smooth_eigenvalues
-    if chosen is None:
-        chosen = smooth_spectrum(system, Config.dt).eigenvalues
-    smooth = tuple(np.round(chosen, 6).tolist())
-    return Config(pipeline, smooth, box_factor=2.0, forward_steps=10_000, adaptive=True, noise_free_share=0.35)
+    chosen = dict(profile(system).spinn_settings)
+    smooth = chosen.pop("eigenvalues", None) or smooth_spectrum(system, Config.dt).eigenvalues
+    fast = Config(
+        pipeline,
+        tuple(np.round(smooth, 6).tolist()),
+        box_factor=2.0,
+        forward_steps=10_000,
+        adaptive=True,
+        noise_free_share=0.35,
+    )
+    return override(fast, chosen)
 
 
 def eigenvalues(system: System) -> tuple[float, ...]:

@@ -18,7 +18,6 @@ from training.presets import preset
 from training.spectrum import papers_spectrum
 from training.tuning import Probe, Spectrum
 
-FEATURES = 1500
 PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
 TUNED_FOR = 0.5
@@ -78,6 +77,7 @@ class PapersSPINN(Ablation):
             "scaling": "range",
             "transients": False,
             "solved_output_layer": False,
+            "adaptive": False,
         }
         return {name: value for name, value in papers.items() if name not in self.given_back()}
 
@@ -128,7 +128,7 @@ class SolvedSPINN(ScaledSPINN):
 
 
 class SPINNOfAnyAge(SolvedSPINN):
-    """The same at every age and level of noise: the preset."""
+    """The same at every age and level of noise."""
 
     name: ClassVar[str] = "ablation-spinn-transients"
     label: ClassVar[str] = "... transients and noise"
@@ -136,36 +136,22 @@ class SPINNOfAnyAge(SolvedSPINN):
 
 
 class AdaptiveSPINN(SPINNOfAnyAge):
-    """The preset, with points where the residual is large drawn more often."""
+    """The same with points where the residual is large drawn more often: the preset."""
 
     name: ClassVar[str] = "ablation-spinn-adaptive"
     label: ClassVar[str] = "... adaptive points"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """One setting."""
-        return {"adaptive": True}
+    own: ClassVar[tuple[str, ...]] = ("adaptive",)
 
 
-class LipschitzSPINN(SPINNOfAnyAge):
+class LipschitzSPINN(AdaptiveSPINN):
     """The preset with a penalty on the Lipschitz constant of T_inv."""
 
     name: ClassVar[str] = "ablation-spinn-lipschitz"
-    label: ClassVar[str] = "... or Lipschitz penalty"
+    label: ClassVar[str] = "... Lipschitz penalty"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """One setting."""
         return {"lipschitz_penalty": PENALTY}
-
-
-class Solved(SPINNOfAnyAge):
-    """The preset with a T of random features, solved for by least squares."""
-
-    name: ClassVar[str] = "ablation-spinn-random"
-    label: ClassVar[str] = "... or T of random features"
-
-    def changes(self, task: Task) -> Mapping[str, Any]:
-        """Random features in place of a trained network."""
-        return {"forward_steps": 0, "random_features": FEATURES}
 
 
 class Transients(Ablation):

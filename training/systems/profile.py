@@ -20,11 +20,11 @@ class Profile:
     eigenvalues : tuple of float, optional
         Real eigenvalues of A for an input-aware map, in 1/s; by default they follow from how fast f changes in X, see
         :func:`training.presets.eigenvalues`.
-    smooth_eigenvalues : tuple of float, optional
-        Real eigenvalues of A for a map of the paper's pipeline, fast enough for T to be smooth; by default they follow
-        from motions, see :func:`training.smoothness.smooth_spectrum`.
     settings : mapping of str to object
         Settings of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
+    spinn_settings : mapping of str to object
+        The same for a map of the paper's pipeline, its eigenvalues among them. These must be fast enough for T to be
+        smooth; by default :func:`training.smoothness.smooth_spectrum` finds them.
     controller : callable
         Makes of the system the feedback that drives closed-loop data and that agents are measured against.
     fault_deadline : float, optional
@@ -43,8 +43,8 @@ class Profile:
     """
 
     eigenvalues: tuple[float, ...] | None = None
-    smooth_eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    spinn_settings: Mapping[str, Any] = field(default_factory=dict)
     controller: Callable[[System], Controller] = linear_quadratic
     fault_deadline: float | None = None
     task: ControlTask | None = None

@@ -41,7 +41,7 @@ def homogeneous(system: System) -> Controller:
 PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -0.2, -8.0),
     # The paper's: no two of its motions part or fall together.
-    smooth_eigenvalues=tuple(np.linspace(-1.5, -3.0, 5).tolist()),
+    spinn_settings={"eigenvalues": tuple(np.linspace(-1.5, -3.0, 5).tolist())},
     controller=homogeneous,
     fault_deadline=10.0,  # about a period at amplitude 1
     # Marginally stable: whoever does not know the state cannot take energy out.

@@ -11,7 +11,7 @@ PROFILE = Profile(
     # Of input-aware maps. Fast ones follow the jumps of y, slow ones average its noise. Their
     # number and ends are as measured, by the errors of trained observers.
     eigenvalues=evenly_spaced(15, -0.4, -20.0),
-    smooth_eigenvalues=evenly_spaced(11, -5.0, -16.0),
+    spinn_settings={"eigenvalues": evenly_spaced(11, -5.0, -16.0)},
     # Its phase is the hardest of all to tell from noise. Slow complex modes at frequencies of y help there, as
     # `kkl-gym tune` chooses them, and so do more samples at high noise. No input within its bound leads the oscillator
     # out of X, so stronger ones do.

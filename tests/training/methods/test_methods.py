@@ -10,11 +10,12 @@ import torch
 from linear_system import Oscillator, sylvester
 from scipy.signal import bessel
 
-import training.methods.ablation
 from kkl_gym.simulate import simulate
+from kkl_gym.systems import VanDerPol
 from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
 from training.methods import ABLATION, METHODS, Budget, Task, get_method
+from training.methods.ablation import PapersSPINN
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
@@ -270,9 +271,26 @@ def test_training_data_is_the_same_for_everyone_and_matches_the_states(tmp_path)
     np.testing.assert_allclose(data.y[data.ages], system.output(data.x), atol=1e-6)
 
 
+def test_each_step_from_the_papers_spinn_to_the_presets_gives_back_what_it_says(tmp_path):
+    task = Task(VanDerPol(), SMALL, tmp_path)
+    steps = [cls() for cls in ABLATION.values() if issubclass(cls, PapersSPINN)]
+    before = steps[0].changes(task)
+    names = {"SOAP": {"optimiser", "learning_rate", "batch"}, "smooth T": {"eigenvalues", "pairs"}}
+    names |= {"along motions": {"collocation", "box_factor"}, "relative errors": {"scaling"}}
+    names |= {"output layer solved": {"solved_output_layer"}, "transients and noise": {"transients"}}
+    names |= {"adaptive points": {"adaptive"}}
+    for method in steps[1:-1]:
+        after = method.changes(task)
+        assert {**before, **after} == before
+        assert set(before) - set(after) == names.pop(method.label.removeprefix("... ").removeprefix("by "))
+        before = after
+    assert not names
+    assert not before  # the preset
+    assert set(steps[-1].changes(task)) == {"lipschitz_penalty"}
+
+
 @pytest.mark.parametrize("name", sorted(METHODS | ABLATION))
-def test_saved_and_loaded_is_the_same_observer(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(training.methods.ablation, "FEATURES", 30)
+def test_saved_and_loaded_is_the_same_observer(name, tmp_path):
     method, system = get_method(name), Oscillator()
     budget = Budget(
         "tiny", trajectories=10, duration=25.0, samples=20, cpu_seconds=math.inf, width=8, depth=1, dt=0.02, steps=2
