@@ -111,10 +111,19 @@ class Shipped(KKLMethod):
 
     name: ClassVar[str] = "shipped"
     label: ClassVar[str] = "kkl-gym, as shipped"
+    suffix: ClassVar[str] = ""
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """Nothing is trained."""
-        return Artifact.read(resolve(task.system.name))
+        return Artifact.read(resolve(task.system.name + self.suffix))
+
+
+class ShippedSPINN(Shipped):
+    """The SPINN maps that ship, likewise: ``kkl-gym benchmark --methods training.methods.kkl:ShippedSPINN``."""
+
+    name: ClassVar[str] = "shipped-spinn"
+    label: ClassVar[str] = "SPINN, as shipped"
+    suffix: ClassVar[str] = "-spinn"
 
 
 class SPINN(KKLMethod):
