@@ -68,8 +68,8 @@ class Train:
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: dict[str, float] = field(default_factory=dict)
     """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
-    threads: int = 2
-    """CPU threads."""
+    threads: int = 1
+    """CPU threads. More than one hardly help networks of the fast preset's size."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     dry_run: bool = False

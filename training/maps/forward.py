@@ -15,6 +15,7 @@ from training.maps.scaling import StateScale
 
 REFRESH = 500  # batches after which the residual decides anew where collocation points are drawn
 CANDIDATES = 20_000  # points among which it decides
+MOST = 10.0  # times the median, at which residuals are cut for this: a few points far out would take every batch
 SOLVED = 20_000  # pairs, and points, from which the output layer is solved for in the end
 
 
@@ -71,8 +72,9 @@ class ForwardProblem(nn.Module):
     device : torch.device
         Where the network is trained.
     adaptive : bool, default False
-        Whether points are drawn in proportion to the residual plus its mean, instead of alike. This is RAD with k = c
-        = 1 (Wu et al., Comput. Methods Appl. Mech. Eng. 403, 115671, 2023).
+        Whether points are drawn in proportion to the residual plus its median, instead of alike. This is RAD (Wu et
+        al., Comput. Methods Appl. Mech. Eng. 403, 115671, 2023) with k = c = 1, the residual cut, and the median in
+        place of the mean.
     """
 
     def __init__(
@@ -144,7 +146,7 @@ class ForwardProblem(nn.Module):
             self.candidates = torch.randint(len(self._points), (CANDIDATES,), generator=generator, device=device)
             with torch.no_grad():
                 size = self._weighted_residual(self._points[self.candidates]).norm(dim=-1).double()
-            self.cumulative = (size + size.mean()).cumsum(0)
+            self.cumulative = (1.0 + (size / size.median().clamp(min=1e-30)).clamp(max=MOST)).cumsum(0)
         at = torch.rand(self._batch, generator=generator, device=device, dtype=torch.double) * self.cumulative[-1]
         return self.candidates[torch.searchsorted(self.cumulative, at).clamp(max=CANDIDATES - 1)]
 

@@ -116,7 +116,7 @@ def test_solved_output_layer_minimises_the_risk_over_it():
             last.weight -= step
 
 
-def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_mean():
+def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_median():
     problem, _ = problem_of_the_oscillator(adaptive=True)
     generator = torch.Generator().manual_seed(0)
     rows = torch.cat([problem._drawn(generator) for _ in range(400)])
@@ -124,9 +124,17 @@ def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_mean():
         size = problem._weighted_residual(problem._points).norm(dim=-1).numpy()
     drawn = np.bincount(rows.numpy(), minlength=len(size))
     strong, weak = size > np.quantile(size, 0.9), size < np.quantile(size, 0.1)
-    expected = (size[strong] + size.mean()).mean() / (size[weak] + size.mean()).mean()
+    expected = (size[strong] + np.median(size)).mean() / (size[weak] + np.median(size)).mean()
     assert expected > 1.5
     assert drawn[strong].mean() / drawn[weak].mean() == pytest.approx(expected, rel=0.05)
+
+
+def test_one_point_with_a_huge_residual_does_not_take_the_batches():
+    problem, _ = problem_of_the_oscillator(adaptive=True)
+    problem._points[0] = 1e6
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.cat([problem._drawn(generator) for _ in range(50)])
+    assert (rows == 0).double().mean() < 0.02
 
 
 def test_filter_state_from_T_and_what_is_left_of_its_start():
