@@ -31,7 +31,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff format .
 
 # Into runs/. A new version ships as observers/maps/NAME-vN.safetensors, beside the old ones.
-maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable. docs/artifacts.md: the older SPINN maps
+maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
