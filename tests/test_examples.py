@@ -25,6 +25,15 @@ def test_estimate(capsys):
     assert "x_hat" in capsys.readouterr().out
 
 
+def test_known_start(capsys):
+    found = example("known_start")(runs=20)
+    for name, (*errors, sound, biased) in found.items():
+        assert errors[0] < errors[3]
+        assert biased > 3 * sound, name
+    assert found["reverse_duffing"][0] < 0.02 * found["reverse_duffing"][3]
+    assert "reverse duffing" in capsys.readouterr().out
+
+
 def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=500, trajectories=100, out=tmp_path) < 20.0
 
