@@ -118,9 +118,9 @@ class Config:
     """Share of an input-aware map's trajectories with process noise. Each has a level of its own, up to the system's.
     The map is told the level unless the share is 0."""
     measurement_noise_max: Positive = 1.0
-    """Largest standard deviation of the measurement noise that an input-aware map is trained for."""
+    """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too)."""
     noise_free_share: Share = 0.2
-    """Share of an input-aware map's samples without measurement noise."""
+    """Share of the samples without measurement noise, where a map is told its level."""
     high_noise_emphasis: Positive = 2.0
     """How often samples have high levels of measurement noise, which are harder to learn. 1 draws the level evenly on
     a logarithmic scale over the two decades below measurement_noise_max; higher values draw high levels more often."""

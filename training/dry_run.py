@@ -1,5 +1,6 @@
 """What a training run will take, before it is started: ``kkl-gym train --dry-run``."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,7 +9,7 @@ import torch
 
 from kkl_gym.system import System
 from training.config import Config
-from training.pipeline import Result, train
+from training.pipeline import Result, shares, train
 from training.trajectories.record import CHUNK, recording_ages
 
 FEW, MORE = 10, 50  # batches of the two short runs whose difference is timed
@@ -31,7 +32,7 @@ class Estimate:
     bytes : float
         Memory, roughly.
     seconds : dict of str to float
-        Of each stage, at the speed that short runs had on this machine.
+        Of each stage, at the speed that short runs had on this machine; at most its part of the limit of CPU time.
     """
 
     pairs: int
@@ -64,11 +65,14 @@ def estimate(system: System, config: Config, *, device: torch.device | None = No
     """
     few, more = (_short_run(system, config, batches=batches, device=device) for batches in (FEW, MORE))
     seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
+    if config.random_features:
+        seconds["solving"] = more.seconds["solving"]
+    parts = shares(config, few.artifact.nu)
     for stage in few.losses:
         batches = config.forward_steps if stage == "forward" else config.inverse_steps
-        seconds[stage] = few.seconds[stage] + (batches - FEW) * (more.seconds[stage] - few.seconds[stage]) / (
-            MORE - FEW
-        )
+        each = max(0.0, more.seconds[stage] - few.seconds[stage]) / (MORE - FEW)
+        limit = math.inf if config.cpu_seconds is None else parts[stage] * config.cpu_seconds
+        seconds[stage] = min(few.seconds[stage] + max(0, batches - FEW) * each, limit)
     pairs = config.trajectories * len(recording_ages(max(1, round(config.duration / config.dt)), config.samples))
     size = few.artifact.filter.size
     maps = (few.artifact.inverse, few.artifact.free_inverse, few.artifact.forward)
@@ -86,8 +90,9 @@ def _short_run(system: System, config: Config, *, batches: int, device: torch.de
     short = replace(
         config,
         trajectories=min(CHUNK, config.trajectories),
-        forward_steps=min(batches, config.forward_steps),
+        forward_steps=batches if config.forward_steps else 0,
         inverse_steps=batches,
+        cpu_seconds=None,
         closed_loop_trajectories=min(CHUNK, config.closed_loop_trajectories),
     )
     with TemporaryDirectory() as folder:

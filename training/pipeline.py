@@ -10,7 +10,6 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ class Result:
     losses : dict of str to list of (int, float)
         For each stage that trained a network, its error after so many batches.
     seconds : dict of str to float
-        What each of these stages took, and "simulating".
+        What each of these stages took, "simulating", and "solving" for T with random features.
     """
 
     artifact: Artifact
@@ -173,10 +172,15 @@ class _Run:
         self.spectrum = Spectrum(config.eigenvalues, config.pairs)
         nu = system.nu if config.pipeline == "input-aware" and config.inputs else 0
         self.linear = self.spectrum.filter(system.ny, config.dt, nu)
-        self.shares = _shares(config, nu)
+        self.shares = shares(config, nu)
         self.steps = max(1, round(config.duration / config.dt))
         self.process_noise_share = config.process_noise_share if config.pipeline == "input-aware" else 0.0
         self.ages = recording_ages(self.steps, config.samples)
+        if config.pipeline == "spinn":  # ages at which the filter's start no longer matters; an error before any work
+            first = truncation_step(
+                system, self.linear, steps=self.steps, epsilon=config.truncation, box_factor=config.box_factor
+            )
+            self.settled = self.ages >= first
 
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
         """Training trajectories with a filter beside them."""
@@ -215,15 +219,6 @@ class _Run:
         sampler = self.along(self.simulate(unforced, f"{self.system.name}, free", motions), unforced)
         return sampler.inverse_map(self.fit_inverse("free", sampler), unforced)
 
-    @cached_property
-    def settled(self) -> np.ndarray:
-        """Which of the recorded ages the filter's start no longer matters at."""
-        config = self.config
-        first = truncation_step(
-            self.system, self.linear, steps=self.steps, epsilon=config.truncation, box_factor=config.box_factor
-        )
-        return np.asarray(self.ages >= first)
-
     def points(self, trajectories: Trajectories) -> np.ndarray:
         """States at which T's equation is asked to hold, and x' where there are no transients: (n, nx)."""
         x = trajectories.x.reshape(-1, self.system.nx)
@@ -235,7 +230,8 @@ class _Run:
         if config.random_features:
             report = self._bar(f"solving for T with {config.random_features} features", 1)
             self.samples["forward_samples"] = min(POINTS * config.random_features, len(points))
-            forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
+            with self.timed("solving"):
+                forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
             report(1)
             return forward
         late = self.settled
@@ -255,7 +251,8 @@ class _Run:
         )
         self.minimise("forward", problem, config.forward_steps)
         if config.solved_output_layer:
-            problem.solve_output_layer(self.rng)
+            with self.timed("forward"):
+                problem.solve_output_layer(self.rng)
         return problem.forward_map()
 
     def by_forward_map(
@@ -361,8 +358,21 @@ class _Run:
         return lambda done: self.progress.update(task, completed=done)
 
 
-def _shares(config: Config, nu: int) -> dict[str, float]:
-    """The stages of a run that train networks, with their parts in the CPU time."""
+def shares(config: Config, nu: int) -> dict[str, float]:
+    """Stages of a run that train networks, with their parts in the CPU time.
+
+    Parameters
+    ----------
+    config : Config
+        Of the run.
+    nu : int
+        Number of inputs that the filter takes in.
+
+    Returns
+    -------
+    dict of str to float
+        By the stage's name.
+    """
     if config.pipeline == "spinn":
         return SOLVED_SHARES if config.random_features else SPINN_SHARES
     closed_loop = ["closed-loop"] if config.closed_loop_trajectories else []

@@ -117,7 +117,7 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
     asking, others = known[:, :ASKING], known[:, ASKING:]  # neighbours are of different motions
     low, high = system.box()
     least = AT_REST * (high - low) / 2
-    too_few = known.sum() < FEWEST_STATES or not asking.any()
+    too_few = known.sum() < FEWEST_STATES or not asking.any() or others.sum() < FAR
     if too_few or (x[known].std(0) <= least).all():
         return Smoothness(spectrum, np.nan, *np.full((2, z.shape[-1]), np.nan))
     x = x / np.maximum(x[known].std(0), least)

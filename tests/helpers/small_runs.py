@@ -11,6 +11,7 @@ from training import preset
 from training.config import override
 from training.maps.networks import Network
 from training.maps.samplers import ClosedLoopSampler, TrajectorySampler
+from training.spectrum import papers_spectrum
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import KINDS
@@ -21,7 +22,9 @@ SIZES = {"trajectories": 20, "duration": 5.0, "samples": 40, "width": 16, "depth
 
 def toy(system, pipeline="input-aware", **changes):
     """A configuration that trains within a second."""
-    steps = {"inverse_steps": 200} | ({"forward_steps": 200} if pipeline == "spinn" else {})
+    steps = {"inverse_steps": 200}
+    if pipeline == "spinn":  # modes that are forgotten within the 20 s of such runs
+        steps |= {"forward_steps": 200, "eigenvalues": papers_spectrum(system)}
     return override(preset(system, pipeline, "fast"), SIZES | steps | changes)
 
 

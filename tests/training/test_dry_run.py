@@ -1,5 +1,7 @@
 """What a run will take."""
 
+from dataclasses import replace
+
 import numpy as np
 from linear_system import Oscillator
 from small_runs import CPU, toy
@@ -35,6 +37,21 @@ def test_times_grow_with_batches_and_trajectories(monkeypatch):
     T_inv = (5 + 2) * 16 + 16 + (16 * 16 + 16) + (16 * 2 + 2)
     assert found.parameters == T + T_inv
     assert found.bytes > training.dry_run.PROGRAM
+
+
+def test_few_batches_and_a_limit_of_time_are_taken_as_they_are(monkeypatch):
+    def timed(system, config, folder, *, device):
+        assert config.cpu_seconds is None  # a short run must have all its batches
+        result = train(system, config, folder, device=device)
+        seconds = {"inverse": 2.0 + 0.1 * config.inverse_steps, "simulating": 3.0, "solving": 7.0}
+        return Result(result.artifact, {"inverse": result.losses["inverse"]}, seconds)
+
+    monkeypatch.setattr(training.dry_run, "train", timed)
+    config = toy(Oscillator(), "spinn", duration=20.0, forward_steps=0, random_features=20, cpu_seconds=40.0)
+    long = estimate(Oscillator(), replace(config, inverse_steps=4000), device=CPU).seconds
+    short = estimate(Oscillator(), replace(config, inverse_steps=3), device=CPU).seconds
+    assert long == {"simulating": 3.0, "solving": 7.0, "inverse": 30.0}  # its part of the limit
+    assert short == {"simulating": 3.0, "solving": 7.0, "inverse": 3.0}
 
 
 def test_a_dry_run_says_what_the_papers_sizes_take_and_writes_nothing(tmp_path, capsys):

@@ -163,7 +163,8 @@ def test_closing_the_loop_is_a_second_stage(tmp_path):
         train(Autonomous(), toy(Autonomous(), closed_loop_trajectories=20, inverse_steps=5), tmp_path / "b")
 
 
-def test_truncation_beyond_the_trajectories_is_an_error(tmp_path):
+def test_truncation_beyond_the_trajectories_is_an_error_before_they_are_simulated(tmp_path, monkeypatch):
+    monkeypatch.delattr(training.pipeline, "record")
     with pytest.raises(ValueError, match="make them longer"):
         train(Oscillator(), toy(Oscillator(), "spinn"), tmp_path)
 

@@ -148,6 +148,8 @@ def expected(config: Config, found: "Estimate") -> Table:
         size = f"{batches.get(stage, config.inverse_steps):,} batches of {config.batch:,}"
         if stage == "simulating":
             size = f"{config.trajectories:,} trajectories of {config.duration:g} s"
+        elif stage == "solving":
+            size = f"{config.random_features:,} random features"
         table.add_row(stage, size, duration(seconds))
     table.add_section()
     table.add_row("all", "", duration(sum(found.seconds.values())))

@@ -143,7 +143,7 @@ class SPINN(KKLMethod):
         """The package's pipeline."""
         config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
         fastest, slowest = configuration["spectrum"]
-        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest), box_factor=1.0)
+        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest), pairs=(), box_factor=1.0)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 

@@ -74,16 +74,17 @@ def recording_ages(steps: int, n: int) -> np.ndarray:
     steps : int
         The greatest age.
     n : int
-        How many ages at most.
+        How many ages at most, 2 or more.
 
     Returns
     -------
     ndarray of int, shape (at most n,)
-        Samples since reset, sorted; the other half is even in time.
+        Samples since reset, sorted, from 0 to the greatest; the other half is even in time.
     """
-    early = np.geomspace(1, steps, n // 2).round()
-    late = np.linspace(0, steps, n - n // 2).round()
-    return np.unique(np.concatenate([early, late])).astype(int)
+    late = max(2, n - n // 2)  # the first and the greatest age at least
+    even = np.linspace(0, steps, late).round()
+    early = np.geomspace(1, steps, n - late).round()
+    return np.unique(np.concatenate([early, even])).astype(int)
 
 
 def record(

@@ -71,6 +71,8 @@ def test_recording_ages_cover_start_transient_and_end():
     assert ages[-1] == 5000
     assert (np.diff(ages) > 0).all()
     assert (ages < 50).sum() > 20
+    assert recording_ages(5000, 2).tolist() == [0, 5000]
+    assert recording_ages(5000, 3).tolist() == [0, 1, 5000]
 
 
 def test_most_motions_start_in_a_larger_box_where_one_is_asked_for():
