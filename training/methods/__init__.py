@@ -26,7 +26,7 @@ from training.methods.base import Budget, CausalObserver, Configuration, Data, M
 from training.methods.dmf import DMF, DMFNoise
 from training.methods.gru import GRU
 from training.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
-from training.methods.kkl import SPINN, Default, SPINNPreset
+from training.methods.kkl import SPINN, Default
 from training.methods.node import NODE, NODENoise
 
 METHODS: dict[str, type[Method[Any]]] = {
@@ -34,7 +34,6 @@ METHODS: dict[str, type[Method[Any]]] = {
     for cls in (
         Default,
         SPINN,
-        SPINNPreset,
         AE,
         DMF,
         DMFNoise,

@@ -145,15 +145,3 @@ class SPINN(KKLMethod):
         fastest, slowest = configuration["spectrum"]
         config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest), pairs=(), box_factor=1.0)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
-
-
-class SPINNPreset(KKLMethod):
-    """The same as its maps ship: with the preset's spectrum, and trajectories most of which start in 2X."""
-
-    name: ClassVar[str] = "spinn-preset"
-    label: ClassVar[str] = "SPINN, from 2X"
-
-    def train(self, task: Task, configuration: Configuration) -> Artifact:
-        """The package's pipeline."""
-        config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
-        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
