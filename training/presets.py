@@ -4,6 +4,7 @@ What differs from system to system, the spectrum above all, comes from the syste
 :mod:`training.systems`.
 """
 
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -15,16 +16,24 @@ from training.spectrum import evenly_spaced, papers_spectrum, typical_rate
 from training.systems import profile
 
 Preset = Literal["fast", "paper"]
+LARGE: dict[str, Any] = {
+    "width": 512,
+    "depth": 4,
+    "activation": "silu",
+    "optimiser": "adam",
+    "batch": 4096,
+    "learning_rate": 1e-3,
+}
 CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 
-def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
+def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping[str, Any] | None = None) -> Config:
     """The configuration behind ``--pipeline`` and ``--preset`` for a system.
 
     "paper" has the sizes of the paper's sec. 8: 500 trajectories of 50 s, SiLU networks of 4 x 512, 200 epochs over
     3 million and 5 million points, physics weight 0.1, and nz = ny (2 nx + 1) eigenvalues in [-3, -1.5].
     The paper leaves open the batch (here 4,096), the spacing of the eigenvalues (even) and the decay of
-    the learning rate (a cosine). "fast" is what ships: at most ten minutes on two CPU cores.
+    the learning rate (a cosine). "fast" is what ships: at most ten minutes.
 
     Parameters
     ----------
@@ -34,11 +43,14 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
         How the observer is learned.
     name : {"fast", "paper"}
         The sizes.
+    changes : mapping of str to object, optional
+        Settings that are to differ, as for :func:`training.config.override`. Where a spectrum has to be found, it suits
+        them; where one is given, none is looked for.
 
     Returns
     -------
     Config
-        For :func:`training.train`; :func:`training.config.override` changes it.
+        For :func:`training.train`.
 
     Raises
     ------
@@ -49,24 +61,18 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
         raise ValueError(
             f"no preset {name!r} for pipeline {pipeline!r}; there are {get_args(Preset)}, {get_args(Pipeline)}"
         )
-    large: dict[str, Any] = {
-        "width": 512,
-        "depth": 4,
-        "activation": "silu",
-        "optimiser": "adam",
-        "batch": 4096,
-        "learning_rate": 1e-3,
-    }
+    changes = changes or {}
     if pipeline == "input-aware":
-        fast = override(Config(pipeline, eigenvalues(system)), profile(system).settings)
-        return fast if name == "fast" else override(fast, {**large, "inverse_steps": 244_140})
+        config = override(Config(pipeline, eigenvalues(system)), profile(system).settings)
+        sizes = {**LARGE, "inverse_steps": 244_140}
+        return override(override(config, sizes if name == "paper" else {}), changes)
     if name == "paper":
-        return Config(
+        config = Config(
             pipeline,
             papers_spectrum(system),
             trajectories=500,
             samples=5001,
-            **large,
+            **LARGE,
             forward_steps=200 * 3_000_000 // 4096,
             inverse_steps=200 * 5_000_000 // 4096,
             collocation="box",
@@ -74,17 +80,13 @@ def preset(system: System, pipeline: Pipeline, name: Preset) -> Config:
             solved_output_layer=False,
             transients=False,
         )
-    chosen = dict(profile(system).spinn_settings)
-    smooth = chosen.pop("eigenvalues", None) or smooth_spectrum(system, Config.dt).eigenvalues
-    fast = Config(
-        pipeline,
-        tuple(np.round(smooth, 6).tolist()),
-        box_factor=2.0,
-        forward_steps=10_000,
-        adaptive=True,
-        noise_free_share=0.35,
-    )
-    return override(fast, chosen)
+        return override(config, changes)
+    chosen: dict[str, Any] = {"box_factor": 2.0, "forward_steps": 10_000, "adaptive": True, "noise_free_share": 0.35}
+    chosen |= {**profile(system).spinn_settings, **{key: value for key, value in changes.items() if value is not None}}
+    if "eigenvalues" not in chosen:
+        dt, duration = (chosen.get(key, getattr(Config, key)) for key in ("dt", "duration"))
+        chosen["eigenvalues"] = smooth_spectrum(system, dt, duration).eigenvalues
+    return Config(pipeline, **{**chosen, "eigenvalues": tuple(np.round(chosen["eigenvalues"], 6).tolist())})
 
 
 def eigenvalues(system: System) -> tuple[float, ...]:

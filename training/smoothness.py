@@ -25,6 +25,7 @@ FINEST = 0.05  # least sampling interval in multiples of 1 / rate; finer ones on
 AT_REST = 1e-6  # part of X's half-width below which the variation of a state no longer counts
 SLOWEST, FASTEST = 1 / 6, 8.0  # slow ends of the first and the last interval, in multiples of the rate
 STEP = 2**0.5  # from one interval to the next
+FORGOTTEN = 30.0  # times 1 / |slow end|, by which a filter has forgotten its start
 SPREAD = 4.0  # fast end of an interval over its slow end
 FASTEST_MODE = 0.5  # bound of |fast end| * dt
 
@@ -135,7 +136,7 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
     return Smoothness(spectrum, float(near), roughness, exponent)
 
 
-def intervals(system: System, dt: float) -> list[Spectrum]:
+def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
     """Spectra to choose from, slow ones first: 2 nx + 1 real eigenvalues for each output, even in the logarithm.
 
     Parameters
@@ -144,6 +145,8 @@ def intervals(system: System, dt: float) -> list[Spectrum]:
         Any system.
     dt : float
         Sampling interval in seconds, which bounds the fast ones.
+    duration : float, default infinity
+        Length of trajectories in seconds, which bounds the slow ones: filters are to forget their starts on them.
 
     Returns
     -------
@@ -158,11 +161,12 @@ def intervals(system: System, dt: float) -> list[Spectrum]:
     slowest, rate = SLOWEST, typical_rate(system)
     fastest = max(slowest, min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate)))
     slow = rate * np.geomspace(slowest, fastest, 1 + round(np.log(fastest / slowest) / np.log(STEP)))
+    slow = slow[slow >= min(FORGOTTEN / duration, slow[-1])]
     return [Spectrum(tuple(float(f"{v:.6g}") for v in evenly_spaced(2 * system.nx + 1, -a, -SPREAD * a))) for a in slow]
 
 
 @functools.cache
-def smooth_spectrum(system: System, dt: float) -> Spectrum:
+def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spectrum:
     """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best.
 
     Parameters
@@ -171,11 +175,13 @@ def smooth_spectrum(system: System, dt: float) -> Spectrum:
         Any system.
     dt : float
         Sampling interval in seconds.
+    duration : float, default infinity
+        Length of trajectories in seconds, on which its filter is to forget its start.
 
     Returns
     -------
     Spectrum
-        Always the same for the same system and dt. If no interval makes T smooth, the one that comes closest to it; if
+        Always the same for the same arguments. If no interval makes T smooth, the one that comes closest to it; if
         all motions are at rest before, the fastest.
 
     Raises
@@ -184,7 +190,7 @@ def smooth_spectrum(system: System, dt: float) -> Spectrum:
         If the system does not say how fast f changes, or motions leave its bounds too soon.
     """
     found = []
-    for one in smoothness(system, intervals(system, dt), dt):
+    for one in smoothness(system, intervals(system, dt, duration), dt):
         if one.smooth:
             return one.spectrum
         found.append(one)

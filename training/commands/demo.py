@@ -57,11 +57,11 @@ class Demo:
         table = Table(
             "environment",
             "default",
-            "after 20 %",
+            "late",
             "SPINN",
-            "after 20 %",
-            "µs per step",
-            title=f"SMAPE in %, one episode each, measurement noise {self.measurement_noise:g}",
+            "late",
+            "µs a step",
+            title=f"SMAPE in %, all steps and late (after 20 %), measurement noise {self.measurement_noise:g}",
         )
         episodes = []
         with progress_bars(console) as progress:

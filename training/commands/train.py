@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kkl_gym.systems import get_system
-from training.config import Config, Pipeline, override, read_changes, setting_types
+from training.config import Config, Pipeline, read_changes, setting_types
 from training.presets import CLOSED_LOOP, Preset, preset
 
 
@@ -53,7 +53,7 @@ class Train:
     pipeline: Annotated[Pipeline, tyro.conf.arg(aliases=["--method"])] = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
-    """fast: about ten minutes on two CPU cores; it made the shipped maps. paper: the paper's sizes."""
+    """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Path | None = None
@@ -96,7 +96,7 @@ class Train:
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
-        config = override(preset(system, self.pipeline, self.preset), changes)
+        config = preset(system, self.pipeline, self.preset, changes=changes)
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
         name += "-closed-loop" if config.closed_loop_trajectories else ""
         folder = self.out or Path("runs") / name

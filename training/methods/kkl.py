@@ -141,7 +141,7 @@ class SPINN(KKLMethod):
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
-        config = within(preset(task.system, "spinn", "fast"), task.budget, task.seed)
         fastest, slowest = configuration["spectrum"]
-        config = replace(config, eigenvalues=spectrum(task.system, fastest, slowest), pairs=(), box_factor=1.0)
+        changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
+        config = within(preset(task.system, "spinn", "fast", changes=changes), task.budget, task.seed)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
