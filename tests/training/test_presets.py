@@ -15,3 +15,15 @@ def test_paper_preset_has_the_papers_table():
     assert (max(config.eigenvalues), min(config.eigenvalues)) == (-1.5, -3.0)
     assert isinstance(config, Config)
     assert all(value < 0 for value in presets.eigenvalues(Oscillator()))
+
+
+def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectrum_that_is_given(monkeypatch):
+    for duration in (50.0, 200.0):
+        config = preset(Oscillator(), "spinn", "fast", changes={"duration": duration, "width": None})
+        assert -max(config.eigenvalues) * duration >= 30
+        assert config.duration == duration
+    monkeypatch.delattr(presets, "smooth_spectrum")
+    given = {"eigenvalues": (-1.0, -2.0), "dt": 0.1, "seed": 3}
+    config = preset(Oscillator(), "spinn", "fast", changes=given)
+    assert {name: getattr(config, name) for name in given} == given
+    assert config.adaptive

@@ -173,8 +173,8 @@ def draw(path: Path, episodes: Sequence[Episode], measurement_noise: float) -> N
             if C is not None and np.array_equal(C[0], np.eye(system.nx)[i]):
                 ax.plot(t, episode.y[:, 0], color="0.75", lw=0.6, label="measured")
             ax.plot(t, episode.x[:, i], "k", lw=1.2, label="true")
-            ax.plot(t, episode.x_hat[:, i], "m--", lw=1.0, label="estimated")
-            ax.plot(t, episode.spinn[:, i], ":", color="tab:blue", lw=1.2, label="estimated by SPINN")
+            ax.plot(t, episode.x_hat[:, i], "m--", lw=1.0, label="default observer")
+            ax.plot(t, episode.spinn[:, i], ":", color="tab:blue", lw=1.2, label="SPINN")
             low, high = episode.x[:, i].min(), episode.x[:, i].max()
             ax.set_ylim(low - 0.25 * (high - low), high + 0.25 * (high - low))  # the first estimates may be far off
             ax.set_ylabel(system.state_names[i])
