@@ -545,7 +545,7 @@ def test_a_report_says_which_observers_are_missing(tmp_path):
     shutil.copy(RESULTS / "benchmark" / "results.csv", tmp_path)
     Benchmark(report=True, out=tmp_path).run(quiet())
     page = (tmp_path / "table.md").read_text()
-    assert "Partial: 46 of 52 observers. Missing: dmf; node on lorenz; gru on lorenz.\n" in page
+    assert "Partial: 50 of 56 observers. Missing: dmf; node on lorenz; gru on lorenz.\n" in page
 
 
 def test_levels_of_noise_by_both_names(toy, tiny, tmp_path):
