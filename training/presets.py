@@ -81,7 +81,7 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
             transients=False,
         )
         return override(config, changes)
-    chosen: dict[str, Any] = {"box_factor": 2.0, "forward_steps": 10_000, "adaptive": True, "noise_free_share": 0.35}
+    chosen: dict[str, Any] = {"box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
     chosen |= {**profile(system).spinn_settings, **{key: value for key, value in changes.items() if value is not None}}
     if "eigenvalues" not in chosen:
         dt, duration = (chosen.get(key, getattr(Config, key)) for key in ("dt", "duration"))

@@ -26,4 +26,4 @@ def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectr
     given = {"eigenvalues": (-1.0, -2.0), "dt": 0.1, "seed": 3}
     config = preset(Oscillator(), "spinn", "fast", changes=given)
     assert {name: getattr(config, name) for name in given} == given
-    assert config.adaptive
+    assert config.box_factor == 2.0

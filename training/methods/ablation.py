@@ -66,7 +66,7 @@ class PapersSPINN(Ablation):
     pipeline: ClassVar[Pipeline] = "spinn"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """All that the package's SPINN has beyond the paper's; each class below gives one of it back."""
+        """All that the package's SPINN has beyond the paper's; each class below gives some of it back."""
         papers = {
             **super().changes(task),
             "optimiser": "adam",
@@ -136,22 +136,25 @@ class SPINNOfAnyAge(SolvedSPINN):
 
 
 class AdaptiveSPINN(SPINNOfAnyAge):
-    """The same with points where the residual is large drawn more often: the preset."""
+    """The same with points where the residual is large drawn more often."""
 
     name: ClassVar[str] = "ablation-spinn-adaptive"
     label: ClassVar[str] = "... adaptive points"
-    own: ClassVar[tuple[str, ...]] = ("adaptive",)
+
+    def changes(self, task: Task) -> Mapping[str, Any]:
+        """One setting more."""
+        return {**super().changes(task), "adaptive": True}
 
 
 class LipschitzSPINN(AdaptiveSPINN):
-    """The preset with a penalty on the Lipschitz constant of T_inv."""
+    """The same with a penalty on the Lipschitz constant of T_inv."""
 
     name: ClassVar[str] = "ablation-spinn-lipschitz"
     label: ClassVar[str] = "... Lipschitz penalty"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """One setting."""
-        return {"lipschitz_penalty": PENALTY}
+        """One setting more."""
+        return {**super().changes(task), "lipschitz_penalty": PENALTY}
 
 
 class Transients(Ablation):

@@ -16,7 +16,7 @@ from observers import Artifact, LinearFilter
 from training.benchmark.protocol import run
 from training.maps.smooth import decoder
 from training.methods import ABLATION, METHODS, Budget, Task, get_method
-from training.methods.ablation import PapersSPINN
+from training.methods.ablation import PENALTY, PapersSPINN
 from training.methods.autoencoder import _Problem as _AEProblem
 from training.methods.dmf import FORGET, Switching
 from training.methods.gru import Recurrent, _Network
@@ -278,15 +278,15 @@ def test_each_step_from_the_papers_spinn_to_the_presets_gives_back_what_it_says(
     names = {"SOAP": {"optimiser", "learning_rate", "batch"}, "smooth T": {"eigenvalues", "pairs"}}
     names |= {"along motions": {"collocation", "box_factor"}, "relative errors": {"scaling"}}
     names |= {"output layer solved": {"solved_output_layer"}, "transients and noise": {"transients"}}
-    names |= {"adaptive points": {"adaptive"}}
-    for method in steps[1:-1]:
+    for method in steps[1:-2]:
         after = method.changes(task)
         assert {**before, **after} == before
         assert set(before) - set(after) == names.pop(method.label.removeprefix("... ").removeprefix("by "))
         before = after
     assert not names
-    assert not before  # the preset
-    assert set(steps[-1].changes(task)) == {"lipschitz_penalty"}
+    assert before == {"adaptive": False}  # otherwise the preset
+    assert steps[-2].changes(task) == {"adaptive": True}
+    assert steps[-1].changes(task) == {"adaptive": True, "lipschitz_penalty": PENALTY}
 
 
 @pytest.mark.parametrize("name", sorted(METHODS | ABLATION))
