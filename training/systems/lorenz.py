@@ -9,7 +9,7 @@ from training.systems.task import ControlTask
 
 PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -1.5, -25.0),  # faster than the others', as its flow is
-    spinn_settings={"adaptive": True, "eigenvalues": evenly_spaced(9, -9.0, -40.0)},
+    spinn_settings={"eigenvalues": evenly_spaced(9, -9.0, -40.0)},
     settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
     fault_deadline=2.0,
     task=ControlTask("lorenz", duration=5.0),  # the input is weak

@@ -9,7 +9,7 @@ from training.systems.task import ControlTask
 
 PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -0.4, -8.0),
-    spinn_settings={"adaptive": True, "eigenvalues": evenly_spaced(9, -3.0, -20.0)},
+    spinn_settings={"eigenvalues": evenly_spaced(9, -3.0, -20.0)},
     fault_deadline=2.0,
     task=ControlTask("rossler", period=0.1, duration=30.0),
     agent_observer="rossler-v1",  # on which the results in docs/agents.md rest
