@@ -91,7 +91,7 @@ class SPINNBySOAP(PapersSPINN):
     """The same by SOAP."""
 
     name: ClassVar[str] = "ablation-spinn-soap"
-    label: ClassVar[str] = "... by SOAP"
+    label: ClassVar[str] = "SPINN by SOAP"
     own: ClassVar[tuple[str, ...]] = ("optimiser", "learning_rate", "batch")
 
 

@@ -275,13 +275,13 @@ def test_each_step_from_the_papers_spinn_to_the_presets_gives_back_what_it_says(
     task = Task(VanDerPol(), SMALL, tmp_path)
     steps = [cls() for cls in ABLATION.values() if issubclass(cls, PapersSPINN)]
     before = steps[0].changes(task)
-    names = {"SOAP": {"optimiser", "learning_rate", "batch"}, "smooth T": {"eigenvalues", "pairs"}}
+    names = {"SPINN by SOAP": {"optimiser", "learning_rate", "batch"}, "smooth T": {"eigenvalues", "pairs"}}
     names |= {"along motions": {"collocation", "box_factor"}, "relative errors": {"scaling"}}
     names |= {"output layer solved": {"solved_output_layer"}, "transients and noise": {"transients"}}
     for method in steps[1:-2]:
         after = method.changes(task)
         assert {**before, **after} == before
-        assert set(before) - set(after) == names.pop(method.label.removeprefix("... ").removeprefix("by "))
+        assert set(before) - set(after) == names.pop(method.label.removeprefix("... "))
         before = after
     assert not names
     assert before == {"adaptive": False}  # otherwise the preset
