@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,6 +41,34 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
         raise ValueError(f"{name!r} is {found!r}, not a subclass of {package}.{base.__name__}")
+    return found
+
+
+def load_function(name: str) -> Callable[..., Any]:
+    """Find a function by where it is written.
+
+    Parameters
+    ----------
+    name : str
+        ``"package.module:function"`` or ``"path/to/script.py:function"``.
+
+    Returns
+    -------
+    callable
+        The function.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be found or called.
+    """
+    where, _, function_name = name.rpartition(":")
+    try:
+        found = getattr(_module(where), function_name)
+    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
+        raise ValueError(f"cannot load the function {name!r}: {error}") from error
+    if not callable(found):
+        raise ValueError(f"{name!r} is {found!r}, not a function")
     return found
 
 
