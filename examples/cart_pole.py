@@ -36,6 +36,7 @@ class CartPole(kkl_gym.System):
     X: ClassVar = ((-1.0, 1.0), (-1.0, 1.0), (-0.2, 0.2), (-1.0, 1.0))
     bounds: ClassVar = ((-4.8, 4.8), (-10.0, 10.0), (-0.8, 0.8), (-10.0, 10.0))
     u_max: ClassVar = (10.0,)  # N
+    measurement_noise: ClassVar = 0.02  # m and rad
 
     def _terms(self, x):
         """Total mass, the pole's moment, and what both accelerations are divided by."""
