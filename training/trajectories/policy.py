@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from kkl_gym.system import System
 from training.trajectories.controllers import Controller
 from training.trajectories.signals import random_signals
 
-EXACT = 4  # every fourth trajectory is the policy's own, without error and exploration
 ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
 EXPLORATION = 0.5  # largest amplitude of what is added to a policy's action, in input bounds
 SIGNALS = ("steps", "sine")
@@ -25,15 +23,14 @@ def under_policy(
     steps: int,
     dt: float,
     rng: np.random.Generator,
+    own: np.ndarray,
     w: np.ndarray | None = None,
-    numbers: Sequence[int] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy that errs about the state and explores.
 
     A policy that acts on the true state would tell the observer, which filters the input, what it is to find out by
     itself. So each trajectory has an error of its own, which is added to the state before the policy sees it, and
-    something of its own is added to the action. Both are held or swing, at random sizes and rates. Every fourth
-    trajectory is the policy's own.
+    something of its own is added to the action. Both are held or swing, at random sizes and rates.
 
     Parameters
     ----------
@@ -49,10 +46,10 @@ def under_policy(
         Their length in seconds; actions are held over each.
     rng : Generator
         Of errors and exploration.
+    own : ndarray of bool, shape (n,)
+        Which of the trajectories are the policy's own, without either.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval.
-    numbers : sequence of int, length n, optional
-        Of the trajectories, of which every fourth is the policy's own; by default 0, 1, 2, ...
 
     Returns
     -------
@@ -66,8 +63,7 @@ def under_policy(
     error *= np.exp(rng.uniform(np.log(ERROR[0]), np.log(ERROR[1]), n))[:, None]
     exploration = random_signals((1.0,) * system.nu, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=SIGNALS)
     exploration *= EXPLORATION * rng.random(n)[:, None]
-    exact = np.arange(n) % EXACT == 0 if numbers is None else np.array(numbers) % EXACT == 0
-    error[:, exact] = exploration[:, exact] = 0.0
+    error[:, own] = exploration[:, own] = 0.0
     u = np.zeros((steps, n, system.nu))
 
     def act(k: int, x: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ FIRST = 100  # trajectories tried before all others
 FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
+POLICYS_OWN = 4  # every fourth trajectory under a policy is its own, the others are also explored
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 
@@ -242,8 +243,8 @@ def _simulated(
         level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
         w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
     if motions.policy:
-        numbers = [i for i, _ in rows]
-        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, w=w, numbers=numbers)
+        own = np.array([i % POLICYS_OWN == 0 for i, _ in rows])
+        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
     else:
         x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
     return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))

@@ -9,35 +9,26 @@ from unstable_system import Falling
 from kkl_gym.simulate import simulate
 from training import train
 from training.systems import controller, named_policy
-from training.trajectories.policy import EXACT, under_policy
-from training.trajectories.record import Motions, trajectories
+from training.trajectories.policy import under_policy
+from training.trajectories.record import POLICYS_OWN, Motions, trajectories
 
 SYSTEM = Falling()
 
 
-def moved(n=40, steps=300, **options):
-    x0 = SYSTEM.draw_starts(np.random.default_rng(1), n)
-    rng = np.random.default_rng(0)
-    return under_policy(SYSTEM, controller(SYSTEM), x0, steps=steps, dt=SYSTEM.dt, rng=rng, **options)
+def exact(x):
+    """What the policy does on the true states."""
+    return controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
 
 
-def test_inputs_are_the_policys_on_a_wrong_state_and_every_fourth_its_own():
-    x, u = moved()
-    own = controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(u.shape) * SYSTEM.u_max
-    np.testing.assert_array_equal(u[:, ::EXACT], own[:, ::EXACT])
-    others = np.arange(40) % EXACT != 0
-    apart = np.abs(u - own)[:, others].max((0, 2))
-    assert (apart > 0).all()
-    assert np.median(apart) > 0.2
+def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
+    rng, own = np.random.default_rng(0), np.arange(40) % 3 == 1
+    x0 = SYSTEM.draw_starts(rng, 40)
+    x, u = under_policy(SYSTEM, controller(SYSTEM), x0, steps=300, dt=SYSTEM.dt, rng=rng, own=own)
+    apart = np.abs(u - exact(x)).max((0, 2))
+    np.testing.assert_array_equal(apart == 0, own)
+    assert np.median(apart[~own]) > 0.2
     assert np.abs(u).max() <= SYSTEM.u_max[0]
-    np.testing.assert_array_equal(x, simulate(SYSTEM, x[0], 300, SYSTEM.dt, u=u))
-
-
-def test_the_policys_own_are_told_by_their_numbers():
-    numbers = np.arange(40) + 1
-    x, u = moved(numbers=numbers)
-    own = controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(u.shape) * SYSTEM.u_max
-    np.testing.assert_array_equal((u == own).all((0, 2)), numbers % EXACT == 0)
+    np.testing.assert_array_equal(x, simulate(SYSTEM, x0, 300, SYSTEM.dt, u=u))
 
 
 def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
@@ -45,7 +36,8 @@ def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
         assert np.isfinite(x).all()
         return np.zeros((len(x), 1))
 
-    x, _ = under_policy(SYSTEM, letting_go, np.full((4, 2), 0.3), steps=300, dt=SYSTEM.dt, rng=np.random.default_rng(0))
+    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
+    x, _ = under_policy(SYSTEM, letting_go, np.full((4, 2), 0.3), steps=300, dt=SYSTEM.dt, rng=rng, own=own)
     assert np.isnan(x[-1]).any()
 
 
@@ -56,8 +48,9 @@ def test_an_unstable_plant_is_held_by_a_policy_alone():
     motions = Motions(("steps",), process_noise_share=0.5, policy=controller(SYSTEM))
     found = list(trajectories(SYSTEM, **sizes, rng=np.random.default_rng(0), motions=motions))
     assert sum(x.shape[1] for x, _, _ in found) == 30
-    assert found[0][1].any(axis=(0, 2)).all()
-    assert found[0][2].any()
+    (x, u, level), *_ = found
+    np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
+    assert level.any()
 
 
 def test_an_observer_is_trained_under_a_policy_and_says_so(tmp_path):
