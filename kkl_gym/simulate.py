@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
@@ -137,6 +138,11 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
     -------
     sequence of float, length nx
         State at the end. It may be infinite or NaN if the motion escapes.
+
+    Raises
+    ------
+    EquationError
+        If the equations fail, or return something else than components.
     """
     try:
         need = system.rate(x) * dt * PER_RATE
@@ -149,6 +155,9 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
         return runge_kutta(len(x))(field, x, d, dt / n, n)
     except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
         return (math.nan,) * len(x)
+    except Exception as error:
+        blame(error, system, x)
+        raise
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
@@ -171,7 +180,20 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     -------
     ndarray, shape (nx, n)
         States at the end; columns that escape are NaN.
+
+    Raises
+    ------
+    EquationError
+        If the equations fail, or return something else than components.
     """
+    try:
+        return _advance_batch(system, x, u, w, dt)
+    except Exception as error:
+        blame(error, system, x)
+        raise
+
+
+def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
         if (need <= 1).all():

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import besselap
 
+from kkl_gym import equations
 from kkl_gym.system import System
 from observers import LinearFilter
 
@@ -134,7 +135,7 @@ def typical_rate(system: System, rng: np.random.Generator | None = None) -> floa
     """
     low, high = system.box()
     points = (rng or np.random.default_rng(0)).uniform(low, high, (1000, system.nx)).T
-    rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
+    rate = float(np.median(np.broadcast_to(equations.rate(system, points), 1000)))
     if not 0 < rate < np.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate
