@@ -100,6 +100,32 @@ def input_matrix(system: Any, x: Any) -> Any:
     return rows
 
 
+def next_state(system: Any, x: Any, u: Any) -> Any:
+    """Call a system's step, and check what comes back.
+
+    Parameters
+    ----------
+    system : System
+        A system in discrete time.
+    x, u : sequence of length nx, nu
+        As for :func:`components`.
+
+    Returns
+    -------
+    sequence of length nx
+        The next state, untouched.
+
+    Raises
+    ------
+    EquationError
+        As :func:`components`.
+    """
+    values = _called(system.step, x, u)
+    wanted = f"{len(x)} components, one for each state"
+    _check_components(system.step, values, len(x), like=x[0], wanted=wanted)
+    return values
+
+
 def rate(system: Any, x: Any) -> Any:
     """Call a system's rate, and check what comes back.
 
@@ -141,14 +167,16 @@ def check_equations(system: Any, x: tuple[float, ...]) -> None:
     EquationError
         If f or h is missing, an equation fails, or what it returns is wrong or not finite.
     """
-    for equations in (system.f, system.h):
+    moves = system.step if system.discrete else system.f
+    for equations in (moves, system.h):
         if _is_default(equations):
             raise EquationError(f"{type(system).__name__} defines no {_name(equations)}(self, x)")
-    for equations in (system.f, system.h):
-        values = components(equations, x)
+    moved = next_state(system, x, (0.0,) * system.nu) if system.discrete else components(system.f, x)
+    for equations, values in ((moves, moved), (system.h, components(system.h, x))):
         if not all(math.isfinite(value) for value in values):
             raise EquationError(f"{_label(equations)}{_defined(equations)} returned {_shown(values)}; {_held(x)}, in X")
-    input_matrix(system, x)
+    if not system.discrete:
+        input_matrix(system, x)
     if not 0 <= rate(system, x) < math.inf:
         raise _returned(system.rate, "a finite number in 1/s, not below zero", f"{rate(system, x)}; {_held(x)}")
     _check_target(system, len(x))
@@ -173,7 +201,7 @@ def _check_target(system: Any, nx: int) -> None:
 
 
 def blame(error: Exception, system: Any, x: Any) -> None:
-    """Raise an EquationError if an exception comes from a system's f, g or rate, and return otherwise.
+    """Raise an EquationError if an exception comes from a system's f, g, step or rate, and return otherwise.
 
     Parameters
     ----------
@@ -191,34 +219,38 @@ def blame(error: Exception, system: Any, x: Any) -> None:
     """
     if isinstance(error, EquationError | NotImplementedError):
         return
-    for equations in (system.f, system.g, system.rate):
+    for equations in (system.f, system.g, system.step, system.rate):
         if not _is_default(equations) and steps_within(error, _code(equations)):
             raise _failure(error, equations, x) from error
     with np.errstate(all="ignore"):  # what they return then did not go through
-        components(system.f, x)
-        input_matrix(system, x)
+        if system.discrete:
+            next_state(system, x, [0.0 * x[0]] * system.nu)
+        else:
+            components(system.f, x)
+            input_matrix(system, x)
         rate(system, x)
 
 
-def _called(equations: Callable[[Any], Any], x: Any) -> Any:
+def _called(equations: Callable[..., Any], x: Any, *u: Any) -> Any:
     try:
-        return equations(x)
+        return equations(x, *u)
     except NotImplementedError:  # says by itself what is missing
         raise
     except Exception as error:  # whatever a user's code raises
         raise _failure(error, equations, x) from error
 
 
-def _failure(error: Exception, equations: Callable[[Any], Any], x: Any) -> EquationError:
+def _failure(error: Exception, equations: Callable[..., Any], x: Any) -> EquationError:
     what = f"{type(error).__name__}: {error}"
     steps = steps_within(error, _code(equations))
     if not steps:
+        taken = _arguments(equations)
         try:
-            inspect.signature(equations).bind(x)
+            inspect.signature(equations).bind(*taken)
         except TypeError:
             return EquationError(
-                f"{_label(equations)}{_defined(equations)} cannot be called with x alone ({what}): "
-                f"define {_name(equations)}(self, x)"
+                f"{_label(equations)}{_defined(equations)} cannot be called with {' and '.join(taken)} alone ({what}): "
+                f"define {_name(equations)}(self, {', '.join(taken)})"
             )
         return EquationError(f"{_label(equations)}{_defined(equations)} failed: {what}; {_held(x)}")
     frame = steps[0].tb_frame
@@ -299,13 +331,17 @@ def _returned(equations: Any, wanted: str, found: str) -> EquationError:
 
 def _label(equations: Any) -> str:
     system = getattr(getattr(equations, "__self__", None), "name", None)
-    return f"{_name(equations)}(x)" + ("" if system is None else f" of {system!r}")
+    return f"{_name(equations)}({', '.join(_arguments(equations))})" + ("" if system is None else f" of {system!r}")
+
+
+def _arguments(equations: Any) -> tuple[str, ...]:
+    return ("x", "u") if _name(equations) == "step" else ("x",)
 
 
 def _name(equations: Any) -> str:
     """The name of a method, which may have been assigned from a function of another name."""
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
-    names = (name for name in ("f", "g", "h", "rate") if function and getattr(kind, name, None) is function)
+    names = (name for name in ("f", "g", "h", "rate", "step") if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
 
 
