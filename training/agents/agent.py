@@ -1,6 +1,5 @@
 """Trained agents: a policy in NumPy, with everything needed to play it."""
 
-import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -42,7 +41,7 @@ class Agent:
     observer : str, optional
         Name and version of the shipped map, or path of the file, that it was trained on.
     fingerprint : str, optional
-        SHA-256 of that file.
+        Checksum of what that file holds.
     rules : mapping, optional
         What else its observations follow from, see :func:`rules`.
     training : mapping, optional
@@ -214,7 +213,7 @@ def versioned(observer: str) -> str:
 
 
 def fingerprint(observer: str) -> str:
-    """Return the SHA-256 of an observer's file.
+    """Return the checksum of what an observer's file holds.
 
     Parameters
     ----------
@@ -224,7 +223,7 @@ def fingerprint(observer: str) -> str:
     Returns
     -------
     str
-        The digest in hexadecimal.
+        As :func:`observers.storage.checksum` gives it.
 
     Raises
     ------
@@ -232,6 +231,6 @@ def fingerprint(observer: str) -> str:
         If there is no such file.
     """
     try:
-        return hashlib.sha256(resolve(observer).read_bytes()).hexdigest()
-    except (OSError, ArtifactError) as error:
+        return storage.checksum(resolve(observer), ArtifactError)
+    except ArtifactError as error:
         raise AgentError(f"the agent's observer cannot be read: {error}") from error

@@ -1,5 +1,6 @@
 """Training, saving and playing agents, at toy size."""
 
+import hashlib
 import json
 import os
 import re
@@ -11,10 +12,12 @@ import pytest
 import torch
 from PIL import Image
 from safetensors import safe_open
+from safetensors.numpy import save as serialise
 from safetensors.numpy import save_file
 from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
+from observers.artifact import resolve
 from training.agents import SB3VecEnv
 from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.information import observer_of
@@ -103,7 +106,10 @@ def test_mismatches_are_errors(learned, saved, tmp_path):
 
 def test_damaged_and_foreign_files(learned, saved, tmp_path):
     _, folder = learned
-    content = (folder / "agent.safetensors").read_bytes()
+    with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+        text = opened.metadata()["kkl-gym-agent"]
+    content = serialise(tensors, metadata={"kkl-gym-agent": text})  # whose checksum nobody has to mend
     cases = {
         "truncated": (content[:-7], "damaged"),
         "empty": (b"", "damaged"),
@@ -123,6 +129,26 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         Agent.read(tmp_path / "none.safetensors")
     with pytest.raises(AgentError, match="no agent 'nothing' ships"):
         find("nothing")
+
+
+def test_random_flipped_bits_are_all_noticed(tmp_path):
+    path, whole, rng = tmp_path / "agent.safetensors", find("lorenz").read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(8 * len(whole), size=100):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        with pytest.raises(AgentError, match=re.escape(str(path))):
+            Agent.read(path)
+
+
+@pytest.mark.parametrize("name", ["van_der_pol-closed-loop-v1", "lorenz-v1"])
+def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
+    """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
+    with safe_open(resolve(name), framework="numpy") as opened:
+        tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
+        save_file(tensors, tmp_path / "old.safetensors", metadata={"kkl-gym": opened.metadata()["kkl-gym"]})
+    before = hashlib.sha256((tmp_path / "old.safetensors").read_bytes()).hexdigest()
+    assert fingerprint(str(tmp_path / "old.safetensors")) == before == fingerprint(name)
 
 
 @pytest.fixture
@@ -168,6 +194,8 @@ def test_metadata_nested_without_end(tmp_path):
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
+    with safe_open(find(name), framework="numpy") as opened:
+        assert len(opened.metadata()["kkl-gym-agent-sha256"]) == 64
     Agent.read(find(name)).save(tmp_path / "new" / "agent.safetensors")
     assert (tmp_path / "new" / "agent.safetensors").read_bytes() == find(name).read_bytes()
     assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
