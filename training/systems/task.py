@@ -19,7 +19,7 @@ class ControlTask:
     ----------
     system : str or System
         A shipped name, "module:Class" or "script.py:Class", or the system itself. Agents can be saved with a name only.
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     period : float
         Seconds for which an action is held; the observer sees every sample within.
@@ -39,7 +39,7 @@ class ControlTask:
     """
 
     system: str | System
-    measurement_noise: float = 0.5
+    measurement_noise: float | tuple[float, ...] = 0.5
     period: float = 0.05
     duration: float = 20.0
     start_box: Box | None = None
@@ -47,7 +47,7 @@ class ControlTask:
     dt: float = 0.01
 
     def __post_init__(self) -> None:
-        for name in ("measurement_noise", "period", "duration", "tolerance", "dt"):
+        for name in ("period", "duration", "tolerance", "dt"):
             if not is_finite(getattr(self, name)):
                 raise ValueError(f"a task's {name} must be a finite number, got {getattr(self, name)!r}")
         if not self.tolerance > 0 or not 0 < self.dt <= self.period <= self.duration:
