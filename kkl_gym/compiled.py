@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance_batch, runge_kutta
+from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance_batch, check_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
 
@@ -122,6 +122,8 @@ def compiled_step(system: System) -> Step:
     import numba
     import sympy
 
+    if system.discrete:
+        raise ValueError(f"{system.name} is not integrated: it makes its step itself")
     compiled = numba.njit(error_model="numpy")  # a division by zero is infinite, not an exception
     nx, nu = system.nx, system.nu
     x, u = (list(sympy.symbols(f"{letter}:{n}", real=True)) for letter, n in (("x", nx), ("u", nu)))
@@ -148,16 +150,19 @@ def compiled_step(system: System) -> Step:
     # Indexed by numbers, not by loops, so that a row's state never leaves the processor's registers.
     lines = [
         "def kernel(x, u, w, dt, out):",
+        "    lost = False",
         "    for row in range(x.shape[1]):",
         f"        need = rate({tupled(states)}) * dt * {PER_RATE!r}",
         f"        if not need <= {MAX_SUBSTEPS}:",
         "            out[:, row] = nan",
+        "            lost = True",
         "            continue",
         "        n = 1",
         "        while n < need:",
         "            n *= 2",
         f"        end = integrate(field, {tupled(states + inputs)}, {tupled(noise + ['0.0'] * nu)}, dt / n, n)",
         *[f"        out[{i}, row] = end[{i}]" for i in range(nx)],
+        "    return lost",
     ]
     namespace: dict[str, Any] = {
         "field": compiled(field),
@@ -171,9 +176,11 @@ def compiled_step(system: System) -> Step:
     def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
         out = np.empty(x.shape)
         try:
-            kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
+            lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
         except ArithmeticError:  # negative powers of zero, which Numba raises even so
             return advance_batch(system, x, u, w, dt)
+        if lost:
+            check_substeps(system, x, dt)
         return out
 
     # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.

@@ -44,19 +44,21 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     ----------
     system : str or System
         A name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
-    dt : float
-        Sampling interval in seconds.
+    dt : float, optional
+        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
     process_noise : float, optional
         Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
-    measurement_noise : float
-        Standard deviation of the Gaussian noise v on each sample of each output.
+    measurement_noise : float or sequence of float, length ny, optional
+        Standard deviation of the Gaussian noise v on each sample, of all outputs or one of each. None takes the
+        system's own: 0.5 for those that ship, and by default 5 % of the range of each output over X.
     observe : {"state", "output"}
         What the agent sees.
     parameters : mapping of str to float, optional
         Physical parameters of the system, by name, where they differ from its defaults.
     start_box : tuple of (float, float), length nx, optional
-        (low, high) of each state, where episodes start; None is the system's training box.
+        (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
+        its starts.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
 
@@ -85,9 +87,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self,
         system: str | System,
         *,
-        dt: float = 0.01,
+        dt: float | None = None,
         process_noise: float | None = None,
-        measurement_noise: float = 0.5,
+        measurement_noise: float | Sequence[float] | None = None,
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,

@@ -39,6 +39,10 @@ _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 VectorField = Callable[[Any], Any]
 
 
+class SubstepsError(ValueError):
+    """A sampling interval would need more substeps than MAX_SUBSTEPS: it is too long, or the system too fast."""
+
+
 @functools.cache
 def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, int], tuple[Any, ...]]:
     """The Runge–Kutta step of ``STAGES`` and ``WEIGHTS`` for ``nx`` components, written out and compiled.
@@ -137,10 +141,18 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
     -------
     sequence of float, length nx
         State at the end. It may be infinite or NaN if the motion escapes.
+
+    Raises
+    ------
+    SubstepsError
+        If a state within the system's bounds moves too fast for this interval.
     """
     try:
+        if system.discrete:
+            return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
         need = system.rate(x) * dt * PER_RATE
         if not need <= MAX_SUBSTEPS:  # far outside any declared bounds, or not a number
+            check_substeps(system, np.array(x, dtype=float)[:, None], dt)
             return (math.nan,) * len(x)
         n = 1
         while n < need:
@@ -171,12 +183,22 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     -------
     ndarray, shape (nx, n)
         States at the end; columns that escape are NaN.
+
+    Raises
+    ------
+    SubstepsError
+        If a state within the system's bounds moves too fast for this interval.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        if system.discrete:
+            moved = system.step(x, u)
+            return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
         need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
         if (need <= 1).all():
             return _step_batch(system, x, u, w, dt)
         lost = ~(need <= MAX_SUBSTEPS)
+        if lost.any():
+            check_substeps(system, x[:, lost], dt)
         mantissa, exponent = np.frexp(np.where(lost, 1, np.maximum(need, 1)))
         substeps = 1 << (exponent - (mantissa == 0.5))  # the power of two that is not less than need
         h = dt / substeps
@@ -186,6 +208,38 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
             out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
         out[:, lost] = np.nan
         return out
+
+
+def check_substeps(system: System, x: np.ndarray, dt: float) -> None:
+    """Raise an error if states within the bounds need more substeps than are made.
+
+    Beyond the bounds they need not be followed, and where the rate is no number the motion has escaped.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : ndarray, shape (nx, n)
+        States, component first.
+    dt : float
+        Sampling interval in seconds.
+
+    Raises
+    ------
+    SubstepsError
+        With a state, its rate and a sampling interval that would do.
+    """
+    low, high = np.array(system.bounds, dtype=float).T[..., None]
+    with np.errstate(all="ignore"):
+        rate = np.broadcast_to(system.rate(x), x.shape[1:])
+        fast = ((x >= low) & (x <= high)).all(0) & (rate * dt * PER_RATE > MAX_SUBSTEPS) & np.isfinite(rate)
+    if fast.any():
+        worst = int(np.where(fast, rate, -1.0).argmax())
+        raise SubstepsError(
+            f"{system.name} changes at a rate of {rate[worst]:.4g}/s at x = {x[:, worst].tolist()}, for which dt = "
+            f"{dt:g} s needs more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate[worst]:.2g} "
+            "s, tighten the bounds, or override rate(x) if it says too much"
+        )
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> np.ndarray:
@@ -276,13 +330,18 @@ def check_duration(duration: float, dt: float) -> None:
         raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
 
 
-def check_dt(dt: float) -> None:
+def check_dt(dt: float) -> float:
     """Raise an error unless ``dt`` is a sampling interval.
 
     Parameters
     ----------
     dt : float
         Sampling interval in seconds.
+
+    Returns
+    -------
+    float
+        The same.
 
     Raises
     ------
@@ -291,3 +350,25 @@ def check_dt(dt: float) -> None:
     """
     if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
         raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
+    return dt
+
+
+def check_interval(system: System, dt: float) -> None:
+    """Raise an error if a sampling interval does not suit a system at all.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    dt : float
+        Sampling interval in seconds.
+
+    Raises
+    ------
+    ValueError
+        If the system is in discrete time and has another one; SubstepsError, if it is too long at the middle of X.
+    """
+    if not system.discrete:
+        check_substeps(system, np.mean(system.X, axis=1)[:, None], dt)
+    elif not math.isclose(dt, system.dt, rel_tol=1e-9):
+        raise ValueError(f"{system.name} makes steps of dt = {system.dt} s, and no others: got dt = {dt}")

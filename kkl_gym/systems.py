@@ -29,6 +29,8 @@ class ReverseDuffing(System):
     u_max: ClassVar[tuple[float, ...]] = (1.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 1.5)
+    dt: ClassVar[float] = 0.01
+    measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
         x1, x2 = x
@@ -62,6 +64,8 @@ class VanDerPol(System):
     u_max: ClassVar[tuple[float, ...]] = (5.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 4.0)
+    dt: ClassVar[float] = 0.01
+    measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
         x1, x2 = x
@@ -99,10 +103,13 @@ class Rossler(System):
 
     name: ClassVar[str] = "rossler"
     X: ClassVar[Box] = ((-10, 10), (-10, 10), (0, 20))
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as in the paper, which multiplies the corners
     bounds: ClassVar[Box] = ((-50, 50), (-70, 70), (-5, 500))
     u_max: ClassVar[tuple[float, ...]] = (2.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (8.0, 8.0, 10.0)
+    dt: ClassVar[float] = 0.01
+    measurement_noise: ClassVar[float] = 0.5
     portrait: ClassVar[tuple[int, int]] = (0, 1)
 
     def f(self, x: Components) -> Components:
@@ -150,10 +157,13 @@ class Lorenz(System):
 
     name: ClassVar[str] = "lorenz"
     X: ClassVar[Box] = ((-20, 20), (-30, 30), (0, 50))
+    X_centre: ClassVar[tuple[float, ...]] = (0.0, 0.0, 0.0)  # as Rössler's
     bounds: ClassVar[Box] = ((-60, 60), (-120, 120), (-50, 160))
     u_max: ClassVar[tuple[float, ...]] = (10.0,)
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (15.0, 18.0, 20.0)
+    dt: ClassVar[float] = 0.01
+    measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
         x1, x2, x3 = x

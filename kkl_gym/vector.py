@@ -37,11 +37,11 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         As for :class:`KKLEnv`.
     num_envs : int
         How many.
-    dt : float
-        Sampling interval in seconds.
+    dt : float, optional
+        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
     process_noise : float, optional
         As for :class:`KKLEnv`.
-    measurement_noise : float
+    measurement_noise : float or sequence of float, length ny, optional
         As for :class:`KKLEnv`.
     observe : {"state", "output"}
         What the agent sees.
@@ -79,9 +79,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         system: str | System,
         num_envs: int = 1,
         *,
-        dt: float = 0.01,
+        dt: float | None = None,
         process_noise: float | None = None,
-        measurement_noise: float = 0.5,
+        measurement_noise: float | Sequence[float] | None = None,
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,

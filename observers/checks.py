@@ -67,6 +67,36 @@ def noise_level(name: str, level: Any) -> float:
     return float(level)
 
 
+def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
+    """Return levels of noise as one float for all outputs, or a tuple of one for each.
+
+    Parameters
+    ----------
+    name : str
+        What they are the levels of, for the message.
+    levels : float or sequence of float, length ny
+        The levels.
+    ny : int
+        Number of outputs.
+
+    Returns
+    -------
+    float or tuple of float, length ny
+        The levels; a float if all are the same.
+
+    Raises
+    ------
+    ValueError
+        If there are not ny levels, or one is refused by :func:`noise_level`.
+    """
+    if not isinstance(levels, list | tuple | np.ndarray) or (isinstance(levels, np.ndarray) and levels.ndim == 0):
+        return noise_level(name, levels)
+    if len(levels) != ny:
+        raise ValueError(f"{name} must be one number, or one for each of {ny} outputs, got {shown(levels)}")
+    each = tuple(noise_level(f"{name}[{i}]", level) for i, level in enumerate(levels))
+    return each[0] if len(set(each)) == 1 else each
+
+
 def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
     """Return a whole number as an int.
 

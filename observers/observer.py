@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -48,7 +49,7 @@ class KKLObserver:
     def __init__(
         self,
         artifact: Artifact,
-        measurement_noise: float = 0.5,
+        measurement_noise: float | Sequence[float] = 0.5,
         *,
         process_noise: float | None = None,
         monitor: bool = False,
@@ -73,7 +74,7 @@ class KKLObserver:
         return self._measurement_noise
 
     @measurement_noise.setter
-    def measurement_noise(self, level: float) -> None:
+    def measurement_noise(self, level: float | Sequence[float]) -> None:
         inverse, level = self.artifact.inverse, noise_level("measurement_noise", level)
         if "measurement_noise" in inverse.features and level > inverse.measurement_noise_max:
             raise ValueError(
@@ -470,7 +471,7 @@ def _finite(values: np.ndarray) -> bool:
 
 def load(
     name_or_path: str | os.PathLike[str],
-    measurement_noise: float = 0.5,
+    measurement_noise: float | Sequence[float] = 0.5,
     *,
     process_noise: float | None = None,
     monitor: bool = False,

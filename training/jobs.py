@@ -115,7 +115,7 @@ def describe(system: System) -> dict[str, Any]:
     dict
         To be compared with another after a way through JSON, which makes lists of tuples.
     """
-    x = np.random.default_rng(0).uniform(*system.box(), (20, system.nx))
+    x = system.draw_starts(np.random.default_rng(0), 20)
     rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {

@@ -44,7 +44,7 @@ from training.trajectories.signals import DRIVEN, KINDS
 SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
+CLOSED_LOOP_SECONDS = 20.0  # of each trajectory, at the pace of the shipped systems
 
 
 @dataclass(frozen=True)
@@ -222,7 +222,7 @@ class _Run:
     def points(self, trajectories: Trajectories) -> np.ndarray:
         """States at which T's equation is asked to hold, and x' where there are no transients: (n, nx)."""
         x = trajectories.x.reshape(-1, self.system.nx)
-        return x if self.config.collocation == "motions" else self.rng.uniform(*self.system.box(), x.shape)
+        return x if self.config.collocation == "motions" else self.system.draw_starts(self.rng, len(x))
 
     def learn_forward(self, trajectories: Trajectories, points: np.ndarray) -> ForwardMap:
         """T, trained or solved for."""
@@ -286,7 +286,7 @@ class _Run:
     def close_the_loop(self, sampler: TrajectorySampler, artifact: Artifact, feedback: Controller) -> ClosedLoopSampler:
         """Batches half from trajectories of a controller that acts on the artifact's estimate."""
         config = self.config
-        steps = min(self.steps, round(CLOSED_LOOP_SECONDS / config.dt))
+        steps = min(self.steps, round(CLOSED_LOOP_SECONDS * self.system.pace / config.dt))
         driven = record_closed_loop(
             self.system,
             artifact,

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 
 from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.elementary import exp, sin
-from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance, advance_batch, check_dt, runge_kutta, simulate
+from kkl_gym.simulate import (
+    MAX_SUBSTEPS,
+    PER_RATE,
+    SubstepsError,
+    advance,
+    advance_batch,
+    check_dt,
+    runge_kutta,
+    simulate,
+)
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 DT = 0.01
@@ -247,7 +256,10 @@ def test_huge_states_and_steps_are_nan_without_warning(name):
             assert not np.isfinite(advance(system, x, u, w, DT)).any()
             batch = advance_batch(system, np.array(x)[:, None], np.zeros((1, 1)), np.zeros((system.nx, 1)), DT)
             assert not np.isfinite(batch).any()
-        assert np.isnan(advance(system, [1.0] * system.nx, [0.0], [0.0] * system.nx, 1e6)).all()
+        one = np.ones((system.nx, 1))
+        for step, x in ((advance, one[:, 0]), (advance_batch, one)):
+            with pytest.raises(SubstepsError, match=rf"{name} changes at a rate of .*/s at x = \[.*take dt <= "):
+                step(system, x, 0 * x[: system.nu], 0 * x, 1e6)
 
 
 def test_number_of_substeps_is_limited():
@@ -266,8 +278,11 @@ def test_number_of_substeps_is_limited():
     assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 0.999)).all()
     assert len(calls) == 7 * MAX_SUBSTEPS
     calls.clear()
-    assert np.isnan(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)).all()
+    with pytest.raises(SubstepsError, match="more than 1024 substeps"):
+        advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)
     assert not calls
+    beyond = (1.0, 300.0)  # the bounds, where a motion need not be followed
+    assert np.isnan(advance(system, beyond, (0.0,), (0.0, 0.0), dt)).all()
 
 
 def test_overflow_in_a_users_functions_is_an_escape():

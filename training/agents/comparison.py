@@ -199,7 +199,7 @@ def planned(
     list of Case
         What is to be done.
     """
-    noise: dict[str, tuple[float, ...]] = {system: (get_task(system).measurement_noise,) for system in systems}
+    noise: dict[str, tuple[Any, ...]] = {system: (get_task(system).measurement_noise,) for system in systems}
     if more_noise:
         noise |= {name: (*noise[name], level) for name, level in MORE_NOISE.items() if name in noise}
     return [

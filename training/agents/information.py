@@ -15,7 +15,7 @@ from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
 from training.agents.tasks import deviation
-from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter
+from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.systems import ControlTask, profile
 from training.trajectories.derivatives import linearised
 
@@ -154,7 +154,7 @@ class KalmanFilters:
         plant = plant_of(env)
         system = plant.system
         Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2)
-        R = max(plant.measurement_noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
+        R = measurement_covariance(system, plant.measurement_noise)
         self._filters = ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R)
         self.space = plant.state_space
         self.advance = self._filters.advance

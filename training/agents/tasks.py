@@ -34,7 +34,9 @@ def get_task(name: str, measurement_noise: float | None = None) -> ControlTask:
     system = get_system(name)
     if not system.nu:
         raise ValueError(f"{name} has no inputs for an agent to act on")
-    task = profile(system).task or ControlTask(name)
+    task = profile(system).task or ControlTask(
+        name, system.measurement_noise, period=5 * system.dt, duration=2000 * system.dt, dt=system.dt
+    )
     return task if measurement_noise is None else replace(task, measurement_noise=measurement_noise)
 
 

@@ -15,8 +15,7 @@ from training.trajectories.signals import random_inputs
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
 LARGEST = 1.0  # for maps that are not told the noise
-WINDOW = 0.5  # s
-WARM_UP = 5.0  # s
+WINDOW, WARM_UP = 0.5, 5.0  # seconds at the pace of the shipped systems
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
 
@@ -26,7 +25,7 @@ def calibrate(
     system: System,
     *,
     trajectories: int | None = None,
-    duration: float = 50.0,
+    duration: float | None = None,
     false_alarms: float = 0.01,
     seed: int = 0,
 ) -> Artifact:
@@ -44,8 +43,8 @@ def calibrate(
         What it was made for.
     trajectories : int, optional
         Number of trajectories; by default as many as it takes to tell such rare events.
-    duration : float
-        Length of each in seconds.
+    duration : float, optional
+        Length of each in seconds; by default the system's own.
     false_alarms : float
         Probability that a sound trajectory of this length exceeds a limit.
     seed : int
@@ -65,9 +64,11 @@ def calibrate(
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     if artifact.C is None:
         raise ValueError(f"the output of {system.name!r} is not linear: there is no C x_hat to compare it with")
-    if not 0 < false_alarms < 1 or duration <= WARM_UP or seed < 0:
+    duration = system.duration if duration is None else duration
+    window, warm_up = WINDOW * system.pace, WARM_UP * system.pace
+    if not 0 < false_alarms < 1 or duration <= warm_up or seed < 0:
         raise ValueError(
-            f"need 0 < false_alarms < 1, duration > {WARM_UP} and seed >= 0, got {false_alarms}, {duration}, {seed}"
+            f"need 0 < false_alarms < 1, duration > {warm_up} and seed >= 0, got {false_alarms}, {duration}, {seed}"
         )
     share = false_alarms / (6 * system.ny)
     least = math.ceil(1 / share - 1e-9)
@@ -80,7 +81,7 @@ def calibrate(
     rows = [_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng) for level in levels]
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
-        artifact, limits=Limits(levels, mean, low, high, WINDOW, WARM_UP, false_alarms, duration)
+        artifact, limits=Limits(levels, mean, low, high, window, warm_up, false_alarms, duration)
     )
 
 
@@ -125,7 +126,7 @@ def sound_trajectories(
         if artifact.nu:
             u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng)
         w = draw_process_noise(system, system.process_noise, n=missing, steps=steps, rng=rng)
-        x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
+        x = simulate(system, system.draw_starts(rng, missing), steps, dt, u=u, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))
         if len(kept) == TRIES:
@@ -149,8 +150,8 @@ def _limits(
     y = noisy_output(system, x, measurement_noise=level, rng=rng)
     observer = KKLObserver(artifact, level, process_noise=system.process_noise)
     residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
-    a = -np.expm1(-dt / WINDOW)
-    late = slice(round(WARM_UP / dt) + 1, None)
+    a = -np.expm1(-dt / (WINDOW * system.pace))
+    late = slice(round(WARM_UP * system.pace / dt) + 1, None)
     means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]
     squares = lfilter([a], [1.0, a - 1.0], residual**2, axis=0)[late]
     mean = np.quantile(means.max(0), 1 - share, axis=0, method="weibull") * MARGIN

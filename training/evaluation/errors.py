@@ -15,7 +15,13 @@ from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
+TRIES = 1000  # starts of which one at least should lie beyond X
+
 Domain = Literal["X", "1.5X", "2X"]
+
+
+class NoStartsError(ValueError):
+    """A multiple of X holds no starts beyond X."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +106,27 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
     -------
     ndarray, shape (n, nx)
         The starts.
+
+    Raises
+    ------
+    NoStartsError
+        If there are hardly any beyond X.
     """
     if domain == "X":
-        return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
+        return system.draw_starts(rng, n)
     low, high = system.box()
-    larger = system.box(float(domain.removesuffix("X")))
-    found: list[np.ndarray] = []
+    factor, found = float(domain.removesuffix("X")), list[np.ndarray]()
+    tries = 0
     while len(found) < n:
-        x = rng.uniform(*larger)
+        (x,) = system.draw_starts(rng, 1, factor)
         if ((x < low) | (x > high)).any():
             found.append(x)
+        tries += 1
+        if tries > TRIES * (1 + len(found)):
+            raise NoStartsError(
+                f"no state of {system.name} in {domain} lies beyond X = {system.X}: bounds = {system.bounds} leave no "
+                "room there, or its draw_starts takes no notice of the factor"
+            )
     return np.array(found)
 
 

@@ -35,7 +35,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     from matplotlib.figure import Figure
 
     artifact = result.artifact
-    seconds = min(20.0, artifact.training["duration"])
+    seconds = min(20.0 * system.pace, artifact.training["duration"])
     trajectories = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
     figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])

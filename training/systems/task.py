@@ -18,7 +18,7 @@ class ControlTask:
     ----------
     system : str
         A shipped name, "module:Class" or "script.py:Class".
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     period : float
         Seconds for which an action is held; the observer sees every sample within.
@@ -38,7 +38,7 @@ class ControlTask:
     """
 
     system: str
-    measurement_noise: float = 0.5
+    measurement_noise: float | tuple[float, ...] = 0.5
     period: float = 0.05
     duration: float = 20.0
     start_box: Box | None = None

@@ -105,7 +105,7 @@ def record_closed_loop(
         if artifact.process_noise_max is not None and rng.random() < process_noise_share:
             disturbance = system.process_noise * float(np.sqrt(rng.random()))
         observer = KKLObserver(artifact, level, process_noise=disturbance)
-        x = rng.uniform(*system.box(), (count, system.nx)).T.copy()
+        x = system.draw_starts(rng, count).T.copy()
         inside = np.ones(count, dtype=bool)
         x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
         slot = {int(age): i for i, age in enumerate(ages)}

@@ -109,5 +109,5 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
 def output_matrix(system: System) -> np.ndarray | None:
     """C, (ny, nx), if the output is h(x) = C x, else None."""
     C = system.output(np.eye(system.nx)).T
-    x = np.random.default_rng(0).uniform(*system.box(), (100, system.nx))
+    x = system.draw_starts(np.random.default_rng(0), 100)
     return C if np.allclose(system.output(x), x @ C.T, rtol=1e-9, atol=1e-12) else None

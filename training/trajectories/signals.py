@@ -29,9 +29,11 @@ def random_inputs(
         The trajectories are of these in turn:
 
         - "zero": no input (twice as often as each of the others by default);
-        - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s;
+        - "steps": values uniform within the input bounds, held for times that are log-uniform in 0.05 to 5 s at the
+          pace of the shipped systems, see :attr:`kkl_gym.System.pace`;
         - "pulses": the same up to a time uniform within the record, and no input from there on;
-        - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s.
+        - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s
+          at that pace.
 
     Returns
     -------
@@ -44,7 +46,7 @@ def random_inputs(
         kind = kinds[row % len(kinds)]
         for j, u_max in enumerate(system.u_max):
             if kind in ("steps", "pulses"):
-                hold = np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
+                hold = system.pace * np.exp(rng.uniform(np.log(0.05), np.log(5.0)))
                 changes = rng.random(steps) < min(1.0, dt / hold)
                 levels = rng.uniform(-u_max, u_max, steps + 1)
                 u[:, row, j] = levels[np.cumsum(changes)]
@@ -52,5 +54,6 @@ def random_inputs(
                     u[rng.integers(steps + 1) :, row, j] = 0.0
             elif kind == "sine":
                 amplitude, phase = rng.uniform(0, u_max), rng.uniform(0, 2 * np.pi)
-                u[:, row, j] = amplitude * np.sin(np.exp(rng.uniform(np.log(0.2), np.log(20.0))) * t + phase)
+                frequency = np.exp(rng.uniform(np.log(0.2), np.log(20.0))) / system.pace
+                u[:, row, j] = amplitude * np.sin(frequency * t + phase)
     return u

@@ -183,7 +183,7 @@ def certify(
         free = told  # a map that is not told the noise is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
-    l_h = output_lipschitz(system, generator(Stream.CERTIFICATE, seed, 1).uniform(*system.box(), (2_000, system.nx)))
+    l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
     noise_bound = TRUNCATED * measurement_noise
     if psi is None:
         everywhere = np.concatenate([recorded.x, recorded.noisy_x])

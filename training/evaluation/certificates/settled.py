@@ -99,7 +99,7 @@ def record_settled(
     first = math.ceil(settled / dt)
     steps = first + round(RECORDED / dt)
     ages = np.arange(first, steps + 1, EVERY)
-    x0 = rng.uniform(*system.box(), (trajectories, system.nx))
+    x0 = system.draw_starts(rng, trajectories)
     x = noisy_x = simulate(system, x0, steps, dt)
     if process_noise:
         w = draw_process_noise(system, process_noise, n=trajectories, steps=steps, rng=rng)
