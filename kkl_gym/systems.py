@@ -12,6 +12,7 @@ import numpy as np
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
 from observers import Artifact
+from observers.checks import mapping, shown
 
 
 @dataclass(frozen=True)
@@ -212,9 +213,9 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
         system = _find(system)
     if isinstance(system, type) and issubclass(system, System):
         system = system()
-    if not isinstance(system, System):
-        raise ValueError(f"expected a system or the name of one, got {system!r}")
-    found = system.replace(parameters or {})
+    if not isinstance(system, System) or type(system) is System:
+        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
+    found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
         _check_components(found)
     return found
@@ -234,7 +235,8 @@ def _find(name: str) -> type[System]:
         return SYSTEMS[name]
     if ":" not in name:
         raise ValueError(
-            f"unknown system {name!r}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
+            "'script.py:Class'"
         )
     return load_class(name, System)
 

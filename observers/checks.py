@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
-_FLOAT, _FLOAT32 = np.dtype(float), np.dtype(np.float32)  # to compare by identity is quick: a step's cost would be felt
+_FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
 _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
 
 
@@ -176,7 +176,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
     if type(values) is np.ndarray:
         if values.dtype is _FLOAT:
             return values
-        if values.dtype is _FLOAT32:
+        if values.dtype.kind in "fiu" and values.dtype.itemsize <= 8:
             return values.astype(float)
     elif isinstance(values, MaskedArray) and is_masked(values):
         raise ValueError(f"{name} holds masked entries: {shown(values)}; give them values")
@@ -195,8 +195,8 @@ def real_array(name: str, values: Any) -> np.ndarray:
 
 def _of_numbers(values: Any) -> bool:
     """Whether all that nested sequences hold are numbers: NumPy takes True for 1 beside floats, and drops masks."""
-    if isinstance(values, Sequence) and not isinstance(values, str):
-        if isinstance(values, bytes | bytearray | memoryview):
+    if type(values) is list or isinstance(values, Sequence):
+        if isinstance(values, str | bytes | bytearray | memoryview):
             return False
         for value in values:
             if type(value) is not float and type(value) is not int and not _of_numbers(value):
