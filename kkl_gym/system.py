@@ -10,13 +10,13 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
 
 from kkl_gym.equations import components
 from kkl_gym.loading import load_class
+from observers.checks import is_finite, mapping, shown
 
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
@@ -127,8 +127,8 @@ class System:
             if name not in self.parameters and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {value!r}")
+            if not is_finite(value):
+                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {shown(value)}")
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
@@ -408,9 +408,9 @@ class System:
             If a name is unknown or a value is not a finite number.
         """
         known = self.parameters
-        for name in parameters:
+        for name in mapping("parameters", parameters):
             if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
+                raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
 
 

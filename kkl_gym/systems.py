@@ -11,6 +11,7 @@ from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System, inner_state
 from observers import Artifact
+from observers.checks import mapping, shown
 
 
 @dataclass(frozen=True)
@@ -222,11 +223,9 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
                 f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
             )
         system = system()
-    if not isinstance(system, System):
-        raise ValueError(f"expected a system or the name of one, got {system!r}")
-    if parameters is not None and not isinstance(parameters, Mapping):
-        raise ValueError(f"parameters must be a mapping of names to numbers, got {parameters!r}")
-    found = system.replace(parameters or {})
+    if not isinstance(system, System) or type(system) is System:
+        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
+    found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
         check_equations(found, inner_state(found))
     return found
@@ -237,7 +236,8 @@ def _find(name: str) -> type[System]:
         return SYSTEMS[name]
     if ":" not in name:
         raise ValueError(
-            f"unknown system {name!r}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
+            "'script.py:Class'"
         )
     return load_class(name, System)
 

@@ -239,7 +239,7 @@ def test_the_number_of_inputs_is_a_small_whole_one(file, inputs):
     rewrite(file, lambda tensors, meta: meta.update(inputs=inputs))
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert f"number of inputs must be whole, from 0 to 64, got {inputs!r}" in str(raised.value)
+    assert f"number of inputs must be an integer from 0 to 64, got {inputs!r}" in str(raised.value)
 
 
 @pytest.mark.parametrize(
