@@ -7,13 +7,13 @@ on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-
 import functools
 import math
 from collections.abc import Callable, Iterable
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
+from observers.checks import is_finite, shown
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
 # motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
@@ -465,16 +465,16 @@ def check_dt(dt: float) -> float:
     Returns
     -------
     float
-        The same.
+        The same, as a float.
 
     Raises
     ------
     ValueError
         If it is not a positive, finite number.
     """
-    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
-        raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
-    return dt
+    if not is_finite(dt) or not float(dt) > 0:
+        raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
+    return float(dt)
 
 
 def check_interval(system: System, dt: float) -> None:
