@@ -164,8 +164,10 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
         return runge_kutta(len(x))(field, x, d, dt / n, n)
     except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
         return (math.nan,) * len(x)
+    except SubstepsError:
+        raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
@@ -199,8 +201,10 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     """
     try:
         return _advance_batch(system, x, u, w, dt)
+    except SubstepsError:
+        raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
