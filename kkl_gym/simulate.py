@@ -174,7 +174,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
@@ -266,7 +266,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
