@@ -10,6 +10,7 @@ from scipy.signal import periodogram
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.filter_noise import noise_covariance
+from training.kalman import unknown_start
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, bessel_spectrum
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
@@ -92,8 +93,7 @@ class Probe:
                 "least 2"
             )
         system, nx = self.system, self.system.nx
-        low, high = system.box()
-        x0 = generator(Stream.TUNING, self.seed).uniform(low, high, (2 * self.motions, nx))
+        x0 = system.draw_starts(generator(Stream.TUNING, self.seed), 2 * self.motions)
         steps = round(self.duration / self.dt)
         inside = np.isfinite(simulate(system, x0, steps, self.dt)[-1]).all(-1)
         if 2 * inside.sum() < self.motions:
@@ -112,7 +112,7 @@ class Probe:
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
         self.y = system.output(self.x)
         self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
-        self._known = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
+        self._known = np.linalg.inv(unknown_start(system)[1])
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
         self.ages = np.unique(np.concatenate([early, late])).astype(int)
         self.share = np.gradient(self.ages.astype(float))
@@ -217,7 +217,7 @@ class Probe:
 
     def _relative(self, information: np.ndarray) -> float:
         """The mean error in percent, from what is known of the start beside X: (ages, motions, nx, nx)."""
-        left = self.Phi[self.ages] @ _inverse_root(information + np.diag(self._known))
+        left = self.Phi[self.ages] @ _inverse_root(information + self._known)
         size = np.linalg.norm(self.x[self.ages], axis=-1)
         relative = np.linalg.norm(left, axis=(-2, -1)) / np.maximum(size, SMALLEST * size.max())
         found = float(100.0 * self.share @ np.minimum(relative, 2.0).mean(1))
