@@ -36,7 +36,7 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
     where, _, class_name = name.rpartition(":")
     try:
         found = getattr(_module(where), class_name)
-    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
+    except (ImportError, AttributeError, OSError, SyntaxError, TypeError, ValueError) as error:
         raise ValueError(f"cannot load the {base.__name__.lower()} {name!r}: {error}") from error
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
