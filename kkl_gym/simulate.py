@@ -13,7 +13,7 @@ import numpy as np
 
 from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
-from observers.checks import is_finite, shown
+from observers.checks import check_dt
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
 # motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
@@ -452,29 +452,6 @@ def check_duration(duration: float, dt: float) -> None:
     """Raise ValueError unless ``duration`` is a finite number of seconds, and not shorter than a sample of ``dt``."""
     if not dt <= duration < math.inf:
         raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
-
-
-def check_dt(dt: float) -> float:
-    """Raise an error unless ``dt`` is a sampling interval.
-
-    Parameters
-    ----------
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    float
-        The same, as a float.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive, finite number.
-    """
-    if not is_finite(dt) or not float(dt) > 0:
-        raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
-    return float(dt)
 
 
 def check_interval(system: System, dt: float) -> None:

@@ -381,7 +381,8 @@ class System:
             If a name is unknown or a value is not a finite number.
         """
         known = self.parameters
-        for name in mapping("parameters", parameters):
+        parameters = mapping("parameters", parameters)
+        for name in parameters:
             if name not in known:
                 raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
