@@ -217,7 +217,10 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             raise ValueError(
                 f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
             )
-        system = system()
+        try:
+            system = system()
+        except TypeError as error:  # not decorated as a dataclass
+            raise ValueError(str(error)) from error
     if not isinstance(system, System):
         raise ValueError(f"expected a system or the name of one, got {system!r}")
     if parameters is not None and not isinstance(parameters, Mapping):
