@@ -4,7 +4,7 @@ import inspect
 import reprlib
 import sys
 from collections.abc import Callable
-from numbers import Real
+from numbers import Number, Real
 from types import CodeType, TracebackType
 from typing import Any
 
@@ -108,7 +108,8 @@ def held(x: Any) -> str:
             return f"x held {plural} of shape {tuple(first.shape)}"
     if is_of("sympy", "Basic", first):
         return "x held sympy symbols"
-    return f"x = {reprlib.repr(tuple(float(f'{value:.6g}') for value in x))}"
+    shortened = [f"{value:.6g}" if isinstance(value, Number) else reprlib.repr(value) for value in x]
+    return f"x = ({', '.join(shortened)})"
 
 
 def shown(value: Any) -> str:

@@ -222,6 +222,8 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
             components(system.f, args[0])
             input_matrix(system, args[0])
             rate_at(system, args[0])
+    if isinstance(error, TypeError) and "complex" in str(error):  # numbers that cannot be compared
+        raise complex_motion(system, args[0]) from error
 
 
 def complex_motion(system: Any, x: Any) -> EquationError:

@@ -10,7 +10,6 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,12 +17,14 @@ import numpy as np
 from kkl_gym.declarations import complete
 from kkl_gym.equations import components, rate_at
 from kkl_gym.loading import load_class
+from observers.checks import is_finite, mapping, shown
 
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, where it suits
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (25.0, 5.0)  # rate * dt beyond which DT does not suit, and what then does
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
+PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
 
 
@@ -61,7 +62,8 @@ class System:
     portrait : (int, int)
         The two states that a phase portrait shows, by index. The default is the first and the last.
     process_noise : float
-        Default bound of the process noise as a multiple of ``scale`` per second.
+        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 at the
+        system's :attr:`pace`.
     measurement_noise : float or tuple of float, length ny
         Default standard deviation of the measurement noise, of all outputs or each. If it is not set, it is 5 % of the
         range of each output over X.
@@ -87,7 +89,6 @@ class System:
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    process_noise: ClassVar[float] = 0.05
     discrete: ClassVar[bool] = False  # whether there is a step; kept, as every step of an environment asks
 
     def __init_subclass__(cls) -> None:
@@ -99,8 +100,8 @@ class System:
             if name not in self.parameters and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {value!r}")
+            if not is_finite(value):
+                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {shown(value)}")
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
@@ -160,6 +161,11 @@ class System:
     def duration(self) -> float:
         """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
         return 50.0 * self.pace
+
+    @property
+    def process_noise(self) -> float:
+        """Bound of the process noise where none is given, in multiples of ``scale`` per second."""
+        return PROCESS_NOISE / self.pace
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
@@ -375,9 +381,9 @@ class System:
             If a name is unknown or a value is not a finite number.
         """
         known = self.parameters
-        for name in parameters:
+        for name in mapping("parameters", parameters):
             if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
+                raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
 
 

@@ -254,7 +254,7 @@ def test_nonsense_names_raise_with_the_name(nonsense):
 
 @pytest.mark.parametrize("nonsense", [None, 3, int, object()])
 def test_nonsense_objects_raise(nonsense):
-    with pytest.raises(ValueError, match="expected a system"):
+    with pytest.raises(ValueError, match="system must be"):
         get_system(nonsense)
 
 
