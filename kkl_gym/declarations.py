@@ -52,13 +52,10 @@ def complete(cls: Any, base: Any) -> None:
     if not _is_row(cls.state_names, nx, str):
         raise _wrong(cls, "state_names", f"a tuple of {nx} texts, one for each state")
     level = "a number, not below zero"
-    if not isinstance(cls.process_noise, property):
-        _read(cls, "process_noise", level, (), least=0.0)
-    if not isinstance(cls.dt, property):
-        _read(cls, "dt", "a positive number of seconds", (), above=0.0)
-    if not isinstance(cls.measurement_noise, property):
-        shape = () if isinstance(cls.measurement_noise, Real) else (None,)
-        _read(cls, "measurement_noise", f"{level}, or one for each output", shape, least=0.0)
+    _read(cls, "process_noise", level, (), least=0.0)
+    _read(cls, "dt", "a positive number of seconds", (), above=0.0)
+    shape = () if isinstance(cls.measurement_noise, Real) else (None,)
+    _read(cls, "measurement_noise", f"{level}, or one for each output", shape, least=0.0)
 
 
 def _check_names(cls: Any, base: Any) -> None:
@@ -127,6 +124,8 @@ def _read(
     least: float = -math.inf,
 ) -> None:
     """Check numbers of this shape and within these limits, and write them as tuples."""
+    if isinstance(getattr(cls, name), property):  # follows from others
+        return
     try:
         numbers = _numbers(getattr(cls, name), shape)
     except (ValueError, OverflowError):

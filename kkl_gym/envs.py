@@ -272,7 +272,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _measure(self, v: list[float]) -> list[float]:
         try:
-            return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+            return [float(hi + vi) for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
         except Exception:
             components(self.system.h, self._x)  # says what went wrong
             raise

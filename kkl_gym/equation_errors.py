@@ -4,7 +4,7 @@ import inspect
 import reprlib
 import sys
 from collections.abc import Callable
-from numbers import Real
+from numbers import Number, Real
 from types import CodeType, TracebackType
 from typing import Any
 
@@ -108,7 +108,8 @@ def held(x: Any) -> str:
             return f"x held {plural} of shape {tuple(first.shape)}"
     if is_of("sympy", "Basic", first):
         return "x held sympy symbols"
-    return f"x = {reprlib.repr(tuple(float(f'{value:.6g}') for value in x))}"
+    shortened = [f"{value:.6g}" if isinstance(value, Number) else reprlib.repr(value) for value in x]
+    return f"x = ({', '.join(shortened)})"
 
 
 def shown(value: Any) -> str:
@@ -130,9 +131,11 @@ def _defined(equations: Equations) -> str:
 
 
 def _hint(error: Exception, step: TracebackType, x: Any) -> str:
+    on_floats = isinstance(x[0], Real)
     name = called_function(step)
     name = _ALIASES.get(name, name)
-    if name in vars(elementary) and not name.startswith("_"):
+    # On floats, math.sqrt(-1) fails; abs of the whole state, which is no number, does so for another reason.
+    if name in vars(elementary) and not name.startswith("_") and not (on_floats and isinstance(error, TypeError)):
         return f": use kkl_gym.elementary.{name}, which serves {_SERVING}"
     if "truth value" in str(error) or "Boolean value" in str(error):
         return (
@@ -141,6 +144,6 @@ def _hint(error: Exception, step: TracebackType, x: Any) -> str:
         )
     if isinstance(error, IndexError) or "unpack" in str(error):
         return f", {len(x)} of them"
-    if not isinstance(x[0], Real) and not isinstance(error, NameError | KeyError | ArithmeticError):
+    if not on_floats and not isinstance(error, NameError | KeyError | ArithmeticError):
         return f": equations take arithmetic and the functions of kkl_gym.elementary, which serve {_SERVING}"
     return ""

@@ -6,7 +6,7 @@ asks :func:`blame`.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from numbers import Real
 from typing import Any
 
@@ -127,36 +127,36 @@ def check_equations(system: Any) -> None:
     EquationError
         If f or h is missing, an equation fails, returns something wrong or not finite, or mixes the states of a batch.
     """
-    moving = system.step if system.discrete else system.f
-    for equations in (moving, system.h):
-        if _is_default(equations):
-            raise EquationError(f"{type(system).__name__} defines no {signature(equations, 'self, ')}")
+    names = ("step", "h", "rate") if system.discrete else ("f", "h", "g", "rate")
+    for name in names[:2]:
+        if _is_default(getattr(system, name)):
+            raise EquationError(f"{type(system).__name__} defines no {signature(getattr(system, name), 'self, ')}")
     starts = _checked_starts(system)
-    n, nu = len(starts), system.nu
-    several: list[tuple[Equations, Callable[..., list[Any]]]] = [
-        (moving, lambda x, u: [*components(moving, x, u)] if system.discrete else [*components(moving, x)]),
-        (system.h, lambda x, u: [*components(system.h, x)]),
-        (system.rate, lambda x, u: [rate_at(system, x)]),
-    ]
-    if not system.discrete:
-        several.append((system.g, lambda x, u: [value for row in input_matrix(system, x) for value in row]))
-    for equations, values in several:
-        single = np.array([values(x, (0.0,) * nu) for x in map(tuple, starts.tolist())], dtype=float)
-        wrong = ~np.isfinite(single).all(1) | ((single < 0).any(1) if equations == system.rate else False)
+    for name in names:
+        equations, n = getattr(system, name), len(starts)
+        alone = np.array([_values(system, name, x) for x in map(tuple, starts.tolist())], dtype=float)
+        wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
         if wrong.any():
             at = int(wrong.argmax())
-            wanted = "finite numbers within X" + (", not below zero" if equations == system.rate else "")
-            raise returned(equations, wanted, f"{single[at].tolist()}; {held(starts[at])}")
-        batch = np.array([np.broadcast_to(value, n) for value in values(starts.T, np.zeros((nu, n)))]).reshape(-1, n).T
-        rounding = 1e-6 * np.abs(single).max(initial=0.0)
-        if batch.shape != single.shape or not np.allclose(batch, single, rtol=1e-3, atol=rounding):
-            raise returned(
-                equations,
-                "for many states what it returns for each, and always the same",
-                f"{batch[0].tolist()} and {single[0].tolist()}; {held(starts[0])}: sum, max and norm mix the states of "
-                "a batch, use arithmetic on components",
-            )
+            wanted = "finite numbers within X" + (", not below zero" if name == "rate" else "")
+            raise returned(equations, wanted, f"{alone[at].tolist()}; {held(starts[at])}")
+        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, starts.T)]).reshape(-1, n).T
+        rounding = 1e-6 * np.abs(alone).max(initial=0.0)
+        if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
+            wanted = "for each state of a batch what it returns for that state alone, and always the same"
+            found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
+            raise returned(equations, wanted, f"{found}: sum, max and norm mix states, use arithmetic on components")
     _check_target(system)
+
+
+def _values(system: Any, name: str, x: Any) -> list[Any]:
+    """All numbers that an equation returns, checked, without input."""
+    if name == "g":
+        return [value for row in input_matrix(system, x) for value in row]
+    if name == "rate":
+        return [rate_at(system, x)]
+    inputs = ([0.0 * x[0]] * system.nu,) if name == "step" else ()
+    return [*components(getattr(system, name), x, *inputs)]
 
 
 def _checked_starts(system: Any) -> np.ndarray:
@@ -222,6 +222,8 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
             components(system.f, args[0])
             input_matrix(system, args[0])
             rate_at(system, args[0])
+    if isinstance(error, TypeError) and "complex" in str(error):  # numbers that cannot be compared
+        raise complex_motion(system, args[0]) from error
 
 
 def complex_motion(system: Any, x: Any) -> EquationError:

@@ -222,7 +222,10 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             raise ValueError(
                 f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
             )
-        system = system()
+        try:
+            system = system()
+        except TypeError as error:  # not decorated as a dataclass
+            raise ValueError(str(error)) from error
     if not isinstance(system, System) or type(system) is System:
         raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
     found = system.replace(mapping("parameters", parameters))

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from kinked_systems import SYSTEMS as KINKED
 
 import kkl_gym
 from kkl_gym import SYSTEMS, EquationError, System, get_system
 from kkl_gym.compiled import batch_step, clipped, compiled_step
 from kkl_gym.elementary import cos, sin, tanh
-from kkl_gym.simulate import advance_batch
+from kkl_gym.simulate import advance, advance_batch
 from observers.sparse import MANY_ROWS
 
 DT = 0.01
@@ -97,6 +98,21 @@ def test_compiled_is_numpys_step(system, dt):
     assert got.flags.c_contiguous
     assert (x == before).all()
     assert np.allclose(got, expected, rtol=1e-11, atol=1e-11, equal_nan=True)
+
+
+@compiles
+@pytest.mark.parametrize("system", KINKED, ids=str)
+def test_kinks_and_jumps_are_the_same_on_floats_arrays_and_compiled(system):
+    step = compiled_step(system)
+    x, u, w = batch(system)
+    kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
+    x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of either change
+    for dt in (DT, 0.2):
+        expected = advance_batch(system, x, u, w, dt)
+        single = [advance(system, tuple(xi), list(ui), list(wi), dt) for xi, ui, wi in zip(x.T, u.T, w.T, strict=True)]
+        assert np.isfinite(expected).all()
+        assert np.allclose(np.array(single).T, expected, rtol=1e-12, atol=1e-12)
+        assert np.allclose(step(x, u, w, dt), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_any_memory_layout_and_no_rows():
