@@ -14,7 +14,7 @@ from scipy.stats import bootstrap, trim_mean
 
 import kkl_gym
 from kkl_gym import get_system
-from observers.storage import write
+from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
@@ -252,19 +252,20 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
         key = (case.system, case.measurement_noise)
         if key not in idle_scores:
             idle_scores[key] = float(idle(*key, case.episodes).mean())
-        result = json.loads((case.folder / "scores.json").read_text())
-        rows.append(
-            {
-                "system": case.system,
-                "noise": case.measurement_noise,
-                "knows": case.information,
-                "seed": case.seed,
-                "score": np.mean(result["scores"]),
-                "success": np.mean(result["successes"]),
-                "idle": idle_scores[key],
-                "seconds": result["seconds"],
-            }
-        )
+        with explained(case.folder / "scores.json", ValueError):
+            result = json.loads((case.folder / "scores.json").read_text())
+            rows.append(
+                {
+                    "system": case.system,
+                    "noise": case.measurement_noise,
+                    "knows": case.information,
+                    "seed": case.seed,
+                    "score": np.mean(result["scores"]),
+                    "success": np.mean(result["successes"]),
+                    "idle": idle_scores[key],
+                    "seconds": result["seconds"],
+                }
+            )
     return pd.DataFrame(rows)
 
 

@@ -370,6 +370,20 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0", "lorenz", "1.0"]
 
 
+@pytest.mark.parametrize(("file", "text"), [
+    ("configuration-0.json", "{"), ("configuration-0.json", "[]"), ("configuration-0.json", '{"configuration": {}}'),
+    ("trained.seconds", ""), ("trained.seconds", "a minute"),
+])  # fmt: skip
+def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
+    job = Job("lorenz", toy[0], tmp_path / "job", TINY, SHORT, 1.0, SHORT)
+    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
+    (job.folder / "errors.csv").unlink()
+    (job.folder / file).write_text(text)
+    ((_, failure, _),) = run_all(run_job, [job], 1)
+    assert isinstance(failure, ValueError)
+    assert str(job.folder / file) in str(failure)
+
+
 def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     name, _ = toy
     script = Path(name.rpartition(":")[0])
