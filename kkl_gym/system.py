@@ -21,7 +21,7 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, where it suits
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (25.0, 5.0)  # rate * dt beyond which DT does not suit, and what then does
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
 
 
