@@ -44,6 +44,11 @@ def show_level(level: float | Sequence[float]) -> str:
     return ", ".join(f"{each:g}" for each in np.atleast_1d(level))
 
 
+def as_cell(level: Level) -> float | str:
+    """For CSV files: a number wherever there is but one."""
+    return show_level(level) if isinstance(level, tuple) else level
+
+
 def own_level(artifact: Artifact, system: System) -> Level:
     """Return the system's own level of measurement noise, as far as a map was trained for it.
 

@@ -119,6 +119,11 @@ def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     return 100.0 * np.divide(error, size, out=np.full_like(error, np.nan), where=moves)
 
 
+def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of a CSV file from the values (n, nx) of :func:`nrmse`: nrmse1, nrmse2, ..., in the states' order."""
+    return {f"nrmse{i + 1}": column for i, column in enumerate(values.T)}
+
+
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
     """Time from which |x - x_hat| stays below a tenth of the root mean square of |x|.
 
