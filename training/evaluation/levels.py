@@ -49,6 +49,24 @@ def as_cell(level: Level) -> float | str:
     return show_level(level) if isinstance(level, tuple) else level
 
 
+def multiple(system: System, factor: float) -> Level:
+    """Return a multiple of a system's own level of measurement noise.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    factor : float
+        The multiple.
+
+    Returns
+    -------
+    float or tuple of float, length ny
+        The level, of all outputs or each.
+    """
+    return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
+
+
 def own_level(artifact: Artifact, system: System) -> Level:
     """Return the system's own level of measurement noise, as far as a map was trained for it.
 
