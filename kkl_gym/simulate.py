@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
@@ -146,25 +147,33 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If the system moves too fast, within its bounds, to be followed over this interval.
     """
     end: Components = (math.nan,) * len(x)
     try:
-        if system.discrete:
-            return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
-        need = system.rate(x) * dt * PER_RATE
-        if need <= MOST_EQUAL:
-            n = 1
-            while n < need:
-                n *= 2
-            field, d = forced(system, u, w)
-            end = runge_kutta(len(x))(field, x, d, dt / n, n)
-            if system.rate(end) * dt * PER_RATE <= GROWTH * n:
-                return end
-    except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
-        pass
-    return followed(system, x, u, w, dt=dt, end=end)
+        try:
+            if system.discrete:
+                return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
+            need = system.rate(x) * dt * PER_RATE
+            if need <= MOST_EQUAL:
+                n = 1
+                while n < need:
+                    n *= 2
+                field, d = forced(system, u, w)
+                end = runge_kutta(len(x))(field, x, d, dt / n, n)
+                if system.rate(end) * dt * PER_RATE <= GROWTH * n:
+                    return end
+        except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
+            pass
+        return followed(system, x, u, w, dt=dt, end=end)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x)
+        raise
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
@@ -213,7 +222,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             h = left if rate * left <= RATE_STEP else RATE_STEP / rate
             x = runge_kutta(len(x))(field, x, d, h, 1)
             left -= h
-    except (ArithmeticError, TypeError):  # the second of complex numbers, which Python makes of (-1.0) ** 0.5
+    except ArithmeticError:
         return end
     raise SubstepsError(
         f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
@@ -245,9 +254,21 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If the system moves too fast, within its bounds, to be followed over this interval.
     """
+    try:
+        return _advance_batch(system, x, u, w, dt)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x)
+        raise
+
+
+def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         if system.discrete:
             moved = system.step(x, u)
