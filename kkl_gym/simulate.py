@@ -40,6 +40,8 @@ WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 
 VectorField = Callable[[Any], Any]
+Feedback = Callable[[int, np.ndarray], np.ndarray]
+"""(k, x) to the inputs held over interval k, (n, nu)."""
 
 
 class SubstepsError(ValueError):
@@ -385,7 +387,7 @@ def simulate(
     x0: np.ndarray,
     steps: int,
     dt: float,
-    u: np.ndarray | None = None,
+    u: np.ndarray | Feedback | None = None,
     w: np.ndarray | None = None,
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
@@ -400,8 +402,9 @@ def simulate(
         Number of sampling intervals.
     dt : float
         Length of an interval in seconds.
-    u : ndarray, shape (steps, n, nu), optional
-        Inputs, held over each interval; None is zero.
+    u : ndarray, shape (steps, n, nu), or callable, optional
+        Inputs, held over each interval; None is zero. A callable gives those of interval k, of shape (n, nu), from
+        (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval; None is zero.
 
@@ -422,7 +425,7 @@ def simulate(
     check_dt(dt)
     n = len(x0)
     for name, signal, width in (("u", u, system.nu), ("w", w, system.nx)):
-        if signal is not None and np.shape(signal) != (steps, n, width):
+        if signal is not None and not callable(signal) and np.shape(signal) != (steps, n, width):
             raise ValueError(f"{name} must have shape {(steps, n, width)}, got {np.shape(signal)}")
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     no_u, no_w = np.zeros((system.nu, n)), np.zeros((system.nx, n))
@@ -430,8 +433,9 @@ def simulate(
     x = np.ascontiguousarray(x0.T)
     out[0] = x0
     for k in range(steps):
+        acting = u(k, out[k]) if callable(u) else None if u is None else u[k]
         held = (
-            no_u if u is None else np.ascontiguousarray(u[k].T),
+            no_u if acting is None else np.ascontiguousarray(acting.T),
             no_w if w is None else np.ascontiguousarray(w[k].T),
         )
         end = advance_batch(system, x, *held, dt)

@@ -14,10 +14,19 @@ from kkl_gym.system import System
 from observers import Artifact
 from observers.checks import noise_levels
 from observers.storage import write
-from training.commands.options import Duration, NoiseLevels, Observers, OwnSystem, read_observers
+from training.commands.options import (
+    Duration,
+    NoiseLevels,
+    Observers,
+    OwnPolicy,
+    OwnSystem,
+    read_observers,
+    read_policy,
+)
 from training.evaluation.errors import Domain, NoStartsError, UnseenTrajectories, errors, unseen_trajectories
 from training.evaluation.levels import Level, as_cell, beyond, own_level, show_level
 from training.evaluation.metrics import by_state
+from training.trajectories.controllers import Controller
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
@@ -36,11 +45,13 @@ class Evaluate:
     2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
     told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is
     there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
+    Under a policy, those are driven in which it errs about the state and explores.
     """
 
     observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
+    policy: OwnPolicy = None
     measurement_noise: NoiseLevels = None
     """Standard deviations of the noise on each sample of y, a table row for each. 0.1,0.3 is one for each output."""
     process_noise: float = 0.0
@@ -98,9 +109,10 @@ class Evaluate:
             for measure in measures:
                 table.add_column(measure, justify="right")
         frames = []
+        policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
         for starts, domain, driven in CASES[: 3 if artifact.nu else 2] if levels else ():
-            trajectories = self._trajectories(artifact, system, domain, duration=duration, driven=driven)
+            trajectories = self._trajectories(artifact, system, domain, duration=duration, driven=driven, policy=policy)
             if isinstance(trajectories, str):
                 left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
                 continue
@@ -129,7 +141,14 @@ class Evaluate:
         return frames
 
     def _trajectories(
-        self, artifact: Artifact, system: System, domain: Domain, *, duration: float, driven: bool
+        self,
+        artifact: Artifact,
+        system: System,
+        domain: Domain,
+        *,
+        duration: float,
+        driven: bool,
+        policy: Controller | None,
     ) -> UnseenTrajectories | str:
         """Test trajectories, or why there are none."""
         try:
@@ -142,6 +161,7 @@ class Evaluate:
                 domain=domain,
                 driven=driven,
                 process_noise=self.process_noise,
+                policy=policy,
             )
         except NoStartsError as error:
             return str(error)
