@@ -40,6 +40,17 @@ class Autonomous(Oscillator):
 
 
 @dataclass(frozen=True)
+class TwoOutputs(Oscillator):
+    """Both states are measured, with noise of different size."""
+
+    name: ClassVar[str] = "two-outputs"
+    measurement_noise: ClassVar = (0.1, 0.3)
+
+    def h(self, x):
+        return x[0], x[1]
+
+
+@dataclass(frozen=True)
 class Reactor(System):
     """The oscillator in mixed units: a temperature of 300 K, give or take 20, and 1e-3 mol/l, give or take as much."""
 

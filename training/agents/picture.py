@@ -9,6 +9,7 @@ from PIL import Image
 from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from training.agents.play import Episodes
+from training.evaluation.levels import show_level
 from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
@@ -49,7 +50,7 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
     for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
         axes[i, 0].set_ylabel(name)
     axes[0, 0].legend(loc="upper right", fontsize="x-small")
-    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {task.measurement_noise:g}")
+    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
     figure.savefig(path, dpi=110)
 
 

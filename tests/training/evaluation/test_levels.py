@@ -6,20 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from linear_system import Oscillator
+from linear_system import TwoOutputs
 
 from kkl_gym import VanDerPol
-from training.evaluation.levels import beyond, own_level, read_level, show_level
+from training.evaluation.levels import beyond, multiple, own_level, read_level, show_level
 
 LEVELS = st.integers(0, 999_999).map(lambda n: n / 1000)
-
-
-class TwoOutputs(Oscillator):
-    name = "two-outputs"
-    measurement_noise = (0.3, 2.0)
-
-    def h(self, x):
-        return x[0], x[1]
 
 
 @given(st.one_of(LEVELS, st.lists(LEVELS, min_size=2, max_size=4).map(tuple)))
@@ -45,8 +37,14 @@ def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
     assert own_level(artifact, VanDerPol()) == 0.5
     assert own_level(told_up_to(artifact, 0.1), VanDerPol()) == 0.1
     assert own_level(make_artifact(noise=False), VanDerPol()) == 0.5
-    assert own_level(artifact, TwoOutputs()) == (0.3, 1.0)
-    assert own_level(told_up_to(artifact, 0.2), TwoOutputs()) == 0.2
+    assert own_level(artifact, TwoOutputs()) == (0.1, 0.3)
+    assert own_level(told_up_to(artifact, 0.2), TwoOutputs()) == (0.1, 0.2)
+    assert own_level(told_up_to(artifact, 0.05), TwoOutputs()) == 0.05
+
+
+def test_multiples_of_the_systems_own_level():
+    assert multiple(VanDerPol(), 0.02) == 0.01
+    assert multiple(TwoOutputs(), 2.0) == (0.2, 0.6)
 
 
 def test_levels_beyond_the_maps_range(make_artifact):
