@@ -14,7 +14,7 @@ import torch
 import kkl_gym
 from kkl_gym.systems import get_system
 from observers.storage import explained, write
-from training.benchmark.protocol import Protocol, measure, validate
+from training.benchmark.protocol import Protocol, measure, tuned_for, validate
 from training.jobs import check_identity, claimed_job, describe
 from training.maps.optimise import seconds_spent
 from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
@@ -82,7 +82,7 @@ class Job:
             "system": describe(system),
             "method": method.name,
             "configurations": method.configurations(system),
-            "tuned_for": method.tuned_for,
+            "tuned_for": tuned_for(method, system),
             "version": kkl_gym.__version__,
             "revision": REVISION,
         }

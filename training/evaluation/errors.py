@@ -1,14 +1,16 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.evaluation.metrics import smape
+from observers.checks import noise_levels
+from training.evaluation.levels import Level
+from training.evaluation.metrics import nrmse, smape
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
@@ -28,20 +30,23 @@ class NoStartsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
+    """Errors in percent of each trajectory that stayed within bounds, and how many did not.
 
     Parameters
     ----------
     full : ndarray, shape (n,)
-        Over all steps (the paper's).
+        SMAPE over all steps (the paper's).
     late : ndarray, shape (n,)
-        After the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+        SMAPE after the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+    nrmse : ndarray, shape (n, nx)
+        Of each state after the transient, see :func:`training.evaluation.metrics.nrmse`.
     escaped : int
-        Number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+        Number of trajectories that left the system's declared bounds and are not among these.
     """
 
     full: np.ndarray
     late: np.ndarray
+    nrmse: np.ndarray
     escaped: int
 
 
@@ -210,7 +215,7 @@ def errors(
     system: System,
     trajectories: UnseenTrajectories,
     *,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int,
     skip: float | None = None,
 ) -> Errors:
@@ -224,8 +229,8 @@ def errors(
         What it was made for.
     trajectories : UnseenTrajectories
         What it is to follow.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of the measurement noise.
     skip : float, optional
@@ -235,10 +240,16 @@ def errors(
     -------
     Errors
         One for each trajectory.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or beyond the map's range.
     """
+    level: Any = noise_levels("measurement_noise", measurement_noise, system.ny)
+    observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
     rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(system, trajectories.x, measurement_noise=measurement_noise, rng=rng)
-    observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
-    x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
+    y = noisy_output(system, trajectories.x, measurement_noise=level, rng=rng)
+    x, x_hat = trajectories.x, observer.estimate(y, trajectories.u if artifact.nu else None)
     first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
-    return Errors(smape(trajectories.x, x_hat), smape(trajectories.x, x_hat, first), trajectories.escaped)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)

@@ -9,6 +9,7 @@ from scipy.signal import periodogram
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance
 from training.kalman import unknown_start
 from training.seeds import Stream, generator
@@ -164,15 +165,15 @@ class Probe:
         Z = linear.run(signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
 
-    def error(self, spectrum: Spectrum, measurement_noise: float) -> float:
+    def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
         """Predict the error of the best decoder.
 
         Parameters
         ----------
         spectrum : Spectrum
             Modes for each output.
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
 
         Returns
         -------
@@ -186,13 +187,13 @@ class Probe:
         """
         return self._error(*self.response(spectrum), measurement_noise)
 
-    def least(self, measurement_noise: float) -> float:
+    def least(self, measurement_noise: Level) -> float:
         """Predict the error of whoever knows the equations and remembers every sample of y.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
 
         Returns
         -------
@@ -202,16 +203,19 @@ class Probe:
         Raises
         ------
         ValueError
-            Without noise.
+            If an output is without noise.
         """
-        if not measurement_noise > 0:
+        if not np.min(measurement_noise) > 0:
             raise ValueError("without noise, all of y tells the state exactly")
-        square = np.einsum("tnij,tnik->tnjk", self.signal, self.signal).cumsum(0)
-        return self._relative(square[self.ages] / measurement_noise**2)
+        largest = np.max(measurement_noise)
+        signal = self.signal / np.reshape(measurement_noise / largest, (-1, 1))
+        square = np.einsum("tnij,tnik->tnjk", signal, signal).cumsum(0)
+        return self._relative(square[self.ages] / largest**2)
 
-    def _error(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: float) -> float:
+    def _error(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: Level) -> float:
         spread = np.cov(z.reshape(-1, z.shape[-1]).T).reshape(z.shape[-1], -1)
-        R = measurement_noise**2 * P + RESOLUTION**2 * spread
+        sigma = np.repeat(np.broadcast_to(measurement_noise, self.system.ny), z.shape[-1] // self.system.ny)
+        R = np.outer(sigma, sigma) * P + RESOLUTION**2 * spread  # each output has the same modes, and noise of its own
         seen = Z @ _inverse_root(R)[:, None]
         return self._relative(seen @ seen.mT)
 
@@ -225,13 +229,13 @@ class Probe:
             raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
         return found
 
-    def choose(self, measurement_noise: float, most: int = 21, anew: bool = False) -> list[Choice]:
+    def choose(self, measurement_noise: Level, most: int = 21, anew: bool = False) -> list[Choice]:
         """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         most : int
             Modes for each output at which it ends. It also ends where none lowers the error by LEAST_GAIN.
         anew : bool
@@ -276,13 +280,13 @@ class Probe:
             chosen, columns, before = chosen + spectrum, columns + own, error
             found.append(Choice(chosen, error))
 
-    def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
+    def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
         """Find Bessel filters to compare with.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         orders : sequence of int
             Of the filters: their numbers of modes.
         cutoffs : iterable of float
