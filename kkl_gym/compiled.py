@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import components, input_matrix, rate
 from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance_batch, check_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
@@ -131,7 +132,7 @@ def compiled_step(system: System) -> Step:
     def traced() -> list[Any]:
         return [
             sympy.sympify(fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)))
-            for fi, row in zip(system.f(x), system.g(x), strict=True)
+            for fi, row in zip(components(system.f, x), input_matrix(system, x), strict=True)
         ]
 
     forced = traced()
@@ -141,7 +142,7 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    rate = sympy.lambdify([(*x,)], sympy.sympify(system.rate(x)), "math", cse=True)
+    need = sympy.lambdify([(*x,)], sympy.sympify(rate(system, x)), "math", cse=True)
 
     def tupled(values: list[str]) -> str:
         return "(" + "".join(f"{value}, " for value in values) + ")"
@@ -166,7 +167,7 @@ def compiled_step(system: System) -> Step:
     ]
     namespace: dict[str, Any] = {
         "field": compiled(field),
-        "rate": compiled(rate),
+        "rate": compiled(need),
         "integrate": compiled(runge_kutta(nx + nu)),
         "nan": math.nan,
     }

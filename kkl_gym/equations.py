@@ -6,6 +6,7 @@ a loop catches what is raised and asks :func:`blame`.
 """
 
 import inspect
+import math
 import reprlib
 import sys
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import elementary
-from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
+from kkl_gym.user_lines import called_function, line_of, path_of, steps_within, user_line
 
 _SERVING = "floats, arrays, tensors and symbols"
 _ALIASES = {
@@ -125,6 +126,52 @@ def rate(system: Any, x: Any) -> Any:
     return value
 
 
+def check_equations(system: Any, x: tuple[float, ...]) -> None:
+    """Check all that a system's equations return on floats.
+
+    Parameters
+    ----------
+    system : System
+        A user's system.
+    x : tuple of float, length nx
+        A state in X.
+
+    Raises
+    ------
+    EquationError
+        If f or h is missing, an equation fails, or what it returns is wrong or not finite.
+    """
+    for equations in (system.f, system.h):
+        if _is_default(equations):
+            raise EquationError(f"{type(system).__name__} defines no {_name(equations)}(self, x)")
+    for equations in (system.f, system.h):
+        values = components(equations, x)
+        if not all(math.isfinite(value) for value in values):
+            raise EquationError(f"{_label(equations)}{_defined(equations)} returned {_shown(values)}; {_held(x)}, in X")
+    input_matrix(system, x)
+    if not 0 <= rate(system, x) < math.inf:
+        raise _returned(system.rate, "a finite number in 1/s, not below zero", f"{rate(system, x)}; {_held(x)}")
+    _check_target(system, len(x))
+
+
+def _check_target(system: Any, nx: int) -> None:
+    found = f"target of {system.name!r}"
+    try:
+        target = system.target
+    except ValueError:  # there is none at these parameters; whoever needs one will say so
+        return
+    except Exception as error:  # whatever a user's code raises
+        line = user_line(error)
+        raise EquationError(
+            f"{found} failed{f' in {line}' if line else ''}: {type(error).__name__}: {error}"
+        ) from error
+    if callable(target):
+        raise EquationError(f"{found} is a method: write @property above its def")
+    wanted = f"must be {nx} finite numbers, one for each state"
+    if not _is_sequence(target) or len(target) != nx or not all(_fits(t, 0.0) and math.isfinite(t) for t in target):
+        raise EquationError(f"{found} {wanted}, got {_shown(target)}")
+
+
 def blame(error: Exception, system: Any, x: Any) -> None:
     """Raise an EquationError if an exception comes from a system's f, g or rate, and return otherwise.
 
@@ -145,7 +192,7 @@ def blame(error: Exception, system: Any, x: Any) -> None:
     if isinstance(error, EquationError | NotImplementedError):
         return
     for equations in (system.f, system.g, system.rate):
-        if getattr(equations, "__module__", None) != "kkl_gym.system" and steps_within(error, _code(equations)):
+        if not _is_default(equations) and steps_within(error, _code(equations)):
             raise _failure(error, equations, x) from error
     with np.errstate(all="ignore"):  # what they return then did not go through
         components(system.f, x)
@@ -260,6 +307,10 @@ def _name(equations: Any) -> str:
     function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
     names = (name for name in ("f", "g", "h", "rate") if function and getattr(kind, name, None) is function)
     return next(names, getattr(equations, "__name__", "equations"))
+
+
+def _is_default(equations: Any) -> bool:
+    return getattr(equations, "__module__", None) == "kkl_gym.system"
 
 
 def _code(equations: Any) -> CodeType | None:

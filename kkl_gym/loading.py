@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+from kkl_gym.user_lines import user_line
+
 Class = TypeVar("Class")
 
 
@@ -34,14 +36,30 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
         If it cannot be found or is not a subclass of ``base``.
     """
     where, _, class_name = name.rpartition(":")
+    failure = f"cannot load the {base.__name__.lower()} {name!r}"
     try:
-        found = getattr(_module(where), class_name)
-    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
-        raise ValueError(f"cannot load the {base.__name__.lower()} {name!r}: {error}") from error
+        module = _module(where)
+    except Exception as error:  # whatever a user's script raises
+        line = user_line(error)
+        raise ValueError(f"{failure}: {f'{line}: {type(error).__name__}: ' if line else ''}{error}") from error
+    found = getattr(module, class_name, None)
+    if found is None:
+        others = [key for key, value in vars(module).items() if _is_own(value, base, module.__name__)]
+        raise ValueError(f"{failure}: {where} defines no {class_name}; it defines {', '.join(others) or 'none'}")
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
         raise ValueError(f"{name!r} is {found!r}, not a subclass of {package}.{base.__name__}")
     return found
+
+
+def _is_own(value: Any, base: type, module: str) -> bool:
+    """Whether a value is a subclass that a module, or a package's part, defines itself."""
+    return (
+        inspect.isclass(value)
+        and issubclass(value, base)
+        and value is not base
+        and f"{value.__module__}.".startswith(f"{module}.")
+    )
 
 
 def _module(where: str) -> Any:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
@@ -144,6 +145,8 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If a state within the system's bounds moves too fast for this interval.
     """
@@ -161,6 +164,9 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
         return runge_kutta(len(x))(field, x, d, dt / n, n)
     except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
         return (math.nan,) * len(x)
+    except Exception as error:
+        blame(error, system, x)
+        raise
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
@@ -186,9 +192,19 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If a state within the system's bounds moves too fast for this interval.
     """
+    try:
+        return _advance_batch(system, x, u, w, dt)
+    except Exception as error:
+        blame(error, system, x)
+        raise
+
+
+def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         if system.discrete:
             moved = system.step(x, u)

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.loading import load_class
 
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
@@ -147,7 +148,7 @@ class System:
     @property
     def ny(self) -> int:
         """Number of outputs."""
-        return len(self.h([(low + high) / 2 for low, high in self.X]))
+        return len(components(self.h, inner_state(self)))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -421,8 +422,19 @@ def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> n
     -------
     ndarray, shape (..., m)
         The values. Components that do not depend on the state are repeated.
+
+    Raises
+    ------
+    EquationError
+        If they fail, or return something else.
     """
-    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in equations(np.moveaxis(x, -1, 0))], axis=-1)
+    values = components(equations, np.moveaxis(x, -1, 0))
+    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
+
+
+def inner_state(system: System) -> tuple[float, ...]:
+    """A state in X for a first look at the equations, off its centre, where some divide by zero."""
+    return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
 
 
 def _starts(system: System) -> np.ndarray:

@@ -3,14 +3,13 @@
 # ruff: noqa: D102 - what each system overrides is documented on System
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar
 
-import numpy as np
-
+from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
-from kkl_gym.system import Box, Components, System
+from kkl_gym.system import Box, Components, System, inner_state
 from observers import Artifact
 
 
@@ -207,26 +206,26 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     ------
     ValueError
         If the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
+    EquationError
+        If a user's equations fail on floats, or return something else than components.
     """
     if isinstance(system, str):
         system = _find(system)
     if isinstance(system, type) and issubclass(system, System):
+        missing = [field.name for field in fields(system) if field.default is MISSING]
+        if missing:
+            raise ValueError(
+                f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
+            )
         system = system()
     if not isinstance(system, System):
         raise ValueError(f"expected a system or the name of one, got {system!r}")
+    if parameters is not None and not isinstance(parameters, Mapping):
+        raise ValueError(f"parameters must be a mapping of names to numbers, got {parameters!r}")
     found = system.replace(parameters or {})
     if type(found) not in SYSTEMS.values():
-        _check_components(found)
+        check_equations(found, inner_state(found))
     return found
-
-
-def _check_components(system: System) -> None:
-    """Raise ValueError if f or h of a user's system does not return components, as when a comma is missing."""
-    middle = [(low + high) / 2 for low, high in system.X]
-    for name, found, n in (("f", system.f(middle), system.nx), ("h", system.h(middle), None)):
-        if not isinstance(found, Sequence | np.ndarray) or n not in (None, len(found)):
-            wanted = "its components, as in (y,)" if n is None else f"{n} components"
-            raise ValueError(f"{name}(x) of {system.name} must return {wanted}; it returns {found!r}")
 
 
 def _find(name: str) -> type[System]:

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import batch_step
+from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.system import Box, System
@@ -398,7 +399,11 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         # As System.output, component first and in a third of its time, which a step would feel.
-        return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+        try:
+            return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+        except Exception:
+            components(self.system.h, x)  # says what went wrong
+            raise
 
     def _observation(self) -> np.ndarray:
         values = self._x if self.plant.observe == "state" else self._y

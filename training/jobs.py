@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from filelock import FileLock, Timeout
 
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
 from observers.storage import write
 
@@ -116,7 +117,8 @@ def describe(system: System) -> dict[str, Any]:
         To be compared with another after a way through JSON, which makes lists of tuples.
     """
     x = system.draw_starts(np.random.default_rng(0), 20)
-    rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *system.output(x).T]
+    matrix = input_matrix(system, x.T)
+    rows = [*components(system.f, x.T), *(entry for row in matrix for entry in row), *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {
         "system": system.name,

@@ -1,15 +1,27 @@
 """Derivatives of a system from its own equations."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
+
+# Functions in the derivatives that sympy does not print for NumPy, or prints for arrays of one shape only.
+_IN_NUMPY = {
+    "Max": lambda *values: functools.reduce(np.maximum, values),
+    "Min": lambda *values: functools.reduce(np.minimum, values),
+    "Heaviside": np.heaviside,
+}
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of f or h from its own equations.
+
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of those on both sides; at a jump it is that
+    beside it.
 
     Parameters
     ----------
@@ -25,23 +37,43 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
     Raises
     ------
-    ValueError
+    EquationError
         If the equations do not take sympy symbols.
+    ValueError
+        If sympy cannot differentiate them.
     """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
     x = sympy.symbols(f"x:{nx}", real=True)
     rows = []
-    try:
-        values = [sympy.sympify(value) for value in equations(list(x))]
-    except TypeError as error:
-        raise ValueError(f"derivatives need equations that take symbols, from kkl_gym.elementary: {error}") from error
-    for value in values:
+    for i, value in enumerate(components(equations, list(x))):
+        value = _differentiable(sympy.sympify(value))
         derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
-        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
+        if any(derivative.has(sympy.Derivative) for derivative in derivatives.values()):
+            raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative that sympy knows: {value}")
+        rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in derivatives.items() if d != 0})
     return rows
 
 
+def _differentiable(value: Any) -> Any:
+    """An expression in which functions with kinks and jumps are written so that sympy knows their derivatives."""
+    import sympy
+
+    def flat(name: str) -> Any:
+        return type(name, (sympy.Function,), {"fdiff": lambda self, argindex=1: sympy.Integer(0)})
+
+    floor = flat("floor")
+    for function, real in (
+        (sympy.Mod, lambda a, b: a - b * floor(a / b)),
+        (sympy.floor, floor),
+        (sympy.sign, flat("sign")),
+        (sympy.Abs, lambda u: sympy.Max(u, -u)),
+    ):
+        value = value.replace(function, real)
+    return value
+
+
+@np.errstate(all="ignore")  # where(x > 0, log(x), 0) is evaluated on both sides of zero
 def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
     """Evaluate what :func:`jacobian` returned at states (..., nx), as (..., rows, nx)."""
     out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
@@ -53,7 +85,7 @@ def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linearise a system at a state x: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx)."""
-    g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
+    g = np.array(input_matrix(system, x), dtype=float).reshape(system.nx, system.nu)
     at = np.array(x, dtype=float)
     return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
 
