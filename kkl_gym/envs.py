@@ -10,7 +10,7 @@ import numpy as np
 from kkl_gym.equations import components
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
-from kkl_gym.simulate import advance
+from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, System
 
 _INTEGER = np.dtype(np.int64)
@@ -199,6 +199,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = advance(self.system, self._x, u, w, self.dt)
         escaped = not self._inside(x)
+        if escaped:  # unless that is but an error of the method
+            x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
+            escaped = not self._inside(x)
         if not escaped:
             self._x = tuple(x)
             self._y = self._measure(v)

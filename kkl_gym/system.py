@@ -22,7 +22,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, where it suits
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (25.0, 5.0)  # rate * dt beyond which DT does not suit, and what then does
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
+PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
 
 
@@ -60,7 +61,8 @@ class System:
     portrait : (int, int)
         The two states that a phase portrait shows, by index. The default is the first and the last.
     process_noise : float
-        Default bound of the process noise as a multiple of ``scale`` per second.
+        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 at the
+        system's :attr:`pace`.
     measurement_noise : float or tuple of float, length ny
         Default standard deviation of the measurement noise, of all outputs or each. If it is not set, it is 5 % of the
         range of each output over X.
@@ -86,7 +88,6 @@ class System:
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    process_noise: ClassVar[float] = 0.05
     discrete: ClassVar[bool] = False  # whether there is a step; kept, as every step of an environment asks
 
     def __init_subclass__(cls) -> None:
@@ -187,6 +188,11 @@ class System:
     def duration(self) -> float:
         """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
         return 50.0 * self.pace
+
+    @property
+    def process_noise(self) -> float:
+        """Bound of the process noise where none is given, in multiples of ``scale`` per second."""
+        return PROCESS_NOISE / self.pace
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:

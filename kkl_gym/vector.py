@@ -14,6 +14,7 @@ from kkl_gym.compiled import batch_step
 from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
+from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 
 Infos = dict[str, Any]
@@ -345,6 +346,10 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         w, v = self._noise(rows)
         x = batch_step(self.system)(before, u, w, self.plant.dt)
         within = (x >= self._low) & (x <= self._high)
+        if not within.all():  # unless that is but an error of the method
+            beyond = np.flatnonzero(~within.all(0))
+            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=beyond)
+            within = (x >= self._low) & (x <= self._high)
         if within.all():
             inside = np.ones_like(within[0])
             y = self._measure(x, v)

@@ -9,6 +9,7 @@ from observers.checks import is_finite
 from observers.sparse import MANY_ROWS, SparseUpdate
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
+MOST_VALUES = 1024  # of its state, and of the output; beyond them memory and the decomposition of A would be felt
 
 
 class LinearFilter:
@@ -25,9 +26,9 @@ class LinearFilter:
     Parameters
     ----------
     A : ndarray, shape (nz, nz)
-        Hurwitz and diagonalisable, in 1/s.
+        Hurwitz and diagonalisable, in 1/s. The state may have 1024 values.
     B : ndarray, shape (nz, ny)
-        What the outputs act through.
+        What the outputs act through, 1 to 1024 of them.
     dt : float
         Sampling interval in seconds.
     nu : int, default 0
@@ -60,6 +61,12 @@ class LinearFilter:
             raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
         if not isinstance(nu, int | np.integer) or isinstance(nu, bool) or not 0 <= nu <= MOST_INPUTS:
             raise ValueError(f"the number of inputs must be whole, from 0 to {MOST_INPUTS}, got {nu!r}")
+        nz, ny = B.shape
+        if not (1 <= nz * (1 + nu) <= MOST_VALUES and 1 <= ny <= MOST_VALUES):
+            raise ValueError(
+                f"a filter has 1 to {MOST_VALUES} values, nz (1 + nu), and as many outputs at most; "
+                f"got nz = {nz}, nu = {nu} and {ny} outputs"
+            )
         if np.count_nonzero(A - np.diag(A.diagonal())):
             poles, V = np.linalg.eig(A)
         else:
@@ -78,7 +85,6 @@ class LinearFilter:
             late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
         if not (np.isfinite(hold).all() and np.isfinite(late).all()):
             raise ValueError(f"dt = {dt!r} and the eigenvalues of A, {poles}, lead beyond the range of floats")
-        nz, ny = B.shape
         blocks = 1 + nu
 
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, n
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
-    """Put a system beside its variational equation, x' = f(x) + G u and Phi' = df/dx Phi.
+    """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
 
     Parameters
     ----------
@@ -108,29 +108,37 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
     Raises
     ------
     ValueError
-        If it is driven through an input matrix that depends on the state, or f does not take sympy symbols.
+        If f, or a g that depends on the state, does not take sympy symbols.
     """
     nx, rows = system.nx, jacobian(system.f, system.nx)
     nu = system.nu if driven else 0
-    if nu and type(system).g is not System.g:
-        raise ValueError(
-            f"{system.name} has an input matrix that depends on the state, which the variational equation would need"
-        )
+    varying = nu > 0 and type(system).g is not System.g
+
+    def entries(x: Components) -> Components:
+        return [entry for row in input_matrix(system, x) for entry in row]
+
+    input_rows = jacobian(entries, nx) if varying else []
+
+    def carried(row: dict[int, Callable[..., Any]], x: Components) -> list[Any]:
+        """A row of derivatives by the states, times Phi."""
+        at = {k: derivative(*x[:nx]) for k, derivative in row.items()}
+        return [sum(value * x[nx + k * nx + j] for k, value in at.items()) for j in range(nx)]
 
     class Sensitivity(System):
         name = f"{system.name}-sensitivity"
         X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
         bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
         u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu else ()
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not varying else ()
 
         def f(self, x: Components) -> Components:
-            state, Phi = x[:nx], x[nx:]
-            out = list(system.f(state))
-            for row in rows:
-                at = {k: derivative(*state) for k, derivative in row.items()}
-                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
-            return out
+            return [*system.f(x[:nx]), *(value for row in rows for value in carried(row, x))]
+
+        if varying:
+
+            def g(self, x: Components) -> Sequence[Components]:
+                by_input = [[carried(input_rows[i * nu + m], x) for m in range(nu)] for i in range(nx)]
+                return [*system.g(x[:nx]), *(column for row in by_input for column in zip(*row, strict=True))]
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])
