@@ -29,7 +29,7 @@ from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
-from training.progress import ProgressBars, progress_bars
+from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum
 from training.systems import controller
@@ -44,7 +44,6 @@ SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory
-LOG = "log.txt"  # in the run's folder
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ from rich.progress import (
 )
 from rich.text import Text
 
+LOG = "log.txt"  # in the folder of a run
+
 FIRST_LINE = 5.0  # seconds after which a phase is said to be under way
 SECONDS_BETWEEN_LINES = 15.0  # at first; a twentieth of the time that passed later on
 MOST_BETWEEN_LINES = 60.0
@@ -59,7 +61,7 @@ class ProgressBars(Progress):
             **options,
         )
         self._written = None if drawn else console
-        self._log = log
+        self._log, self._logged = log, False
         self._due: dict[TaskID, float] = {}
         self._ended = threading.Event()
 
@@ -156,7 +158,7 @@ class ProgressBars(Progress):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         super().__exit__(kind, error, traceback)
-        if error is not None:
+        if error is not None and self._logged:  # what was refused leaves nothing behind
             self._append(f"ended by {type(error).__name__}{': ' if str(error) else ''}{error}")
 
     def tell(self) -> None:
@@ -188,6 +190,7 @@ class ProgressBars(Progress):
     def _append(self, text: str) -> None:
         if self._log is None:
             return
+        self._logged = True
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with self._log.open("a", encoding="utf-8") as file:
             file.write(f"{datetime.now().isoformat(' ', 'seconds')} {text}\n")

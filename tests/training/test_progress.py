@@ -104,6 +104,12 @@ def test_a_phase_that_fails_is_gone(clock):
     assert console.file.getvalue() == "drawing: 0 of 1, 0:01:00 passed\ndrawing: 1 of 1, 0:01:00 passed\n"
 
 
+def test_what_is_refused_leaves_no_log(tmp_path):
+    with suppress(ValueError), progress_bars(None, tmp_path / "run" / "log.txt"):
+        raise ValueError("x")
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("console", [None, console_of(terminal=True)])
 def test_a_log_has_lines_whatever_is_drawn(console, clock, tmp_path):
     log = tmp_path / "run" / "log.txt"

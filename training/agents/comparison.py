@@ -5,12 +5,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-import pandas as pd
-import torch
-from scipy.stats import bootstrap, trim_mean
+import scipy
 
 import kkl_gym
 from kkl_gym import get_system
@@ -22,6 +20,9 @@ from training.agents.tasks import TASKS, get_task, scores, successes
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # What agents know: an information set of training.agents.information, or y or the state with a policy that remembers.
 Compared = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"]
@@ -117,6 +118,8 @@ def run_case(case: Case) -> None:
 
 
 def _run(case: Case) -> None:
+    import torch
+
     from training.agents.learn import learn, learn_recurrent
 
     torch.set_num_threads(1)
@@ -221,7 +224,7 @@ def planned(
     ]
 
 
-def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
+def collect(out: Path, episodes: int, timesteps: int | None) -> "pd.DataFrame":
     """What there is in a comparison's folder, whichever run it is from.
 
     Parameters
@@ -243,6 +246,8 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
     ValueError
         If some agents are of another comparison.
     """
+    import pandas as pd
+
     plan = planned(out, seeds=MANY, episodes=episodes, timesteps=timesteps)
     idle_scores: dict[tuple[str, float], float] = {}
     rows = []
@@ -291,7 +296,7 @@ def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
 
 def middle(values: np.ndarray, axis: int = -1) -> Any:
     """Interquartile mean along an axis."""
-    return trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
@@ -321,5 +326,5 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3:
         return found, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    ends = bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
     return found, float(ends.low), float(ends.high)

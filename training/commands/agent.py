@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
+import scipy
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import bootstrap
 
 from kkl_gym import SYSTEMS, get_system
 from training.agents.agent import Agent, AgentError
@@ -80,7 +79,9 @@ class Train:
         FileExistsError
             If the folder holds an agent already.
         """
-        from training.agents.learn import learn  # stable-baselines3 takes seconds to import
+        import torch  # which takes seconds to import, as stable-baselines3 does
+
+        from training.agents.learn import learn
 
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name
@@ -227,7 +228,7 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, np.nan, np.nan
-    ends = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return mean, float(ends.low), float(ends.high)
 
 

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 
@@ -15,6 +14,9 @@ from training.agents.comparison import COMPARED, Compared, collect, interval, mi
 from training.agents.tasks import TASKS
 from training.jobs import run_all
 from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LABELS = {
     "state": "full state",
@@ -112,6 +114,8 @@ def report(out: Path) -> None:
     out : Path
         Folder of the comparison.
     """
+    import pandas as pd  # which takes half a second that help need not wait for
+
     results = pd.read_csv(out / "results.csv")
     kinds = ["system", "noise", "knows", "seed"]
     plan = {(case.system, case.measurement_noise, case.information, case.seed) for case in planned(out)}
@@ -147,7 +151,7 @@ def report(out: Path) -> None:
     _draw(out / "scores.png", results, tasks, partial)
 
 
-def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
+def _cells(results: "pd.DataFrame", tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
     """What table and figure show for each task and kind of agent."""
     cells = {}
     for system, noise in tasks:
@@ -168,7 +172,7 @@ def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[
     return cells
 
 
-def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], partial: str) -> None:
+def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, float]], partial: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")

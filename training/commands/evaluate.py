@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -15,6 +14,10 @@ from observers import Artifact
 from observers.storage import write
 from training.commands.options import Observers, OwnSystem, read_observers
 from training.evaluation.errors import Domain, errors, unseen_trajectories
+from training.progress import ProgressBars, progress_bars
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,7 @@ class Evaluate:
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
-    def run(self, console: Console) -> pd.DataFrame:
+    def run(self, console: Console) -> "pd.DataFrame":
         """Evaluate.
 
         Parameters
@@ -62,21 +65,25 @@ class Evaluate:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        import pandas as pd  # which takes half a second that help need not wait for
+
         if not self.measurement_noise:
             raise ValueError("give at least one level of measurement noise; 0 is none")
         if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
             raise ValueError(f"csv = {self.csv} is a folder: name a file")
         frames = []
-        for name, artifact, system in read_observers(self.observers, self.system):
-            with console.status(f"evaluating {name}"):
-                frames.append(self._evaluate(name, artifact, system, console))
+        with progress_bars(console) as progress:
+            for name, artifact, system in read_observers(self.observers, self.system):
+                frames.append(self._evaluate(name, artifact, system, progress))
         found = pd.concat(frames, ignore_index=True)
         if self.csv:
             write(self.csv, found.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
         return found
 
-    def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> pd.DataFrame:
+    def _evaluate(self, name: str, artifact: Artifact, system: System, progress: ProgressBars) -> "pd.DataFrame":
+        import pandas as pd
+
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
             cases.append(("X", "X", True))
@@ -90,6 +97,8 @@ class Evaluate:
         for column in ("noise\non y", "all steps", "after transient", "escaped"):
             table.add_column(column, justify="right")
         frames = []
+        parts = len(cases) * (1 + len(self.measurement_noise))
+        bar = progress.add_task(f"evaluating {name}", total=parts)
         for starts, domain, driven in cases:
             trajectories = unseen_trajectories(
                 system,
@@ -101,6 +110,7 @@ class Evaluate:
                 driven=driven,
                 process_noise=self.process_noise,
             )
+            progress.advance(bar)
             for level in self.measurement_noise:
                 found = errors(
                     artifact,
@@ -123,7 +133,8 @@ class Evaluate:
                     "smape_late": found.late,
                 }
                 frames.append(pd.DataFrame(columns))
-        console.print(table)
+                progress.advance(bar)
+        progress.console.print(table)
         return pd.concat(frames, ignore_index=True)
 
 

@@ -10,6 +10,17 @@ from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.artifact import resolve
 
+SystemName = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(metavar="SYSTEM", help="A shipped system, or a class of yours as script.py:Class or module:Class."),
+]
+Parameters = Annotated[
+    dict[str, float],
+    tyro.conf.arg(
+        help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
+        help_behavior_hint="(default: none)",
+    ),
+]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
 ]

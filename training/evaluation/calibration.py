@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -19,6 +20,7 @@ WINDOW = 0.5  # s
 WARM_UP = 5.0  # s
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
+PARTS = 1 + len(LEVELS)  # of the work: simulating, and each level
 
 
 def calibrate(
@@ -29,6 +31,7 @@ def calibrate(
     duration: float = 50.0,
     false_alarms: float = 0.01,
     seed: int = 0,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Artifact:
     """Find limits for an observer's monitor.
 
@@ -50,6 +53,8 @@ def calibrate(
         Probability that a sound trajectory of this length exceeds a limit.
     seed : int
         Seed of starts, inputs and noise.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -77,7 +82,10 @@ def calibrate(
     x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng)
     largest = artifact.inverse.measurement_noise_max
     levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
-    rows = [_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng) for level in levels]
+    rows = []
+    for done, level in enumerate(levels, 1):
+        report(done)
+        rows.append(_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng))
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
         artifact, limits=Limits(levels, mean, low, high, WINDOW, WARM_UP, false_alarms, duration)

@@ -1,5 +1,6 @@
 """Faulty sensors, and how soon an observer's monitor notices them."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
@@ -14,6 +15,7 @@ from training.systems import profile
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
+PARTS = 1 + len(FAULTS)  # of the work: simulating, and each fault
 
 
 def deadline(system: System, duration: float) -> float:
@@ -22,7 +24,14 @@ def deadline(system: System, duration: float) -> float:
 
 
 def simulate_faults(
-    artifact: Artifact, system: System, *, trajectories: int, duration: float, measurement_noise: float, seed: int
+    artifact: Artifact,
+    system: System,
+    *,
+    trajectories: int,
+    duration: float,
+    measurement_noise: float,
+    seed: int,
+    report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -40,6 +49,8 @@ def simulate_faults(
         Standard deviation of the noise on each sample of y.
     seed : int
         Seed of starts, inputs and noise.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -68,7 +79,8 @@ def simulate_faults(
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
-    for fault in FAULTS:
+    for done, fault in enumerate(FAULTS, 1):
+        report(done)
         seen = y.copy()
         if fault == "bias":
             seen[at:] += BIAS * width

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
+import scipy
 
 from kkl_gym.system import System
 from training.trajectories.derivatives import linearised
@@ -37,7 +37,7 @@ def linear_quadratic(system: System) -> Controller:
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
-    K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
+    K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
 
     def act(x: np.ndarray) -> np.ndarray:
         action: np.ndarray = np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)

@@ -1,6 +1,7 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,6 +21,8 @@ from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschit
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
+
+WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,7 @@ def certify(
     seed: int = 0,
     name: str = "",
     recorded: SettledTrajectories | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
@@ -147,6 +151,8 @@ def certify(
         Of the observer, for the report.
     recorded : SettledTrajectories, optional
         What :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+    report : callable, optional
+        Told how many of the :func:`parts` of the work are done.
 
     Returns
     -------
@@ -174,10 +180,13 @@ def certify(
     noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
+    report(1)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)
+    report(2)
     upper = lipschitz_upper(told)
+    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
         free = told  # a map that is not told the noise is bounded once
@@ -230,8 +239,14 @@ def certify(
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
+            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
+
+
+def parts(artifact: Artifact) -> int:
+    """Number of parts, of about the same length, that the work of :func:`certify` has."""
+    return WITHOUT_T if artifact.forward is None else WITH_T
 
 
 def _plain(value: Any) -> Any:
