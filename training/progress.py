@@ -5,7 +5,7 @@ that nothing that takes long is silent, whether it tells how far it is or not.
 """
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -218,6 +218,12 @@ def progress_bars(console: Console | ProgressBars | None, log: Path | None = Non
     else:
         with ProgressBars(console, log) as progress:
             yield progress
+
+
+def under_way(what: str, names: Iterable[str]) -> str:
+    """Describe jobs by what they are and the names of those that run: ``observers (now lorenz/ekf)``."""
+    running = ", ".join(names)
+    return f"{what} (now {running})" if running else what
 
 
 class _Left(ProgressColumn):

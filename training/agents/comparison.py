@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
@@ -29,6 +29,7 @@ Compared = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "r
 COMPARED: tuple[Compared, ...] = get_args(Compared)
 
 MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if found.second_noise}
+SEEDS = 5
 RECURRENT_SEEDS = 3
 MORE_NOISE_RECURRENT_SEEDS = 1
 MANY = 1000  # seeds, more than anyone trains
@@ -43,7 +44,7 @@ class Case:
     Parameters
     ----------
     system : str
-        A shipped system.
+        A shipped system, or a class of the user's as "module:Class" or "script.py:Class".
     measurement_noise : float
         Standard deviation of the noise on each sample of y.
     information : {"state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"}
@@ -56,6 +57,9 @@ class Case:
         Actions to learn from; None takes what the hyperparameters say.
     folder : Path
         Receives job.json, scores.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
+    observer : str, optional
+        A shipped map or a ``.safetensors`` file, for what agents know of an observer; by default
+        :func:`training.agents.information.observer_of` the system.
     """
 
     system: str
@@ -65,11 +69,12 @@ class Case:
     episodes: int
     timesteps: int | None
     folder: Path
+    observer: str | None = None
 
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.system} at noise {self.measurement_noise:g}/{self.information}/{self.seed}"
+        return f"{get_system(self.system).name} at noise {self.measurement_noise:g}/{self.information}/{self.seed}"
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -78,7 +83,7 @@ class Case:
 
         task = get_task(self.system, self.measurement_noise)
         recurrent = self.information.startswith("recurrent")
-        named = versioned(observer_of(get_system(task.system))) if self.information in ("x_hat", "z") else None
+        named = versioned(self.observer or observer_of(get_system(task.system))) if self._observes else None
         return {
             "protocol": PROTOCOL,
             "episodes": self.episodes,
@@ -89,6 +94,10 @@ class Case:
             "observer": None if named is None else [named, fingerprint(named)],
             "version": kkl_gym.__version__,
         }
+
+    @property
+    def _observes(self) -> bool:
+        return self.information in ("x_hat", "z")
 
     @property
     def done(self) -> bool:
@@ -132,7 +141,10 @@ def _run(case: Case) -> None:
         env = make(task, of, case.episodes, autoreset_mode="Disabled", with_action=True)
     else:
         information: Any = case.information
-        policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
+        observer = case.observer if case._observes else None
+        policy = agent = learn(
+            task, information, case.folder, seed=case.seed, timesteps=case.timesteps, observer=observer
+        )
         env = agent.make(case.episodes)
     seconds = time.process_time() - began
     x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
@@ -168,43 +180,102 @@ def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
     return scores(get_system(task.system), x)
 
 
+def kinds(
+    levels: Mapping[str, Sequence[float]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
+) -> Iterator[tuple[str, float, Compared, int]]:
+    """Agents of a comparison, the first seed of each first.
+
+    Parameters
+    ----------
+    levels : mapping of str to sequence of float
+        For each system the levels of measurement noise, the task's own first.
+    information : sequence of str
+        What agents know.
+    seeds : int
+        Agents of each kind; of recurrent ones at most three, and one at the further noise levels.
+
+    Yields
+    ------
+    system, level, information, seed
+        Of one agent.
+    """
+    for seed in range(seeds):
+        for system, at in levels.items():
+            for level in at:
+                for what in information:
+                    most = RECURRENT_SEEDS if level == at[0] else MORE_NOISE_RECURRENT_SEEDS
+                    if seed < most or not what.startswith("recurrent"):
+                        yield system, level, what, seed
+
+
+def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[float, ...]]:
+    """Levels of measurement noise at which agents are compared on each system.
+
+    Parameters
+    ----------
+    systems : sequence of str
+        Shipped ones, or classes of the user's.
+    more_noise : bool
+        Also the further level of those that have one.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        The task's own level first.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if a system has no inputs.
+    """
+    more = MORE_NOISE if more_noise else {}
+    further = {system: (more[system],) if system in more else () for system in systems}
+    return {system: (get_task(system).measurement_noise, *further[system]) for system in systems}
+
+
 def planned(
     out: Path,
     *,
     systems: Sequence[str] = tuple(TASKS),
     information: Sequence[Compared] = COMPARED,
-    seeds: int = 5,
+    seeds: int = SEEDS,
     episodes: int = 100,
     timesteps: int | None = None,
     more_noise: bool = True,
+    observers: Mapping[str, str] | None = None,
 ) -> list[Case]:
-    """All agents of a comparison, the first seed of each first; the defaults are the full set.
+    """All agents of a comparison; the defaults are the full set.
 
     Parameters
     ----------
     out : Path
         Folder of the comparison, under which each agent has one.
     systems : sequence of str
-        Systems with a control task.
+        Shipped ones, or classes of the user's.
     information : sequence of str
         What agents know.
     seeds : int
-        Agents of each kind; of recurrent ones at most three, and one at the further noise level.
+        Agents of each kind, as for :func:`kinds`.
     episodes : int
         Number of episodes that each is played on.
     timesteps : int, optional
         Actions to learn from; by default what the hyperparameters say.
     more_noise : bool
         Also at the further noise level of those systems that have one.
+    observers : mapping of str to str, optional
+        Shipped map or ``.safetensors`` file by the name of the system that it is for.
 
     Returns
     -------
     list of Case
         What is to be done.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if a system has no inputs.
     """
-    noise: dict[str, tuple[float, ...]] = {system: (get_task(system).measurement_noise,) for system in systems}
-    if more_noise:
-        noise |= {name: (*noise[name], level) for name, level in MORE_NOISE.items() if name in noise}
+    names = {system: get_system(system).name for system in systems}
     return [
         Case(
             system=system,
@@ -213,19 +284,22 @@ def planned(
             seed=seed,
             episodes=episodes,
             timesteps=timesteps,
-            folder=out / "jobs" / f"{system}-{level:g}" / what / str(seed),
+            folder=out / "jobs" / f"{names[system]}-{level:g}" / what / str(seed),
+            observer=(observers or {}).get(names[system]),
         )
-        for seed in range(seeds)
-        for system in systems
-        for level in noise[system]
-        for what in information
-        if not what.startswith("recurrent")
-        or seed < (RECURRENT_SEEDS if level == noise[system][0] else MORE_NOISE_RECURRENT_SEEDS)
+        for system, level, what, seed in kinds(noise_levels(systems, more_noise), information, seeds)
     ]
 
 
-def collect(out: Path, episodes: int, timesteps: int | None) -> "pd.DataFrame":
-    """What there is in a comparison's folder, whichever run it is from.
+def collect(
+    out: Path,
+    *,
+    episodes: int,
+    timesteps: int | None,
+    own: Sequence[str] = (),
+    observers: Mapping[str, str] | None = None,
+) -> "pd.DataFrame":
+    """What there is in a comparison's folder of shipped systems and some others, whichever run it is from.
 
     Parameters
     ----------
@@ -235,6 +309,10 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> "pd.DataFrame":
         Number of episodes that each agent was played on.
     timesteps : int or None
         Actions that each learned from; None for what the hyperparameters say.
+    own : sequence of str
+        Classes of the user's.
+    observers : mapping of str to str, optional
+        As for :func:`planned`.
 
     Returns
     -------
@@ -248,7 +326,8 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> "pd.DataFrame":
     """
     import pandas as pd
 
-    plan = planned(out, seeds=MANY, episodes=episodes, timesteps=timesteps)
+    systems = (*TASKS, *own)
+    plan = planned(out, systems=systems, seeds=MANY, episodes=episodes, timesteps=timesteps, observers=observers)
     idle_scores: dict[tuple[str, float], float] = {}
     rows = []
     for case in plan:
@@ -260,7 +339,7 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> "pd.DataFrame":
         result = json.loads((case.folder / "scores.json").read_text())
         rows.append(
             {
-                "system": case.system,
+                "system": get_system(case.system).name,
                 "noise": case.measurement_noise,
                 "knows": case.information,
                 "seed": case.seed,

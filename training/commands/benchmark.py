@@ -1,7 +1,6 @@
 """``kkl-gym benchmark``."""
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from kkl_gym.systems import SYSTEMS, get_system
-from training.progress import LOG, progress_bars
+from training.progress import LOG, progress_bars, under_way
 from training.seeds import Stream, generator
 
 if TYPE_CHECKING:
@@ -79,14 +78,14 @@ class Benchmark:
                 todo = [job for job in jobs if not job.done]
                 workers = min(self.jobs, max(1, len(todo)))
                 task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
-                progress.update(task, description=_now(job.name for job in todo[:workers]))
+                progress.update(task, description=under_way("observers", [job.name for job in todo[:workers]]))
                 for job, failure, running in run_all(run_job, todo, workers):
                     if failure:
                         failures.append(f"{job.name}: {failure}")
                         progress.say(f"failed {failures[-1]} ({job.folder / 'failure.txt'})")
                     else:
                         progress.say(f"finished {job.name}")
-                    progress.update(task, advance=1, description=_now(running))
+                    progress.update(task, advance=1, description=under_way("observers", running))
                 trained = [job for job in jobs if job.done]
                 for job in progress.track(trained, description="timing steps"):
                     try:
@@ -139,8 +138,3 @@ class Benchmark:
             for system in self.systems
             for method in methods
         ]
-
-
-def _now(running: Iterable[str]) -> str:
-    names = ", ".join(running)
-    return f"observers (now {names})" if names else "observers"

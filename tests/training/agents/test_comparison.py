@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import linear_system
 import numpy as np
 import pandas as pd
 import pytest
@@ -141,12 +142,32 @@ def test_wrong_numbers(tmp_path):
         toy(tmp_path, seeds=0).run(Console())
     for wrong in (
         {"systems": ("lorenz", "lorenz")},
-        {"systems": ("mine.py:Mine",)},  # whose agents the report would leave out
         {"information": ("y", "y")},
         {"information": ()},
     ):
         with pytest.raises(ValueError, match="each once"):
             toy(tmp_path, **wrong).run(Console())
+    for wrong, message in (
+        ({"systems": ("mine.py:Mine",)}, "no file mine.py"),
+        ({"observers": ("rossler",)}, "the observer rossler is for rossler: name one for each of lorenz at most"),
+        ({"observers": ("lorenz", "lorenz-v1")}, "the observer lorenz-v1 is for lorenz"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            toy(tmp_path, **wrong).run(Console())
+
+
+def test_a_system_and_an_observer_of_ones_own(tmp_path, saved, capsys):
+    own = f"{linear_system.__file__}:Oscillator"
+    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
+        toy(tmp_path, systems=(own,), information=("x_hat",), seeds=1).run(Console())
+    options = {"information": ("state", "x_hat"), "seeds": 1, "observers": (saved(system=own),)}
+    toy(tmp_path, systems=(own,), **options).run(Console())
+    results = pd.read_csv(tmp_path / "results.csv")
+    assert results[["system", "knows"]].to_numpy().tolist() == [["oscillator", "state"], ["oscillator", "x_hat"]]
+    table = (tmp_path / "table.md").read_text()
+    assert "| oscillator, noise 0.5 |" in table
+    assert f"Partial: {6 * 5 + 2 * 3 - 2} of {6 * 5 + 2 * 3} agents are missing" in table
+    assert "finished oscillator at noise 0.5/x_hat/0" in (tmp_path / "log.txt").read_text()
 
 
 def test_an_interrupted_training_is_of_one_comparison_as_well(tmp_path, monkeypatch):
