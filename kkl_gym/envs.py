@@ -7,12 +7,15 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
-from kkl_gym.simulate import advance
+from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, System
+from observers.checks import integer, mapping, real_array, shown
 
 _INTEGER = np.dtype(np.int64)
+_ACTIONS = (np.dtype(np.float32), np.dtype(np.float64))  # that a step takes as they are
 
 
 class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -44,19 +47,21 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     ----------
     system : str or System
         A name, ``"module:Class"``, ``"script.py:Class"``, or a :class:`kkl_gym.System`.
-    dt : float
-        Sampling interval in seconds.
+    dt : float, optional
+        Sampling interval in seconds. None takes the system's own, 0.01 s for those that ship.
     process_noise : float, optional
         Bound of the uniform noise w, as a multiple of the system's ``scale`` per second:
         \|w_i\| <= process_noise * scale_i. None takes the system's own default.
-    measurement_noise : float
-        Standard deviation of the Gaussian noise v on each sample of each output.
+    measurement_noise : float or sequence of float, length ny, optional
+        Standard deviation of the Gaussian noise v on each sample, of all outputs or one of each. None takes the
+        system's own: 0.5 for those that ship, and by default 5 % of the range of each output over X.
     observe : {"state", "output"}
         What the agent sees.
     parameters : mapping of str to float, optional
         Physical parameters of the system, by name, where they differ from its defaults.
     start_box : tuple of (float, float), length nx, optional
-        (low, high) of each state, where episodes start; None is the system's training box.
+        (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
+        its starts.
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
 
@@ -85,9 +90,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self,
         system: str | System,
         *,
-        dt: float = 0.01,
+        dt: float | None = None,
         process_noise: float | None = None,
-        measurement_noise: float = 0.5,
+        measurement_noise: float | Sequence[float] | None = None,
         observe: Literal["state", "output"] = "state",
         parameters: Mapping[str, float] | None = None,
         start_box: Box | None = None,
@@ -129,7 +134,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         seed : int, optional
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``.
+            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
 
         Returns
         -------
@@ -141,17 +146,18 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            If x0 has the wrong shape, is not finite, lies outside the declared bounds, or if ``options`` holds an
-            unknown key.
+            If x0 has the wrong shape, is not finite, lies outside the declared bounds, if ``options`` is no mapping or
+            holds an unknown key, or if the seed is no integer or negative. The environment is then as it was.
         """
-        super().reset(seed=seed)
-        if seed is not None:
-            self._noise.clear()
         start = None
-        for key, value in (options or {}).items():
+        for key, value in mapping("options", options).items():
             if key != "x0":
-                raise ValueError(f'unknown reset option {key!r}; the one there is is "x0"')
-            start = self.plant.start(value)
+                raise ValueError(f'unknown reset option {shown(key)}; the one there is is "x0"')
+            start = None if value is None else self.plant.start(value)
+        if seed is not None:
+            seed = integer("seed", seed, 0)
+            self._noise.clear()
+        super().reset(seed=seed)
         if start is None:
             start = self.plant.draw_start(self.np_random)
         self._x = tuple(start.tolist())
@@ -186,7 +192,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            If the action has the wrong shape or holds NaN.
+            If the action has the wrong shape, or holds NaN or anything but numbers. The environment is then as it was.
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         """
@@ -196,6 +202,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = advance(self.system, self._x, u, w, self.dt)
         escaped = not self._inside(x)
+        if escaped:  # unless that is but an error of the method
+            x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
+            escaped = not self._inside(x)
         if not escaped:
             self._x = tuple(x)
             self._y = self._measure(v)
@@ -250,18 +259,23 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
 
     def _input(self, action: np.ndarray) -> list[float]:
-        values = np.asarray(action, dtype=float)
-        if values.shape != (self._nu,):
-            raise ValueError(f"the action must have shape ({self._nu},), got {action!r}")
+        if type(action) is not np.ndarray or action.dtype not in _ACTIONS:
+            action = real_array("the action", action)
+        if action.shape != (self._nu,):
+            raise ValueError(f"the action must have shape ({self._nu},), got {shown(action)}")
         u = []
-        for a, u_max in zip(values.tolist(), self._u_max):
+        for a, u_max in zip(action.tolist(), self._u_max):
             if a != a:
-                raise ValueError(f"the action must be numbers, got {action!r}")
+                raise ValueError(f"the action must be numbers, got {shown(action)}")
             u.append(u_max if a > 1.0 else -u_max if a < -1.0 else a * u_max)
         return u
 
     def _measure(self, v: list[float]) -> list[float]:
-        return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+        try:
+            return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+        except Exception:
+            components(self.system.h, self._x)  # says what went wrong
+            raise
 
     def _inside(self, x: Any) -> bool:
         for xi, (low, high) in zip(x, self._bounds):  # noqa: SIM110 - all() takes twice as long

@@ -1,16 +1,15 @@
 """A system sampled under noise: what single and vector environments share."""
 
-import math
-from collections.abc import Mapping
-from numbers import Real
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.simulate import check_dt
+from kkl_gym.simulate import check_dt, check_interval
 from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
+from observers.checks import choice, noise_level, noise_levels, real_array, shown
 
 NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
@@ -22,25 +21,29 @@ class Plant:
     ----------
     system : str or System
         A name, ``"module:Class"``, ``"script.py:Class"``, or a system.
-    dt : float
-        Sampling interval in seconds.
+    dt : float or None
+        Sampling interval in seconds; None takes the system's own.
     process_noise : float or None
         Bound of the uniform process noise as a multiple of the system's ``scale`` per second; None takes the system's
         own default.
-    measurement_noise : float
-        Standard deviation of the Gaussian noise on each sample of each output.
+    measurement_noise : float, sequence of float or None
+        Standard deviation of the Gaussian noise on each sample, of all outputs or one of each; None takes the system's
+        own default.
     observe : {"state", "output"}
         What the observation space is of.
     parameters : mapping of str to float or None
         Physical parameters of the system, by name, where they differ from its defaults.
     start_box : tuple of (float, float), length nx, or None
-        (low, high) of each state, where episodes start; None is the system's training box.
+        (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
+        its starts.
 
     Attributes
     ----------
     system : System
         The system, with its parameters.
-    dt, process_noise, measurement_noise : float
+    dt, process_noise : float
+        As given, with defaults filled in.
+    measurement_noise : float or tuple of float, length ny
         As given, with defaults filled in.
     observe : str
         As given.
@@ -62,36 +65,39 @@ class Plant:
     ValueError
         On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a ``start_box``
         that does not lie within the declared bounds.
+        SubstepsError, a ValueError, if dt is too long for the system.
     """
 
     def __init__(
         self,
         system: str | System,
-        dt: float,
+        dt: float | None,
         *,
         process_noise: float | None,
-        measurement_noise: float,
+        measurement_noise: float | Sequence[float] | None,
         observe: str,
         parameters: Mapping[str, float] | None,
         start_box: Box | None,
     ) -> None:
         self.system = get_system(system, parameters)
-        check_dt(dt)
-        process_noise = self.system.process_noise if process_noise is None else process_noise
-        for name, level in (("process_noise", process_noise), ("measurement_noise", measurement_noise)):
-            if isinstance(level, bool) or not isinstance(level, Real) or not 0 <= level < math.inf:
-                raise ValueError(f"{name} must be finite and not negative, got {level!r}")
-        if observe not in ("state", "output"):
-            raise ValueError(f'observe must be "state" or "output", got {observe!r}')
-        self.dt = float(dt)
-        self.process_noise = float(process_noise)
-        self.measurement_noise = float(measurement_noise)
-        self.observe = observe
+        self.dt = check_dt(self.system.dt if dt is None else dt)
+        check_interval(self.system, self.dt)
+        self.process_noise = noise_level(
+            "process_noise", self.system.process_noise if process_noise is None else process_noise
+        )
+        self.measurement_noise = noise_levels(
+            "measurement_noise",
+            self.system.measurement_noise if measurement_noise is None else measurement_noise,
+            self.system.ny,
+        )
+        self.observe = choice("observe", observe, ("state", "output"))
         self.start_box = _start_box(self.system, start_box)
+        self._draws = start_box is None and type(self.system).draw_starts is not System.draw_starts
         self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
-        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * self.measurement_noise))
+        self.output_space = _float32_box(*output_bounds(self.system, 6.0 * np.asarray(self.measurement_noise)))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
+        self._v_scale = np.broadcast_to(np.asarray(self.measurement_noise), (self.system.ny,))
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
@@ -136,10 +142,12 @@ class Plant:
         v : ndarray, shape (..., ny)
             Measurement noise, in units of the output.
         """
-        return (drawn_w - 0.5) * self._w_range, drawn_v * self.measurement_noise
+        return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
-        """A start drawn uniformly in ``start_box``, shape (nx,)."""
+        """A start drawn uniformly in ``start_box``, or as the system draws it where there is none; shape (nx,)."""
+        if self._draws:
+            return self.start(self.system.draw_starts(rng, 1)[0])
         low, high = self.start_box
         return rng.uniform(low, high)
 
@@ -161,24 +169,26 @@ class Plant:
         ValueError
             If it is no state within the declared bounds.
         """
-        start = np.asarray(x0, dtype=float)
+        start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
-            raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {x0!r}")
+            raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {shown(x0)}")
         return start
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
-    ends = np.array(system.X if box is None else box, dtype=float)  # a copy: it is kept
+    ends = real_array("start_box", system.X if box is None else box).copy()  # it is kept
     low, high = np.array(system.bounds).T
     if ends.shape != (system.nx, 2):
-        raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {box!r}")
+        raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {shown(box)}")
     if not ((low <= ends[:, 0]) & (ends[:, 0] <= ends[:, 1]) & (ends[:, 1] <= high)).all():
-        raise ValueError(f"start_box must lie within the declared bounds {system.bounds}, low before high; got {box!r}")
+        raise ValueError(
+            f"start_box must lie within the declared bounds {system.bounds}, low before high, got {shown(box)}"
+        )
     return ends[:, 0], ends[:, 1]
 
 
-def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray]:
+def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the output h(x) over the declared bounds of the state.
 
     Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
@@ -187,7 +197,7 @@ def output_bounds(system: System, margin: float) -> tuple[np.ndarray, np.ndarray
     ----------
     system : System
         The system.
-    margin : float
+    margin : float or ndarray, shape (ny,)
         How much wider the bounds shall be on either side.
 
     Returns

@@ -4,20 +4,27 @@ Every equation is written once, on components, in plain arithmetic. The same met
 floats (fast single steps), NumPy arrays (batches), torch tensors (derivatives) and sympy symbols (formulas).
 """
 
+import functools
 import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.loading import load_class
+from observers.checks import is_finite, mapping, shown
 
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
+
+DT = 0.01  # s, where it suits
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
+PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
+NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
 
 
 @dataclass(frozen=True)
@@ -25,7 +32,8 @@ class System:
     """A system; its physical parameters are the fields of a frozen dataclass, all of them floats.
 
     A subclass is decorated with ``@dataclass(frozen=True)``, sets the class variables below and defines
-    :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one.
+    :meth:`f` and :meth:`h`. See ``examples/own_system.py`` for a complete one. Units are the user's own: what
+    matters is the size of a state relative to ``X``.
 
     Parameters
     ----------
@@ -40,6 +48,8 @@ class System:
         Names of the states with their units, for plots and documentation. The default is x1, x2, ...
     X : tuple of (float, float), length nx
         Training box, (low, high) of each state: where starts are drawn and observers are trained.
+    X_centre : tuple of float, length nx
+        The point about which multiples of X, such as 2X, grow. The default is the middle of X.
     bounds : tuple of (float, float), length nx
         Declared bounds, (low, high) of each state: an episode ends where the state leaves them.
     u_max : tuple of float, length nu
@@ -51,7 +61,14 @@ class System:
     portrait : (int, int)
         The two states that a phase portrait shows, by index. The default is the first and the last.
     process_noise : float
-        Default bound of the process noise as a multiple of ``scale`` per second.
+        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 at the
+        system's :attr:`pace`.
+    measurement_noise : float or tuple of float, length ny
+        Default standard deviation of the measurement noise, of all outputs or each. If it is not set, it is 5 % of the
+        range of each output over X.
+    dt : float
+        Default sampling interval in seconds. If it is not set, it is 0.01 s where that suits the system's rate, and
+        otherwise follows from the rate.
 
     Raises
     ------
@@ -65,12 +82,13 @@ class System:
     name: ClassVar[str]
     state_names: ClassVar[tuple[str, ...]] = ()
     X: ClassVar[Box]
+    X_centre: ClassVar[tuple[float, ...]] = ()
     bounds: ClassVar[Box]
     u_max: ClassVar[tuple[float, ...]] = ()
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    process_noise: ClassVar[float] = 0.05
+    discrete: ClassVar[bool] = False  # whether there is a step; kept, as every step of an environment asks
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -86,11 +104,17 @@ class System:
                 raise TypeError(f"{cls.__name__}: X = {cls.X} must lie within finite bounds = {cls.bounds}")
         if any(not 0 < u < math.inf for u in cls.u_max):
             raise TypeError(f"{cls.__name__}: u_max = {cls.u_max} must be positive and finite")
-        if cls.g is System.g and nu and (len(cls.G) != nx or any(len(row) != nu for row in cls.G)):
+        cls.discrete = cls.step is not System.step
+        if cls.discrete and cls.dt is System.dt:
+            raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
+        if not cls.discrete and cls.g is System.g and nu and (len(cls.G) != nx or any(len(row) != nu for row in cls.G)):
             raise TypeError(f"{cls.__name__}: G = {cls.G} must have {nx} rows of {nu} numbers, or override g(x)")
         if "X" in vars(cls):  # what is not said anew belongs to the parent's box
             cls.scale = vars(cls).get("scale") or tuple((high - low) / 2 for low, high in cls.X)
             cls.state_names = vars(cls).get("state_names") or tuple(f"x{i + 1}" for i in range(nx))
+            cls.X_centre = vars(cls).get("X_centre") or tuple((low + high) / 2 for low, high in cls.X)
+        if len(cls.X_centre) != nx or not all(math.isfinite(centre) for centre in cls.X_centre):
+            raise TypeError(f"{cls.__name__}: X_centre = {cls.X_centre} must be {nx} finite numbers")
         if len(cls.scale) != nx or any(not 0 < scale < math.inf for scale in cls.scale):
             raise TypeError(f"{cls.__name__}: scale = {cls.scale} must be {nx} positive numbers")
         if len(cls.portrait) != 2 or any(not -nx <= i < nx for i in cls.portrait):
@@ -103,8 +127,8 @@ class System:
             if name not in self.parameters and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {value!r}")
+            if not is_finite(value):
+                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {shown(value)}")
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
@@ -125,7 +149,7 @@ class System:
     @property
     def ny(self) -> int:
         """Number of outputs."""
-        return len(self.h([(low + high) / 2 for low, high in self.X]))
+        return len(components(self.h, inner_state(self)))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -136,6 +160,55 @@ class System:
     def target(self) -> tuple[float, ...]:
         """The equilibrium that a controller should hold, nx numbers; default: the origin."""
         return (0.0,) * self.nx
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in seconds of environments and observers where none is given.
+
+        0.01 s, unless that is far too long or too short for the rate at which f changes. A class variable of this name
+        takes its place.
+        """
+        try:
+            rate = self.typical_rate
+        except ValueError:  # such as of an integrator, for which any interval does
+            return DT
+        (least, slow), (most, fast) = SHORT_STEP, LONG_STEP
+        if least <= rate * DT <= most:
+            return DT
+        longest = (slow if rate * DT < least else fast) / rate
+        power = 10.0 ** math.floor(math.log10(longest))
+        return max(m * power for m in (1.0, 2.0, 5.0) if m * power <= longest)
+
+    @property
+    def pace(self) -> float:
+        """Seconds that are to this system what one second is to those that ship: a hundred sampling intervals."""
+        return 100.0 * self.dt
+
+    @property
+    def duration(self) -> float:
+        """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
+        return 50.0 * self.pace
+
+    @property
+    def process_noise(self) -> float:
+        """Bound of the process noise where none is given, in multiples of ``scale`` per second."""
+        return PROCESS_NOISE / self.pace
+
+    @property
+    def measurement_noise(self) -> float | tuple[float, ...]:
+        """Standard deviation of the measurement noise where none is given, of all outputs or each."""
+        levels = tuple(float(f"{NOISE_SHARE * size:.2g}") for size in self.output_range)
+        return levels[0] if len(set(levels)) == 1 else levels
+
+    @property
+    def output_range(self) -> tuple[float, ...]:
+        """How far each output, without noise, ranges over a thousand starts; 1 where it does not move. Length ny."""
+        return _output_range(self)
+
+    @property
+    def typical_rate(self) -> float:
+        """Median of :meth:`rate` over a thousand starts, in 1/s; ValueError if that is zero or not finite."""
+        return _typical_rate(self)
 
     def f(self, x: Components) -> Components:
         """Drift f(x).
@@ -155,7 +228,57 @@ class System:
         NotImplementedError
             If the subclass does not define it.
         """
-        raise NotImplementedError(f"{type(self).__name__} does not define f")
+        if not self.discrete:
+            raise NotImplementedError(f"{type(self).__name__} does not define f")
+        moved = self.step(x, (0.0,) * self.nu)
+        return [(after - before) / self.dt for before, after in zip(x, moved, strict=True)]
+
+    def step(self, x: Components, u: Components) -> Components:
+        """The next state of a system in discrete time, one sampling interval after x under the held input u.
+
+        A system that defines it needs no f and g, sets ``dt``, and is not integrated. Process noise adds w dt to the
+        next state. f then is the mean derivative over the interval, without input.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state: floats, arrays, tensors or symbols.
+        u : sequence of length nu
+            Components of the input, in its own units.
+
+        Returns
+        -------
+        sequence of length nx
+            Components of the next state.
+
+        Raises
+        ------
+        NotImplementedError
+            If the system is one in continuous time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} is integrated from f; it defines no step")
+
+    def draw_starts(self, rng: np.random.Generator, n: int, factor: float = 1.0) -> np.ndarray:
+        """Draw starts; default: uniform in a multiple of the training box.
+
+        Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
+        must lie within the bounds.
+
+        Parameters
+        ----------
+        rng : Generator
+            Of everything random.
+        n : int
+            How many.
+        factor : float, default 1
+            How far starts may lie from the middle, in multiples of X.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            The starts.
+        """
+        return rng.uniform(*self.box(factor), (n, self.nx))
 
     def g(self, x: Components) -> Sequence[Components]:
         """Input matrix g(x); default: the constant ``G``.
@@ -225,7 +348,8 @@ class System:
     def rate(self, x: Components) -> Any:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
 
-        The default differentiates f numerically. Override it with a formula where single steps must be fast.
+        The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
+        on the user's units. Override it with a formula where single steps must be fast.
 
         Parameters
         ----------
@@ -237,27 +361,32 @@ class System:
         float, or of the kind that the components of ``x`` are
             The rate in 1/s.
         """
-        fx, eps = self.f(x), 1e-6
+        steps = [5e-7 * (high - low) for low, high in self.X]
+        fx = self.f(x)
         total = 0.0
-        for j in range(self.nx):
-            moved = [*x[:j], x[j] + eps, *x[j + 1 :]]
-            total = total + sum(((b - a) / eps) ** 2 for a, b in zip(fx, self.f(moved), strict=True))
+        for j, step in enumerate(steps):
+            moved = self.f([*x[:j], x[j] + step, *x[j + 1 :]])
+            total = total + sum(((b - a) / unit) ** 2 for a, b, unit in zip(fx, moved, steps, strict=True))
         return total**0.5
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-        """Corners of the training box.
+        """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
 
         Parameters
         ----------
         factor : float
-            What both corners are multiplied with.
+            How many times as wide the box is to be.
 
         Returns
         -------
         low, high : ndarray, shape (nx,)
             The corners.
         """
-        low, high = np.array(self.X).T * factor
+        low, high = np.array(self.X, dtype=float).T
+        if factor != 1:
+            centre, (lowest, highest) = np.array(self.X_centre), np.array(self.bounds, dtype=float).T
+            low = np.maximum(centre + factor * (low - centre), lowest)
+            high = np.minimum(centre + factor * (high - centre), highest)
         return low, high
 
     def replace(self, parameters: Mapping[str, float]) -> "System":
@@ -279,9 +408,9 @@ class System:
             If a name is unknown or a value is not a finite number.
         """
         known = self.parameters
-        for name in parameters:
+        for name in mapping("parameters", parameters):
             if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
+                raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
 
 
@@ -299,8 +428,61 @@ def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> n
     -------
     ndarray, shape (..., m)
         The values. Components that do not depend on the state are repeated.
+
+    Raises
+    ------
+    EquationError
+        If they fail, or return something else.
     """
-    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in equations(np.moveaxis(x, -1, 0))], axis=-1)
+    values = components(equations, np.moveaxis(x, -1, 0))
+    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
+
+
+def inner_state(system: System) -> tuple[float, ...]:
+    """A state in X for a first look at the equations, off its centre, where some divide by zero."""
+    return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
+
+
+def _starts(system: System) -> np.ndarray:
+    """A thousand starts (1000, nx), always the same."""
+    return system.draw_starts(np.random.default_rng(0), 1000)
+
+
+def typical_rate(system: System, starts: np.ndarray) -> float:
+    """Median over some starts of how fast f changes.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    starts : ndarray, shape (n, nx)
+        States at which ``system.rate`` is asked.
+
+    Returns
+    -------
+    float
+        The rate in 1/s.
+
+    Raises
+    ------
+    ValueError
+        If the rate is zero or not finite.
+    """
+    rate = float(np.median(np.broadcast_to(system.rate(starts.T), len(starts))))
+    if not 0 < rate < math.inf:
+        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
+    return rate
+
+
+@functools.lru_cache(maxsize=256)
+def _typical_rate(system: System) -> float:
+    return typical_rate(system, _starts(system))
+
+
+@functools.lru_cache(maxsize=256)
+def _output_range(system: System) -> tuple[float, ...]:
+    size = np.ptp(system.output(_starts(system)), axis=0)
+    return tuple(np.where(size > 0, size, 1.0).tolist())
 
 
 def _restored(kind: "type[System] | str", parameters: Mapping[str, float]) -> System:

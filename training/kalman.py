@@ -1,6 +1,7 @@
 """Kalman filters that know the equations of motion: what a control engineer would try first."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -8,7 +9,7 @@ from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
-NOISE_FLOOR = 0.01  # the least standard deviation of measurement noise that a filter assumes
+NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx) of a batch, or those of one Gaussian, (nx,) and (nx, nx)."""
@@ -18,6 +19,26 @@ def unknown_start(system: System) -> Gaussian:
     """Mean (nx,) and covariance (nx, nx) of a start uniform in X."""
     low, high = system.box()
     return (low + high) / 2, np.diag((high - low) ** 2 / 12)
+
+
+def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
+    """Covariance of the measurement noise that a filter assumes: no less than a part of the system's default.
+
+    Parameters
+    ----------
+    system : System
+        What is measured.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample, of all outputs or each.
+
+    Returns
+    -------
+    ndarray, shape (ny, ny)
+        R.
+    """
+    least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
+    levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
+    return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 
 
 class KalmanFilter(ABC):

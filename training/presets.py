@@ -4,7 +4,7 @@ What differs from system to system, the spectrum above all, comes from the syste
 :mod:`training.systems`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from kkl_gym.system import System
 from training.config import Config, Pipeline, override
 from training.smoothness import smooth_spectrum
-from training.spectrum import evenly_spaced, papers_spectrum, typical_rate
+from training.spectrum import evenly_spaced, papers_spectrum
 from training.systems import profile
 
 Preset = Literal["fast", "paper"]
@@ -24,6 +24,8 @@ LARGE: dict[str, Any] = {
     "batch": 4096,
     "learning_rate": 1e-3,
 }
+NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
+FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
 CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 
@@ -62,14 +64,22 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
             f"no preset {name!r} for pipeline {pipeline!r}; there are {get_args(Preset)}, {get_args(Pipeline)}"
         )
     changes = changes or {}
+    given = {key: value for key, value in changes.items() if value is not None}
+    sizes: dict[str, Any] = {
+        "dt": system.dt,
+        "duration": system.duration,
+        "measurement_noise_max": float(np.max(NOISE_RANGE * np.asarray(system.measurement_noise))),
+    }
     if pipeline == "input-aware":
-        config = override(Config(pipeline, eigenvalues(system)), profile(system).settings)
-        sizes = {**LARGE, "inverse_steps": 244_140}
-        return override(override(config, sizes if name == "paper" else {}), changes)
+        spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
+        config = override(Config(pipeline, spectrum, **sizes), profile(system).settings)
+        larger = {**LARGE, "inverse_steps": 244_140}
+        return override(override(config, larger if name == "paper" else {}), changes)
     if name == "paper":
         config = Config(
             pipeline,
             papers_spectrum(system),
+            **sizes,
             trajectories=500,
             samples=5001,
             **LARGE,
@@ -81,23 +91,27 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
             transients=False,
         )
         return override(config, changes)
-    chosen: dict[str, Any] = {"box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
-    chosen |= {**profile(system).spinn_settings, **{key: value for key, value in changes.items() if value is not None}}
+    chosen = {**sizes, "box_factor": 2.0, "forward_steps": 10_000, "noise_free_share": 0.35}
+    settings = dict(profile(system).spinn_settings)
+    if "eigenvalues" in settings:
+        settings["eigenvalues"] = _rounded(settings["eigenvalues"])
+    chosen |= {**settings, **given}
     if "eigenvalues" not in chosen:
-        dt, duration = (chosen.get(key, getattr(Config, key)) for key in ("dt", "duration"))
-        chosen["eigenvalues"] = smooth_spectrum(system, dt, duration).eigenvalues
-    return Config(pipeline, **{**chosen, "eigenvalues": tuple(np.round(chosen["eigenvalues"], 6).tolist())})
+        chosen["eigenvalues"] = smooth_spectrum(system, chosen["dt"], chosen["duration"]).eigenvalues
+    return Config(pipeline, **chosen)
 
 
-def eigenvalues(system: System) -> tuple[float, ...]:
+def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     """Real eigenvalues of A for an input-aware map.
 
-    The system's profile says them, or they follow from how fast f changes in X.
+    The system's profile says them, or they follow from how fast f changes in X and from how often y is sampled.
 
     Parameters
     ----------
     system : System
         Any system.
+    dt : float
+        Sampling interval in seconds.
 
     Returns
     -------
@@ -110,7 +124,13 @@ def eigenvalues(system: System) -> tuple[float, ...]:
         If there is no profile and the system does not say how fast f changes.
     """
     chosen = profile(system).eigenvalues
-    if chosen is None:
-        rate = typical_rate(system)
-        chosen = evenly_spaced(4 * system.nx + 3, -rate / 15, -1.5 * rate)
-    return tuple(np.round(chosen, 6).tolist())
+    if chosen is not None:
+        return _rounded(chosen)
+    fastest = min(1.5 * system.typical_rate, FASTEST_MODE / dt)
+    spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)
+    return tuple(float(f"{value:.6g}") for value in spaced)
+
+
+def _rounded(eigenvalues: Sequence[float]) -> tuple[float, ...]:
+    """As the shipped maps have them."""
+    return tuple(np.round(eigenvalues, 6).tolist())

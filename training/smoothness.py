@@ -11,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.maps.coordinates import settling_time
 from training.seeds import Stream, generator
-from training.spectrum import Spectrum, evenly_spaced, typical_rate
+from training.spectrum import Spectrum, evenly_spaced
 from training.trajectories.record import recording_ages
 
 SMOOTH = 0.85  # least exponent of a smooth T: differences in z fall as distance^0.85 where neighbours come closer
@@ -92,13 +92,13 @@ def smoothness(
         If the system does not say how fast f changes, or motions leave its bounds before any of the filters has
         forgotten its start.
     """
-    spectra, rate = list(spectra), typical_rate(system)
+    spectra, rate = list(spectra), system.typical_rate
     step = max(dt, FINEST / rate)
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
     settled = [2.0 * settling_time(linear) for linear in filters]
     steps = int(np.ceil((FOLLOWED / rate + max(settled)) / step))
     ages, rng = recording_ages(steps, SAMPLES), generator(Stream.TUNING, seed)
-    x0 = np.concatenate([rng.uniform(*system.box(factor), (MOTIONS // 2, system.nx)) for factor in (1.0, box_factor)])
+    x0 = np.concatenate([system.draw_starts(rng, MOTIONS // 2, factor) for factor in (1.0, box_factor)])
     x = simulate(system, rng.permutation(x0), steps, step)
     inside = np.isfinite(x).all(-1)
     x = np.where(inside[..., None], x, x[0])  # states beyond the bounds do not count; h and the filter need numbers
@@ -158,8 +158,9 @@ def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spect
     ValueError
         If the system does not say how fast f changes.
     """
-    slowest, rate = SLOWEST, typical_rate(system)
-    fastest = max(slowest, min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate)))
+    rate = system.typical_rate
+    fastest = min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate))
+    slowest = min(SLOWEST, fastest)
     slow = rate * np.geomspace(slowest, fastest, 1 + round(np.log(fastest / slowest) / np.log(STEP)))
     slow = slow[slow >= min(FORGOTTEN / duration, slow[-1])]
     return [Spectrum(tuple(float(f"{v:.6g}") for v in evenly_spaced(2 * system.nx + 1, -a, -SPREAD * a))) for a in slow]

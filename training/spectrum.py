@@ -109,31 +109,3 @@ def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "
     _, poles, _ = scipy.signal.besselap(order, norm=norm)
     real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
     return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))
-
-
-def typical_rate(system: System, rng: np.random.Generator | None = None) -> float:
-    """Median over X of how fast f changes.
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    rng : Generator, optional
-        Of the 1,000 states at which ``system.rate`` is asked; by default always the same ones.
-
-    Returns
-    -------
-    float
-        The rate in 1/s.
-
-    Raises
-    ------
-    ValueError
-        If the rate is zero or not finite.
-    """
-    low, high = system.box()
-    points = (rng or np.random.default_rng(0)).uniform(low, high, (1000, system.nx)).T
-    rate = float(np.median(np.broadcast_to(system.rate(points), 1000)))
-    if not 0 < rate < np.inf:
-        raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
-    return rate

@@ -4,7 +4,6 @@ import math
 import pickle
 import subprocess
 import sys
-import warnings
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +17,7 @@ from hypothesis import strategies as st
 import kkl_gym
 from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, get_system
 from kkl_gym.plant import NOISE_BLOCK, output_bounds
-from kkl_gym.simulate import advance
+from kkl_gym.simulate import SubstepsError, advance
 
 everyone = pytest.mark.parametrize("name", ENV_IDS)
 both = pytest.mark.parametrize("observe", ["state", "output"])
@@ -236,16 +235,14 @@ def test_escape_terminates_with_the_last_state(observe):
     assert not env.reset(seed=0)[1].get("escaped")
 
 
-def test_an_interval_too_long_to_simulate_is_an_escape():
-    env = KKLEnv("lorenz", dt=1000.0)
-    start, _ = env.reset(seed=0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        obs, reward, terminated, _, info = env.step(np.zeros(1))
-    assert terminated
-    assert info["escaped"]
-    assert np.array_equal(obs, start)
-    assert math.isfinite(reward)
+def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
+    for dt in (1e5, 1e300):
+        with pytest.raises(SubstepsError, match=r"lorenz changes at a rate of 15\.48/s .* take dt <= 1.7e"):
+            KKLEnv("lorenz", dt=dt)
+    env = KKLEnv("lorenz", dt=1600.0)  # suits the middle of X, but not all states
+    env.reset(options={"x0": [1.0, 1.0, 20.0]})
+    with pytest.raises(SubstepsError, match="65536 substeps are not enough for dt = 1600 s"):
+        env.step(np.zeros(1))
 
 
 @everyone

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, elementary, get_system
+from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 VARIANTS = {
@@ -129,7 +129,8 @@ def test_default_rate_is_the_norm_of_the_jacobian():
     system = Lorenz()
     x, f, _, _ = symbolic(system)
     at = (3.0, -4.0, 25.0)
-    norm = np.linalg.norm(np.array(f.jacobian(x).subs(dict(zip(x, at, strict=True))), float))
+    half = np.ptp(system.X, axis=1) / 2
+    norm = np.linalg.norm(np.array(f.jacobian(x).subs(dict(zip(x, at, strict=True))), float) * half / half[:, None])
     assert System.rate(system, at) == pytest.approx(norm, rel=1e-5)
     assert System.rate(system, np.array([at, at]).T) == pytest.approx([norm, norm], rel=1e-5)
 
@@ -253,7 +254,7 @@ def test_nonsense_names_raise_with_the_name(nonsense):
 
 @pytest.mark.parametrize("nonsense", [None, 3, int, object()])
 def test_nonsense_objects_raise(nonsense):
-    with pytest.raises(ValueError, match="expected a system"):
+    with pytest.raises(ValueError, match="system must be"):
         get_system(nonsense)
 
 
@@ -316,55 +317,6 @@ def test_missing_methods_are_named():
         mine.f((0.0, 0.0))
     with pytest.raises(NotImplementedError, match="Mine does not define h"):
         mine.h((0.0, 0.0))
-
-
-FUNCTIONS = ("sin", "cos", "tan", "exp", "tanh", "sqrt")
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-@settings(deadline=None, max_examples=30, derandomize=True)
-@given(x=st.floats(0.01, 3.0))
-def test_elementary_functions_agree(name, x):
-    function = getattr(elementary, name)
-    expected = getattr(math, name)(x)
-    assert function(x) == expected
-    assert function(np.array([x, x])) == pytest.approx([expected] * 2, rel=1e-13)
-    assert function(np.float32(x)) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_symbols(name):
-    sympy = pytest.importorskip("sympy")
-    symbol = sympy.Symbol("x")
-    assert getattr(elementary, name)(symbol) == getattr(sympy, name)(symbol)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_tensors(name):
-    torch = pytest.importorskip("torch")
-    x = torch.linspace(0.01, 3.0, 30, dtype=torch.float64)
-    expected = [getattr(math, name)(value) for value in x.tolist()]
-    assert getattr(elementary, name)(x).tolist() == pytest.approx(expected, rel=1e-13)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_refuse_the_rest(name):
-    assert getattr(elementary, name)(1) == getattr(math, name)(1.0)
-    for wrong in ("1", None, [1.0]):
-        with pytest.raises(TypeError, match=name):
-            getattr(elementary, name)(wrong)
-
-
-def test_elementary_functions_outside_their_domain_are_nan():
-    assert math.isnan(elementary.sin(math.inf))
-    assert math.isnan(elementary.sqrt(-1.0))
-
-
-def test_elementary_gradient():
-    torch = pytest.importorskip("torch")
-    x = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(elementary.sin(x), x)
-    assert float(slope) == pytest.approx(math.cos(0.3))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ def test_paper_preset_has_the_papers_table():
     assert len(config.eigenvalues) == 5
     assert (max(config.eigenvalues), min(config.eigenvalues)) == (-1.5, -3.0)
     assert isinstance(config, Config)
-    assert all(value < 0 for value in presets.eigenvalues(Oscillator()))
+    assert all(value < 0 for value in presets.eigenvalues(Oscillator(), 0.01))
 
 
 def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectrum_that_is_given(monkeypatch):

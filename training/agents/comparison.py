@@ -2,10 +2,10 @@
 
 import json
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
 import scipy
@@ -16,7 +16,7 @@ from observers.storage import write
 from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
-from training.agents.tasks import TASKS, get_task, scores, successes
+from training.agents.tasks import TASKS, Noise, get_task, noise_text, scores, successes
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
@@ -32,6 +32,8 @@ MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if fo
 SEEDS = 5
 RECURRENT_SEEDS = 3
 MORE_NOISE_RECURRENT_SEEDS = 1
+Level = TypeVar("Level", bound=Hashable)
+
 MANY = 1000  # seeds, more than anyone trains
 OTHER = "an agent of another comparison"
 PROTOCOL = 1  # changes where results must not be mixed with earlier ones
@@ -45,7 +47,7 @@ class Case:
     ----------
     system : str
         A shipped system, or a class of the user's as "module:Class" or "script.py:Class".
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     information : {"state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"}
         What the agent knows.
@@ -63,7 +65,7 @@ class Case:
     """
 
     system: str
-    measurement_noise: float
+    measurement_noise: Noise
     information: Compared
     seed: int
     episodes: int
@@ -74,7 +76,8 @@ class Case:
     @property
     def name(self) -> str:
         """For people."""
-        return f"{get_system(self.system).name} at noise {self.measurement_noise:g}/{self.information}/{self.seed}"
+        system, noise = get_system(self.system).name, noise_text(self.measurement_noise)
+        return f"{system} at noise {noise}/{self.information}/{self.seed}"
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -145,7 +148,7 @@ def _run(case: Case) -> None:
         policy = agent = learn(
             task, information, case.folder, seed=case.seed, timesteps=case.timesteps, observer=observer
         )
-        env = agent.make(case.episodes)
+        env = agent.make(case.episodes, system=task.system)
     seconds = time.process_time() - began
     x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     result = {
@@ -156,14 +159,14 @@ def _run(case: Case) -> None:
     write(case.folder / "scores.json", json.dumps(result) + "\n")
 
 
-def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
+def idle(system: str, measurement_noise: Noise, episodes: int) -> np.ndarray:
     """Scores of zero input on the evaluation's episodes.
 
     Parameters
     ----------
     system : str
         A system with a control task.
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     episodes : int
         Their number.
@@ -181,14 +184,14 @@ def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
 
 
 def kinds(
-    levels: Mapping[str, Sequence[float]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
-) -> Iterator[tuple[str, float, Compared, int]]:
+    levels: Mapping[str, Sequence[Level]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
+) -> Iterator[tuple[str, Level, Compared, int]]:
     """Agents of a comparison, the first seed of each first.
 
     Parameters
     ----------
-    levels : mapping of str to sequence of float
-        For each system the levels of measurement noise, the task's own first.
+    levels : mapping of str to sequence of levels
+        For each system those of measurement noise, or what stands for them; the task's own first.
     information : sequence of str
         What agents know.
     seeds : int
@@ -208,7 +211,7 @@ def kinds(
                         yield system, level, what, seed
 
 
-def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[float, ...]]:
+def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[Noise, ...]]:
     """Levels of measurement noise at which agents are compared on each system.
 
     Parameters
@@ -220,7 +223,7 @@ def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True)
 
     Returns
     -------
-    dict of str to tuple of float
+    dict of str to tuple of levels
         The task's own level first.
 
     Raises
@@ -284,7 +287,7 @@ def planned(
             seed=seed,
             episodes=episodes,
             timesteps=timesteps,
-            folder=out / "jobs" / f"{names[system]}-{level:g}" / what / str(seed),
+            folder=out / "jobs" / f"{names[system]}-{noise_text(level)}" / what / str(seed),
             observer=(observers or {}).get(names[system]),
         )
         for system, level, what, seed in kinds(noise_levels(systems, more_noise), information, seeds)
@@ -328,7 +331,7 @@ def collect(
 
     systems = (*TASKS, *own)
     plan = planned(out, systems=systems, seeds=MANY, episodes=episodes, timesteps=timesteps, observers=observers)
-    idle_scores: dict[tuple[str, float], float] = {}
+    idle_scores: dict[tuple[str, Noise], float] = {}
     rows = []
     for case in plan:
         if not case.done:
@@ -340,7 +343,7 @@ def collect(
         rows.append(
             {
                 "system": get_system(case.system).name,
-                "noise": case.measurement_noise,
+                "noise": noise_text(key[1]) if isinstance(key[1], tuple) else key[1],
                 "knows": case.information,
                 "seed": case.seed,
                 "score": np.mean(result["scores"]),

@@ -26,7 +26,7 @@ from training.agents.comparison import (
     run_case,
 )
 from training.agents.information import observer_of
-from training.agents.tasks import TASKS
+from training.agents.tasks import TASKS, noise_text
 from training.jobs import run_all
 from training.progress import LOG, progress_bars, under_way
 
@@ -143,8 +143,8 @@ class Compare:
             found[system] = name
         if {"x_hat", "z"} & set(self.information):
             for name in self.systems:
-                if (system := get_system(name)).name not in found:
-                    observer_of(system)  # an error now, not when their turn comes
+                if (own := get_system(name)).name not in found:
+                    observer_of(own)  # an error now, not when their turn comes
         return found
 
 
@@ -159,7 +159,9 @@ def report(out: Path) -> None:
     import pandas as pd  # which takes half a second that help need not wait for
 
     results = pd.read_csv(out / "results.csv")
-    levels = noise_levels() if set(results.system) & set(TASKS) else {}
+    results["noise"] = [_plain(level) for level in results.noise]
+    shipped = noise_levels() if set(results.system) & set(TASKS) else {}
+    levels = {name: tuple(map(noise_text, at)) for name, at in shipped.items()}
     for name, group in results.groupby("system", sort=False):
         if name not in TASKS:
             levels[str(name)] = tuple(group.noise.unique())
@@ -188,7 +190,7 @@ def report(out: Path) -> None:
             spread = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
             row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
         rows.append(row)
-    lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks)], rows)
+    lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise}" for system, noise in tasks)], rows)
     minutes = results.groupby("knows").seconds.mean() / 60
     spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
@@ -196,7 +198,15 @@ def report(out: Path) -> None:
     _draw(out / "scores.png", results, tasks, partial)
 
 
-def _cells(results: "pd.DataFrame", tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
+def _plain(level: float | str) -> str:
+    """A level of noise as :func:`noise_text` gives it, from a column in which some are numbers."""
+    try:
+        return noise_text(float(level))
+    except ValueError:  # one for each output
+        return str(level)
+
+
+def _cells(results: "pd.DataFrame", tasks: list[tuple[str, str]]) -> dict[tuple[str, str, str], dict[str, Any]]:
     """What table and figure show for each task and kind of agent."""
     cells = {}
     for system, noise in tasks:
@@ -217,7 +227,7 @@ def _cells(results: "pd.DataFrame", tasks: list[tuple[str, float]]) -> dict[tupl
     return cells
 
 
-def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, float]], partial: str) -> None:
+def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, str]], partial: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")
@@ -232,7 +242,7 @@ def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, float]], p
                 ax.plot([low, high], [place, place], color="C0", lw=2)
                 ax.plot(found, place, "o", color="C0")
         ax.axvline(1.0, color="0.8", lw=0.8)
-        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]:g}", xlabel="normalised score")
+        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]}", xlabel="normalised score")
         ax.set_yticks(range(len(COMPARED)), [LABELS[knows] for knows in reversed(COMPARED)])
     figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
     with replacing(path) as temporary:

@@ -18,6 +18,8 @@ from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
 from training.progress import LOG, ProgressBars, progress_bars
 from training.spectrum import Spectrum
+from training.systems import named_policy
+from training.trajectories.controllers import Controller
 
 if TYPE_CHECKING:
     from training.dry_run import Estimate
@@ -94,6 +96,7 @@ class Train:
         changes = self._changes()
         with progress_bars(console) as progress, progress.phase("choosing a spectrum"):
             config = preset(system, self.pipeline, self.preset, changes=changes)
+        policy = None if config.policy is None else named_policy(system, config.policy)
         if self.dry_run:
             with progress_bars(console) as progress, progress.phase("timing a few batches", RUNS) as report:
                 found = estimate(system, config, device=device, report=report)
@@ -109,9 +112,9 @@ class Train:
             result = train(system, config, folder, resume=self.resume, device=device, console=progress)
             result.artifact.save(path)  # before anything else may fail
             if self.monitor:
-                self._find_limits(system, result, path, progress)
+                find_limits(path, result, system, policy=policy, progress=progress)
             with progress.phase("drawing the report"):
-                write_report(folder / "report.png", result, system)
+                write_report(folder / "report.png", result, system, policy=policy)
             size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
             progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
         return path
@@ -125,18 +128,36 @@ class Train:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         return changes
 
-    def _find_limits(self, system: System, result: "Result", path: Path, progress: ProgressBars) -> None:
-        """Write the artifact again, with limits for its monitor, if they can be found."""
-        from training.evaluation.calibration import PARTS, calibrate
 
-        if result.artifact.C is None:
-            progress.say("no monitor: the output is not linear, so there is no C x_hat to compare it with")
-            return
-        try:
-            with progress.phase("finding the monitor's limits", PARTS) as report:
-                calibrate(result.artifact, system, seed=result.artifact.training["seed"], report=report).save(path)
-        except ValueError as error:
-            progress.say(f"no limits for a monitor: {error}")
+def find_limits(
+    path: Path, result: "Result", system: System, *, policy: Controller | None, progress: ProgressBars
+) -> None:
+    """Write an artifact again, with limits for its monitor, or say why there are none.
+
+    Parameters
+    ----------
+    path : Path
+        The artifact's file.
+    result : Result
+        What the training made.
+    system : System
+        What it was made for.
+    policy : callable or None
+        Under which it was trained.
+    progress : ProgressBars
+        Where progress is shown.
+    """
+    from training.evaluation.calibration import PARTS, calibrate
+
+    artifact = result.artifact
+    if artifact.C is None:
+        progress.say("no monitor: the output is not linear, so there is no C x_hat to compare it with")
+        return
+    try:
+        with progress.phase("finding the monitor's limits", PARTS) as report:
+            calibrate(artifact, system, seed=artifact.training["seed"], policy=policy, report=report).save(path)
+    except ValueError as error:
+        progress.say(f"no limits for a monitor: {error}")
 
 
 def described(system: System, config: Config, name: Preset, changes: Mapping[str, Any]) -> list[str]:

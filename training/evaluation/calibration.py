@@ -11,13 +11,14 @@ from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, Limits
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
 LARGEST = 1.0  # for maps that are not told the noise
-WINDOW = 0.5  # s
-WARM_UP = 5.0  # s
+WINDOW, WARM_UP = 0.5, 5.0  # seconds at the pace of the shipped systems
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
 PARTS = 1 + len(LEVELS)  # of the work: simulating, and each level
@@ -28,9 +29,10 @@ def calibrate(
     system: System,
     *,
     trajectories: int | None = None,
-    duration: float = 50.0,
+    duration: float | None = None,
     false_alarms: float = 0.01,
     seed: int = 0,
+    policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Artifact:
     """Find limits for an observer's monitor.
@@ -47,12 +49,15 @@ def calibrate(
         What it was made for.
     trajectories : int, optional
         Number of trajectories; by default as many as it takes to tell such rare events.
-    duration : float
-        Length of each in seconds.
+    duration : float, optional
+        Length of each in seconds; by default the system's own.
     false_alarms : float
         Probability that a sound trajectory of this length exceeds a limit.
     seed : int
         Seed of starts, inputs and noise.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one; half of the trajectories then are its own, and in the
+        others it explores.
     report : callable, optional
         Told how many of the ``PARTS`` of the work are done.
 
@@ -70,16 +75,18 @@ def calibrate(
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     if artifact.C is None:
         raise ValueError(f"the output of {system.name!r} is not linear: there is no C x_hat to compare it with")
-    if not 0 < false_alarms < 1 or duration <= WARM_UP or seed < 0:
+    duration = system.duration if duration is None else duration
+    window, warm_up = WINDOW * system.pace, WARM_UP * system.pace
+    if not 0 < false_alarms < 1 or duration <= warm_up or seed < 0:
         raise ValueError(
-            f"need 0 < false_alarms < 1, duration > {WARM_UP} and seed >= 0, got {false_alarms}, {duration}, {seed}"
+            f"need 0 < false_alarms < 1, duration > {warm_up} and seed >= 0, got {false_alarms}, {duration}, {seed}"
         )
     share = false_alarms / (6 * system.ny)
     least = math.ceil(1 / share - 1e-9)
     if trajectories is not None and trajectories < least:
         raise ValueError(f"{trajectories} trajectories are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng, policy=policy)
     largest = artifact.inverse.measurement_noise_max
     levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
     rows = []
@@ -88,12 +95,18 @@ def calibrate(
         rows.append(_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng))
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
-        artifact, limits=Limits(levels, mean, low, high, WINDOW, WARM_UP, false_alarms, duration)
+        artifact, limits=Limits(levels, mean, low, high, window, warm_up, false_alarms, duration)
     )
 
 
 def sound_trajectories(
-    artifact: Artifact, system: System, *, n: int, duration: float, rng: np.random.Generator
+    artifact: Artifact,
+    system: System,
+    *,
+    n: int,
+    duration: float,
+    rng: np.random.Generator,
+    policy: Controller | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories with process noise, every other one under random inputs if the map knows inputs.
 
@@ -111,6 +124,8 @@ def sound_trajectories(
         Length of each in seconds.
     rng : numpy.random.Generator
         From which starts, inputs and process noise are drawn.
+    policy : callable, optional
+        Acts on the system in place of random inputs; every other trajectory is its own, without errors and exploration.
 
     Returns
     -------
@@ -130,10 +145,15 @@ def sound_trajectories(
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
         u = np.zeros((steps, missing, system.nu))
-        if artifact.nu:
+        if artifact.nu and not policy:
             u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng)
         w = draw_process_noise(system, system.process_noise, n=missing, steps=steps, rng=rng)
-        x = simulate(system, rng.uniform(*system.box(), (missing, system.nx)), steps, dt, u=u, w=w)
+        x0 = system.draw_starts(rng, missing)
+        if policy:
+            own = np.arange(missing) % 2 == 1
+            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
+        else:
+            x = simulate(system, x0, steps, dt, u=u, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))
         if len(kept) == TRIES:
@@ -157,8 +177,8 @@ def _limits(
     y = noisy_output(system, x, measurement_noise=level, rng=rng)
     observer = KKLObserver(artifact, level, process_noise=system.process_noise)
     residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
-    a = -np.expm1(-dt / WINDOW)
-    late = slice(round(WARM_UP / dt) + 1, None)
+    a = -np.expm1(-dt / (WINDOW * system.pace))
+    late = slice(round(WARM_UP * system.pace / dt) + 1, None)
     means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]
     squares = lfilter([a], [1.0, a - 1.0], residual**2, axis=0)[late]
     mean = np.quantile(means.max(0), 1 - share, axis=0, method="weibull") * MARGIN

@@ -10,12 +10,20 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.metrics import smape
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
+TRIES = 1000  # starts of which one at least should lie beyond X
+
 Domain = Literal["X", "1.5X", "2X"]
+
+
+class NoStartsError(ValueError):
+    """A multiple of X holds no starts beyond X."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +108,27 @@ def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> 
     -------
     ndarray, shape (n, nx)
         The starts.
+
+    Raises
+    ------
+    NoStartsError
+        If there are hardly any beyond X.
     """
     if domain == "X":
-        return np.asarray(rng.uniform(*system.box(), (n, system.nx)))
+        return system.draw_starts(rng, n)
     low, high = system.box()
-    larger = system.box(float(domain.removesuffix("X")))
-    found: list[np.ndarray] = []
+    factor, found = float(domain.removesuffix("X")), list[np.ndarray]()
+    tries = 0
     while len(found) < n:
-        x = rng.uniform(*larger)
+        (x,) = system.draw_starts(rng, 1, factor)
         if ((x < low) | (x > high)).any():
             found.append(x)
+        tries += 1
+        if tries > TRIES * (1 + len(found)):
+            raise NoStartsError(
+                f"no state of {system.name} in {domain} lies beyond X = {system.X}: bounds = {system.bounds} leave no "
+                "room there, or its draw_starts takes no notice of the factor"
+            )
     return np.array(found)
 
 
@@ -124,6 +143,7 @@ def unseen_trajectories(
     driven: bool = False,
     stream: Stream = Stream.EVALUATION,
     process_noise: float = 0.0,
+    policy: Controller | None = None,
 ) -> UnseenTrajectories:
     """Simulate test trajectories, whose random numbers training never draws.
 
@@ -142,11 +162,13 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where they start, see :func:`starts`.
     driven : bool
-        Whether inputs act: random bounded steps and sines in turn.
+        Whether inputs act: random bounded steps and sines in turn. Under a policy, whether it errs and explores.
     stream : Stream
         Random numbers to draw: those of evaluation or those of validation.
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
+    policy : callable, optional
+        Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
 
     Returns
     -------
@@ -169,12 +191,16 @@ def unseen_trajectories(
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = np.zeros((steps, n, system.nu))
-    if driven:
+    if driven and not policy:
         u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
     w = None
     if process_noise:
         w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
-    x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
+    if policy:
+        exploring, own = generator(stream, seed, 3), np.full(n, not driven)
+        x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w)
+    else:
+        x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
 

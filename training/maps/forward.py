@@ -234,7 +234,7 @@ def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon
     ValueError
         If the trajectories end before.
     """
-    x0 = np.random.default_rng(0).uniform(*system.box(box_factor), (10_000, system.nx))
+    x0 = system.draw_starts(np.random.default_rng(0), 10_000, box_factor)
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
     t = truncation_time(linear, z0, epsilon)
     if t >= steps * linear.dt:

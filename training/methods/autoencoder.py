@@ -8,13 +8,13 @@ import torch
 from scipy.linalg import solve_continuous_lyapunov
 from torch import nn
 
-from kkl_gym.system import System
+from kkl_gym.system import System, typical_rate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from training.maps.networks import Network, tensor
 from training.maps.pde import along, on_tensors
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod
-from training.spectrum import bessel_spectrum, typical_rate
+from training.spectrum import bessel_spectrum
 from training.trajectories.derivatives import output_matrix
 
 BATCH = 512
@@ -50,7 +50,7 @@ class AE(KKLMethod):
         """Learn for every cutoff, choose one, learn for it; the first two only where the cutoff is not settled yet."""
         torch.manual_seed(task.seed)
         system, budget = task.system, task.budget
-        rate = typical_rate(system, task.rng)
+        rate = typical_rate(system, system.draw_starts(task.rng, 1000))
         chosen, share = configuration.get("cutoff"), 1.0
         if chosen is None:
             every = _Problem(task, rate * CUTOFFS[0], rate * CUTOFFS[1])

@@ -5,7 +5,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.system import Components, System
-from training.kalman import NOISE_FLOOR, ExtendedKalmanFilter, KalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.kalman import (
+    ExtendedKalmanFilter,
+    KalmanFilter,
+    UnscentedKalmanFilter,
+    measurement_covariance,
+    unknown_start,
+)
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of a second:
@@ -25,7 +31,7 @@ class EKF(Method[Arrays]):
     filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of diffusion, in multiples of the scale per square root of a second."""
+        """Three levels of diffusion, in multiples of the scale per square root of a second of its pace."""
         return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
@@ -34,8 +40,8 @@ class EKF(Method[Arrays]):
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
         """The filter, told the noise level."""
-        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2)
-        R = max(noise, NOISE_FLOOR) ** 2 * np.eye(system.ny)
+        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
+        R = measurement_covariance(system, noise)
         return self.filter(self.model(system), dt, Q=Q, R=R)
 
     def model(self, system: System) -> System:

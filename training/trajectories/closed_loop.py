@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kkl_gym.simulate import advance_batch
+from kkl_gym.simulate import advance_batch, followed_rows
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
@@ -105,7 +105,7 @@ def record_closed_loop(
         if artifact.process_noise_max is not None and rng.random() < process_noise_share:
             disturbance = system.process_noise * float(np.sqrt(rng.random()))
         observer = KKLObserver(artifact, level, process_noise=disturbance)
-        x = rng.uniform(*system.box(), (count, system.nx)).T.copy()
+        x = system.draw_starts(rng, count).T.copy()
         inside = np.ones(count, dtype=bool)
         x_rows, z_rows = np.empty((len(ages), count, system.nx)), np.empty((len(ages), count, artifact.filter.size))
         slot = {int(age): i for i, age in enumerate(ages)}
@@ -125,6 +125,8 @@ def record_closed_loop(
             if disturbance:
                 w = np.ascontiguousarray(draw_process_noise(system, disturbance, n=count, steps=1, rng=rng)[0].T)
             after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
+            beyond = np.flatnonzero(~((after >= low) & (after <= high)).all(0))
+            after = followed_rows(system, x, np.ascontiguousarray(u.T), w, dt=dt, end=after, rows=beyond)
             inside &= ((after >= low) & (after <= high)).all(0)
             x = np.where(inside, after, x)
         xs.append(x_rows[:, inside])

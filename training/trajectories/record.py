@@ -9,12 +9,17 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 
 CHUNK = 500  # trajectories simulated at once
-RANDOM_LEAD_IN = 10.0  # seconds for which random inputs lead starts out of the training box
-CONSTANT_LEAD_IN = 20.0  # seconds for which constant ones do
+FIRST = 100  # trajectories tried before all others
+FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
+# Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
+RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
+POLICYS_OWN = 4  # every fourth trajectory under a policy is its own, the others are also explored
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 
@@ -57,6 +62,8 @@ class Motions:
         Share of the trajectories with process noise, at any level up to the system's own, high ones more often.
     box_factor : float, default 1
         If larger, most trajectories start in this multiple of X.
+    policy : callable, optional
+        Acts on all trajectories in place of random inputs, see :func:`training.trajectories.policy.under_policy`.
     """
 
     kinds: tuple[str, ...] = ()
@@ -64,6 +71,7 @@ class Motions:
     lead_in_input: float = 0.0
     process_noise_share: float = 0.0
     box_factor: float = 1.0
+    policy: Controller | None = None
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
@@ -131,7 +139,7 @@ def record(
     """
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
-        motions = dataclasses.replace(motions, kinds=())
+        motions = dataclasses.replace(motions, kinds=(), policy=None)
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
     levels: list[np.ndarray] = []
@@ -190,40 +198,70 @@ def trajectories(
     tried, pending = 0, []
     for count in [CHUNK] * (n // CHUNK) + [n % CHUNK]:
         pending += [(row, row < round(motions.lead_in_share * count)) for row in range(count)]
+    if n > CHUNK:  # whether they stay within bounds is said before so many have been simulated
+        first = _simulated(system, pending[:FIRST], steps=steps, dt=dt, rng=np.random.default_rng(0), motions=motions)
+        _check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
-        count, led = len(rows), np.array([beyond for _, beyond in rows])
-        x0 = rng.uniform(*system.box(), (count, system.nx))
-        if motions.box_factor > 1:
-            far = rng.random(count) >= NEAR
-            x0[far] = rng.uniform(*system.box(motions.box_factor), (int(far.sum()), system.nx))
-        if system.nu and led.any():
-            end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
-            x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
-        u = np.zeros((steps, count, 0))
-        if motions.kinds:
-            kinds = tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
-            u = random_inputs(system, count, steps, dt=dt, rng=rng, kinds=kinds)
-        w, level = None, np.zeros(count)
-        if motions.process_noise_share and system.process_noise:
-            some = rng.random(count) < motions.process_noise_share
-            level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
-            w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
+        found = _simulated(system, rows, steps=steps, dt=dt, rng=rng, motions=motions)
+        pending += [row for row, stayed in zip(rows, found.inside) if not stayed]
+        tried += len(rows)
+        if pending and tried >= FIRST:
+            _check_share(system, n - len(pending), tried, steps * dt)
+        yield found.x[:, found.inside], found.u[:, found.inside], found.level[found.inside]
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """Trajectories, and which of them stayed within the bounds."""
+
+    x: np.ndarray
+    u: np.ndarray
+    level: np.ndarray
+    inside: np.ndarray
+
+
+def _simulated(
+    system: System, rows: list[tuple[int, bool]], *, steps: int, dt: float, rng: np.random.Generator, motions: Motions
+) -> _Chunk:
+    """Simulate trajectories of the kinds that the rows say: the number of the input's kind, and whether led from X."""
+    count, led = len(rows), np.array([beyond for _, beyond in rows])
+    x0 = system.draw_starts(rng, count)
+    if motions.box_factor > 1:
+        far = rng.random(count) >= NEAR
+        x0[far] = system.draw_starts(rng, int(far.sum()), motions.box_factor)
+    if system.nu and led.any():
+        end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
+        x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
+    u = np.zeros((steps, count, 0))
+    if motions.kinds and not motions.policy:
+        kinds = tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
+        u = random_inputs(system, count, steps, dt=dt, rng=rng, kinds=kinds)
+    w, level = None, np.zeros(count)
+    if motions.process_noise_share and system.process_noise:
+        some = rng.random(count) < motions.process_noise_share
+        level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
+        w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
+    if motions.policy:
+        own = np.array([i % POLICYS_OWN == 0 for i, _ in rows])
+        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
+    else:
         x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
-        inside = np.isfinite(x[-1]).all(-1)
-        pending += [row for row, stayed in zip(rows, inside) if not stayed]
-        tried += count
-        if pending and tried > 20 * n:
-            raise ValueError(
-                f"of {tried} trajectories of {steps * dt:g} s only {n - len(pending)} stayed within bounds = "
-                f"{system.bounds}; widen the bounds, shrink X or shorten the trajectories"
-            )
-        yield x[:, inside], u[:, inside], level[inside]
+    return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))
+
+
+def _check_share(system: System, stayed: int, tried: int, seconds: float) -> None:
+    """Raise an error if hardly any of the trajectories that were tried stayed within the bounds."""
+    if stayed < FEWEST_INSIDE * tried:
+        raise ValueError(
+            f"of {tried} trajectories of {seconds:g} s only {stayed} stayed within bounds = {system.bounds}; widen the "
+            "bounds, shrink X or shorten the trajectories, or give a policy that holds the system (--policy)"
+        )
 
 
 def _lead_in(system: System, x0: np.ndarray, *, dt: float, rng: np.random.Generator, constant: float) -> np.ndarray:
     """Where inputs lead from starts (n, nx); NaN where that is out of bounds."""
-    steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) / dt)
+    steps = round((CONSTANT_LEAD_IN if constant else RANDOM_LEAD_IN) * system.pace / dt)
     if constant:
         values = constant * rng.uniform(-1, 1, (len(x0), system.nu)) * system.u_max
         u = np.broadcast_to(values, (steps, len(x0), system.nu))

@@ -11,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.filter_noise import noise_covariance
 from training.seeds import Stream, generator
-from training.spectrum import Spectrum, bessel_spectrum, typical_rate
+from training.spectrum import Spectrum, bessel_spectrum
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 RESOLUTION = 1e-3  # to which a network reads z, as a part of the signal: what is left where there is no noise
@@ -124,7 +124,7 @@ class Probe:
     @cached_property
     def library(self) -> Spectrum:
         """The modes to choose from: real ones up to three times the system's rate, and pairs where y has its power."""
-        slowest, fastest = 5.0 / self.duration, min(3.0 * typical_rate(self.system), 0.5 / self.dt)
+        slowest, fastest = 5.0 / self.duration, min(3.0 * self.system.typical_rate, 0.5 / self.dt)
         real = -np.geomspace(slowest, max(fastest, 2.0 * slowest), REAL_MODES)
         pairs = [(-a, w) for w in self.frequencies for a in np.geomspace(slowest, max(2 * w, 2 * slowest), DECAYS)]
         return Spectrum(tuple(map(_rounded, real)), tuple((_rounded(a), _rounded(w)) for a, w in pairs))

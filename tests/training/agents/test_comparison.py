@@ -165,9 +165,9 @@ def test_a_system_and_an_observer_of_ones_own(tmp_path, saved, capsys):
     results = pd.read_csv(tmp_path / "results.csv")
     assert results[["system", "knows"]].to_numpy().tolist() == [["oscillator", "state"], ["oscillator", "x_hat"]]
     table = (tmp_path / "table.md").read_text()
-    assert "| oscillator, noise 0.5 |" in table
+    assert "| oscillator, noise 0.1 |" in table  # the system's own
     assert f"Partial: {6 * 5 + 2 * 3 - 2} of {6 * 5 + 2 * 3} agents are missing" in table
-    assert "finished oscillator at noise 0.5/x_hat/0" in (tmp_path / "log.txt").read_text()
+    assert "finished oscillator at noise 0.1/x_hat/0" in (tmp_path / "log.txt").read_text()
 
 
 def test_an_interrupted_training_is_of_one_comparison_as_well(tmp_path, monkeypatch):
@@ -197,3 +197,14 @@ def test_the_published_table_follows_from_the_published_results(tmp_path):
     shutil.copy(published / "results.csv", tmp_path)
     report(tmp_path)
     assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()
+
+
+def test_noise_of_each_output_has_a_name(tmp_path):
+    rows = [
+        {"system": system, "noise": noise, "knows": "state", "seed": 0, "score": -0.2, "success": 0.5, "idle": -0.6,
+         "seconds": 60.0}
+        for system, noise in (("lorenz", 2.0), ("two", "0.1-0.02"))
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
+    report(tmp_path)
+    assert "| lorenz, noise 2 | two, noise 0.1-0.02 |" in (tmp_path / "table.md").read_text()

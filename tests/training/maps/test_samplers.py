@@ -68,7 +68,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
     for _ in range(150):
         inputs, _, _, _ = sampler(generator)
         level = MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2:-1]).double().numpy()
-        age = AGE_UNIT * np.expm1(inputs[:, -1].double().numpy())
+        age = AGE_UNIT * linear.dt * np.expm1(inputs[:, -1].double().numpy())
         noise = inputs[:, :-2].double().numpy() * (1 + (level * gain) ** 2) / level
         slot = np.abs(age[:, None] - data.ages * linear.dt).argmin(1)
         np.add.at(sums, slot, noise[:, :, None] * noise[:, None, :])

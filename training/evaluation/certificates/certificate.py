@@ -21,6 +21,7 @@ from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschit
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 
 WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
@@ -122,6 +123,7 @@ def certify(
     delta: float = 0.05,
     seed: int = 0,
     name: str = "",
+    policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
     report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
@@ -132,7 +134,7 @@ def certify(
     artifact : Artifact
         The observer.
     system : System
-        What it was made for, without input.
+        What it was made for, without input unless there is a policy.
     measurement_noise : float, default 0.5
         Standard deviation of v; the theorems are about the same noise, cut at three of these.
     process_noise : float, optional
@@ -149,8 +151,10 @@ def certify(
         Of everything random.
     name : str, optional
         Of the observer, for the report.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one, see :func:`record_settled`.
     recorded : SettledTrajectories, optional
-        What :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+        What :func:`record_settled` returned for the same of all these, if it is there already.
     report : callable, optional
         Told how many of the :func:`parts` of the work are done.
 
@@ -179,7 +183,7 @@ def certify(
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
     noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
     if recorded is None:
-        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
+        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
     report(1)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
@@ -192,7 +196,7 @@ def certify(
         free = told  # a map that is not told the noise is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
-    l_h = output_lipschitz(system, generator(Stream.CERTIFICATE, seed, 1).uniform(*system.box(), (2_000, system.nx)))
+    l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
     noise_bound = TRUNCATED * measurement_noise
     if psi is None:
         everywhere = np.concatenate([recorded.x, recorded.noisy_x])

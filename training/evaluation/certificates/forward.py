@@ -160,7 +160,7 @@ def certify_forward(
     if artifact.forward is None:
         return None
     T, T_inv, linear = encoder(artifact.forward), noise_free.T_inv, artifact.filter
-    x = rng.uniform(*system.box(), (DRAWN, system.nx))
+    x = system.draw_starts(rng, DRAWN)
     size = np.linalg.norm(residual(artifact, system, x), axis=1)
     weight = float(artifact.training.get("physics_weight", 0.0))
     images, z = T(recorded.x), recorded.z

@@ -6,7 +6,7 @@ import torch
 from observers import InverseMap, LinearFilter
 from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
-from training.maps.samplers.trajectory import AGE_UNIT, MEASUREMENT_NOISE_UNIT, TrajectorySampler
+from training.maps.samplers.trajectory import MEASUREMENT_NOISE_UNIT, TrajectorySampler
 from training.trajectories.closed_loop import ClosedLoop
 
 
@@ -39,7 +39,7 @@ class ClosedLoopSampler:
         self._modes = tensor(coordinates(data.z) / shrink, device)
         self._x = tensor(open_loop.scale(data.x), device)
         self._level = tensor(np.log1p(data.measurement_noise / MEASUREMENT_NOISE_UNIT), device)
-        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / AGE_UNIT), device)
+        self._age = tensor(np.log1p(np.minimum(data.ages * dt, open_loop.age_max) / open_loop.age_unit), device)
         self._weight = tensor(open_loop.scale.weight(data.x), device)
         self._age_cell = open_loop.age_cell(data.ages, device)
         position = (

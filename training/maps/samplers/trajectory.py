@@ -16,7 +16,7 @@ from training.maps.scaling import StateScale
 from training.trajectories.record import Trajectories
 
 MEASUREMENT_NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
-AGE_UNIT = 0.05  # s, in the age feature log(1 + t / unit)
+AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
 PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
 
@@ -61,6 +61,8 @@ class TrajectorySampler:
         In which the network sees z.
     scale : StateScale
         Of the states.
+    age_unit : float
+        Seconds that count as one.
     age_max : float
         Seconds since reset beyond which the network is told no difference.
     cells : int
@@ -94,6 +96,7 @@ class TrajectorySampler:
         self.measurement_noise_max, self.process_noise_max = measurement_noise_max, process_noise_max
         self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
+        self.age_unit = AGE_UNIT * linear.dt
         self._per_age = batch // self.AGES_PER_BATCH
         self._modes = torch.empty((m, n, len(gain)), device=device)
         for i in range(m):
@@ -139,7 +142,8 @@ class TrajectorySampler:
         conditions = [torch.log1p(level / MEASUREMENT_NOISE_UNIT)]
         if self.process_noise_max:
             conditions.append(self._process[rows][..., None])
-        conditions.append(torch.log1p(self._age[ages].clamp(max=self.age_max) / AGE_UNIT)[..., None].expand_as(level))
+        age = torch.log1p(self._age[ages].clamp(max=self.age_max) / self.age_unit)
+        conditions.append(age[..., None].expand_as(level))
         inputs = torch.cat([modes, *conditions], -1)
         level_cell = torch.where(loud, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
         cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows])
@@ -187,6 +191,6 @@ class TrajectorySampler:
             measurement_noise_max=self.measurement_noise_max,
             process_noise_unit=PROCESS_NOISE_UNIT * self.process_noise_max or 1.0,
             process_noise_max=self.process_noise_max or math.inf,
-            age_unit=AGE_UNIT,
+            age_unit=self.age_unit,
             age_max=self.age_max,
         )
