@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
+import scipy
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import bootstrap
 
 from kkl_gym import SYSTEMS, System, get_system
 from training.agents.agent import Agent, AgentError
@@ -21,7 +20,7 @@ from training.agents.tasks import get_task, scores, successes
 from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
 from training.commands.options import NoiseLevel
-from training.evaluation.levels import show_level
+from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import progress_bars
 from training.seeds import agent_evaluation_seed
@@ -83,7 +82,9 @@ class Train:
         FileExistsError
             If the folder holds an agent or a checkpoint already, and nothing is to be resumed.
         """
-        from training.agents.learn import learn  # stable-baselines3 takes seconds to import
+        import torch  # which takes seconds to import, as stable-baselines3 does
+
+        from training.agents.learn import learn
 
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name
@@ -153,8 +154,7 @@ class Evaluate:
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
         episodes = show(console, agent, self.episodes, self.seed, trusted=self.system)
         system = get_system(task.system).name
-        level = show_level(task.measurement_noise).replace(", ", "-")
-        name = f"{system}-{agent.information}-{level}-{agent.seed}"
+        name = f"{system}-{agent.information}-{as_name(task.measurement_noise)}-{agent.seed}"
         draw(task, episodes, self.out / f"{name}.png")
         animate(task, episodes, self.out / f"{name}.gif")
         console.print(f"wrote {name}.png and {name}.gif in {self.out}")
@@ -238,7 +238,7 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, np.nan, np.nan
-    ends = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return mean, float(ends.low), float(ends.high)
 
 

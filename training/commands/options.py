@@ -14,6 +14,17 @@ from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
 
+SystemName = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(metavar="SYSTEM", help="A shipped system, or a class of yours as script.py:Class or module:Class."),
+]
+Parameters = Annotated[
+    dict[str, float],
+    tyro.conf.arg(
+        help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
+        help_behavior_hint="(default: none)",
+    ),
+]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
 ]

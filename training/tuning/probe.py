@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import periodogram
+import scipy
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
@@ -26,8 +26,6 @@ FARTHEST = 1e5  # that an error in the start may grow; what is known of it is a 
 SHORTEST = 10  # samples that must be followed
 SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no longer taken relative to it
 MIXED = 10.0  # largest half-width of X, in the smallest, beyond which states are taken to have different units
-
-"""Standard deviation of the noise on each sample of y, of all outputs or each."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ class Probe:
         moving = self.y[..., self.y.std((0, 1)) > 0]
         if not moving.size:
             return np.empty(0)
-        frequency, power = periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
+        frequency, power = scipy.signal.periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
         share = np.cumsum((power.mean(1) / power.sum(0).mean(0)).mean(-1))
         at = 2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)
         return np.unique([_rounded(w) for w in at if w > 0])

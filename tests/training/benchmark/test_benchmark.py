@@ -15,7 +15,8 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from rich.console import Console
 
-import training.commands.benchmark as command
+import training.benchmark.jobs
+import training.benchmark.sizes as sizes
 from kkl_gym import get_system
 from training.benchmark import protocol as protocol_module
 from training.benchmark.jobs import OTHER, Job, run_job
@@ -104,12 +105,12 @@ def toy(tmp_path):
 @pytest.fixture
 def tiny(monkeypatch):
     """The command at toy size."""
-    monkeypatch.setitem(command.BUDGETS, "cpu", TINY)
-    monkeypatch.setitem(command.BUDGETS, "quick", TINY)
-    monkeypatch.setattr(command, "PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "QUICK_PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "VALIDATION", SHORT)
-    monkeypatch.setattr(command, "step_time", lambda *_, **__: 1.0)
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", TINY)
+    monkeypatch.setitem(sizes.BUDGETS, "quick", TINY)
+    monkeypatch.setattr(sizes, "PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "VALIDATION", SHORT)
+    monkeypatch.setattr(training.benchmark.jobs, "step_time", lambda *_, **__: 1.0)
 
 
 def quiet():
@@ -414,7 +415,7 @@ def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monk
     name, _ = toy
     out = tmp_path / "out"
     Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
-    monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
         Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
