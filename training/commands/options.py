@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
+from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym.system import System
@@ -84,6 +85,11 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
     return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
+
+
+def say_left_out(console: Console, name: str, reason: str) -> None:
+    """Print why a part of what was asked for is left out."""
+    console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
