@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
-from observers.storage import write
+from observers.storage import clear_unfinished, write
 
 
 class Named(Protocol):
@@ -116,9 +116,14 @@ def describe(system: System) -> dict[str, Any]:
     dict
         To be compared with another after a way through JSON, which makes lists of tuples.
     """
-    x = system.draw_starts(np.random.default_rng(0), 20)
-    matrix = input_matrix(system, x.T)
-    rows = [*components(system.f, x.T), *(entry for row in matrix for entry in row), *system.output(x).T]
+    rng = np.random.default_rng(0)
+    x = system.draw_starts(rng, 20)
+    if system.discrete:
+        u = rng.uniform(-1, 1, (system.nu, 20)) * np.array(system.u_max)[:, None]
+        moved = components(system.step, x.T, u)
+    else:
+        moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
+    rows = [*moved, *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {
         "system": system.name,
@@ -162,7 +167,7 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in a folder.
+    """Keep other processes from working in a folder, and clear away what killed ones have left half-written.
 
     Parameters
     ----------
@@ -173,6 +178,8 @@ def locked(folder: Path) -> Iterator[None]:
     ------
     ValueError
         If another process is at work there already.
+    OSError
+        If the folder cannot be made or written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / ".lock", timeout=0)
@@ -181,6 +188,7 @@ def locked(folder: Path) -> Iterator[None]:
     except Timeout:
         raise ValueError(f"another process is at work in {folder}") from None
     try:
+        clear_unfinished(folder)
         yield
     finally:
         lock.release()
@@ -232,7 +240,7 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
         If checkpoints would be spoiled, or another process is at work there.
     """
     with locked(folder):
-        if any(folder.glob("*.checkpoint.*")):
+        if any(folder.glob("[!.]*.checkpoint.*")):
             if not resume:
                 raise ValueError(
                     f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, "

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -15,21 +15,13 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import (
-    NoiseLevel,
-    Observers,
-    OwnPolicy,
-    OwnSystem,
-    read_observers,
-    read_policy,
-    say_left_out,
-)
-from training.evaluation.certificates.certificate import Certificate, certify
-from training.evaluation.certificates.forward import QUANTILES
-from training.evaluation.certificates.gains import noise_variance
-from training.evaluation.certificates.settled import SettledTrajectories, record_settled
+from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for, show_level
-from training.evaluation.report import draw_residual
+from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    from training.evaluation.certificates.certificate import Certificate
+    from training.evaluation.certificates.settled import SettledTrajectories
 
 SHOWN = 30_000  # states in the figure
 
@@ -66,7 +58,7 @@ class Certify:
     out: Path = Path("runs/certificates")
     """Folder for what is written."""
 
-    def run(self, console: Console) -> list[Certificate]:
+    def run(self, console: Console) -> "list[Certificate]":
         """Certify.
 
         Parameters
@@ -84,19 +76,23 @@ class Certify:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        from training.evaluation.certificates.certificate import certify, parts  # torch takes seconds to import
+        from training.evaluation.certificates.settled import record_settled
+
         names = [Path(given).stem if given.endswith(".safetensors") else given for given in self.observers]
         if len(set(names)) < len(names):
             raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
         found = []
-        for name, (_, artifact, system) in zip(names, read_observers(self.observers, self.system), strict=True):
+        observers = read_observers(self.observers, self.system)
+        for name, (_, artifact, system) in zip(names, observers, strict=True):
             level = level_for(artifact, system, self.measurement_noise)
             if reason := beyond(artifact, level):
-                say_left_out(console, name, reason)
+                console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
                 continue
             process_noise = system.process_noise if self.process_noise is None else self.process_noise
             KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now
             noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
-            with console.status(f"certifying {name}"):
+            with progress_bars(console) as progress, progress.phase(f"certifying {name}", parts(artifact)) as report:
                 policy = read_policy(artifact, system, self.policy)
                 motion = record_settled(
                     artifact,
@@ -116,6 +112,7 @@ class Certify:
                     seed=self.seed,
                     name=name,
                     recorded=motion,
+                    report=report,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
                 draw(self.out / f"{name}.png", artifact, system, name=name, noise=noise, motion=motion)
@@ -128,7 +125,7 @@ class Certify:
         return found
 
 
-def lines(found: Certificate) -> list[dict[str, str]]:
+def lines(found: "Certificate") -> list[dict[str, str]]:
     """What a certificate says, in sections: label to value.
 
     Parameters
@@ -141,6 +138,8 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     list of dict
         The sections, with the same labels for all observers of systems of one pace.
     """
+    from training.evaluation.certificates.forward import QUANTILES
+
     forward = found.forward
 
     def number(value: float | None) -> str:
@@ -217,7 +216,7 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     ]
 
 
-def table(found: Sequence[Certificate]) -> Table:
+def table(found: "Sequence[Certificate]") -> Table:
     """Certificates side by side, one row for each label."""
     out = Table("", *(certificate.observer for certificate in found))
     for section in _sections(found):
@@ -227,7 +226,7 @@ def table(found: Sequence[Certificate]) -> Table:
     return out
 
 
-def page(found: Sequence[Certificate]) -> str:
+def page(found: "Sequence[Certificate]") -> str:
     """Certificates side by side in Markdown, with the noise that they were made for."""
     rows = [row for section in _sections(found) for row in section]
     noise = dict.fromkeys(
@@ -237,7 +236,7 @@ def page(found: Sequence[Certificate]) -> str:
     return head + "\n".join(markdown.table(["", *(certificate.observer for certificate in found)], rows)) + "\n"
 
 
-def _sections(found: Sequence[Certificate]) -> list[list[list[str]]]:
+def _sections(found: "Sequence[Certificate]") -> list[list[list[str]]]:
     """Rows of each section: a label, and what each certificate has under it."""
     out = []
     for sections in zip(*map(lines, found), strict=True):
@@ -254,7 +253,7 @@ def draw(
     *,
     name: str,
     noise: Mapping[str, Any],
-    motion: SettledTrajectories,
+    motion: "SettledTrajectories",
 ) -> None:
     """Draw the PDE's residual over X, and along the motion the error that noise will make.
 
@@ -275,6 +274,9 @@ def draw(
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
+
+    from training.evaluation.certificates.gains import noise_variance
+    from training.evaluation.report import draw_residual
 
     panels = 1 + (artifact.forward is not None)
     figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -21,15 +20,18 @@ from training.commands.options import (
     OwnSystem,
     read_observers,
     read_policy,
-    say_left_out,
 )
 from training.evaluation.errors import Domain, NoStartsError, UnseenTrajectories, errors, unseen_trajectories
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
+from training.progress import ProgressBars, progress_bars
 from training.trajectories.controllers import Controller
 
 CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
 SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Evaluate:
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
-    def run(self, console: Console) -> pd.DataFrame:
+    def run(self, console: Console) -> "pd.DataFrame":
         """Evaluate.
 
         Parameters
@@ -83,14 +85,16 @@ class Evaluate:
         ValueError
             If an observer cannot be had, a number makes no sense, or nothing can be measured.
         """
+        import pandas as pd  # which takes half a second that help need not wait for
+
         if self.measurement_noise is not None and not self.measurement_noise:
             raise ValueError("give at least one level of measurement noise; 0 is none")
         if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
             raise ValueError(f"csv = {self.csv} is a folder: name a file")
         frames: list[pd.DataFrame] = []
-        for name, artifact, system in read_observers(self.observers, self.system):
-            with console.status(f"evaluating {name}"):
-                frames += self._evaluate(name, artifact, system, console)
+        with progress_bars(console) as progress:
+            for name, artifact, system in read_observers(self.observers, self.system):
+                frames += self._evaluate(name, artifact, system, progress)
         if not frames:
             raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
@@ -99,8 +103,10 @@ class Evaluate:
             console.print(f"wrote {self.csv}")
         return found
 
-    def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> list[pd.DataFrame]:
+    def _evaluate(self, name: str, artifact: Artifact, system: System, progress: ProgressBars) -> list["pd.DataFrame"]:
         """Print an observer's tables, and what is left out of them; rows of the CSV file."""
+        import pandas as pd
+
         duration = system.duration if self.duration is None else self.duration
         runs = f"{self.trajectories} runs of {duration:g} s"
         smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}", artifact)
@@ -111,11 +117,15 @@ class Evaluate:
         frames = []
         policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
-        for starts, domain, driven in CASES[: 3 if artifact.nu else 2] if levels else ():
+        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
+        bar = progress.add_task(f"evaluating {name}", total=len(cases) * (1 + len(levels)))
+        for starts, domain, driven in cases:
             trajectories = self._trajectories(artifact, system, domain, duration=duration, driven=driven, policy=policy)
             if isinstance(trajectories, str):
+                progress.advance(bar, 1 + len(levels))
                 left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
                 continue
+            progress.advance(bar)
             skip = min(SKIPPED * system.pace, duration / 2) if driven else None
             for level in levels:
                 found = errors(artifact, system, trajectories, measurement_noise=level, seed=self.seed, skip=skip)
@@ -134,10 +144,11 @@ class Evaluate:
                     "smape_late": found.late,
                 }
                 frames.append(pd.DataFrame(columns | by_state(found.nrmse)))
+                progress.advance(bar)
         if frames:
-            console.print(smape, nrmse)
+            progress.console.print(smape, nrmse)
         for reason in left_out:
-            say_left_out(console, name, reason)
+            progress.say(f"{name}, left out: {reason}")
         return frames
 
     def _trajectories(

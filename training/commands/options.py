@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym.system import System
@@ -15,6 +14,17 @@ from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
 
+SystemName = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(metavar="SYSTEM", help="A shipped system, or a class of yours as script.py:Class or module:Class."),
+]
+Parameters = Annotated[
+    dict[str, float],
+    tyro.conf.arg(
+        help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
+        help_behavior_hint="(default: none)",
+    ),
+]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
 ]
@@ -85,11 +95,6 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
     return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
-
-
-def say_left_out(console: Console, name: str, reason: str) -> None:
-    """Print why a part of what was asked for is left out."""
-    console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:

@@ -15,7 +15,8 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from rich.console import Console
 
-import training.commands.benchmark as command
+import training.benchmark.jobs
+import training.benchmark.sizes as sizes
 from kkl_gym import get_system
 from training.benchmark import protocol as protocol_module
 from training.benchmark.jobs import OTHER, Job, run_job
@@ -104,12 +105,12 @@ def toy(tmp_path):
 @pytest.fixture
 def tiny(monkeypatch):
     """The command at toy size."""
-    monkeypatch.setitem(command.BUDGETS, "cpu", TINY)
-    monkeypatch.setitem(command.BUDGETS, "quick", TINY)
-    monkeypatch.setattr(command, "PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "QUICK_PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "VALIDATION", SHORT)
-    monkeypatch.setattr(command, "step_time", lambda *_, **__: 1.0)
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", TINY)
+    monkeypatch.setitem(sizes.BUDGETS, "quick", TINY)
+    monkeypatch.setattr(sizes, "PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "VALIDATION", SHORT)
+    monkeypatch.setattr(training.benchmark.jobs, "step_time", lambda *_, **__: 1.0)
 
 
 def quiet():
@@ -385,6 +386,20 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0", "lorenz", "1.0"]
 
 
+@pytest.mark.parametrize(("file", "text"), [
+    ("configuration-0.json", "{"), ("configuration-0.json", "[]"), ("configuration-0.json", '{"configuration": {}}'),
+    ("trained.seconds", ""), ("trained.seconds", "a minute"),
+])  # fmt: skip
+def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
+    job = Job("lorenz", toy[0], tmp_path / "job", TINY, SHORT, 1.0, SHORT)
+    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
+    (job.folder / "errors.csv").unlink()
+    (job.folder / file).write_text(text)
+    ((_, failure, _),) = run_all(run_job, [job], 1)
+    assert isinstance(failure, ValueError)
+    assert str(job.folder / file) in str(failure)
+
+
 def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     name, _ = toy
     script = Path(name.rpartition(":")[0])
@@ -400,7 +415,7 @@ def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monk
     name, _ = toy
     out = tmp_path / "out"
     Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
-    monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
         Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun

@@ -1,13 +1,20 @@
 """The optimisation loop."""
 
+import errno
+import re
+import threading
+
 import numpy as np
 import pytest
 import torch
+import torch.utils.tensorboard
 
 import training.evaluation.errors
 import training.maps.optimise
 import training.pipeline
 import training.trajectories.record
+from observers.storage import UNFINISHED
+from training import checkpoints
 from training.progress import progress_bars
 
 
@@ -54,7 +61,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
-    monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         fit(stop_after=150)  # the checkpoint is of step 100
     spent = training.maps.optimise.seconds_spent(tmp_path)
@@ -64,3 +71,43 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
     assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
     assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
     assert fit() == 0
+    (tmp_path / f"{UNFINISHED}1234-line{checkpoints.SUFFIX}").write_bytes(b"half")  # of a process that was killed
+    assert 4.0 <= training.maps.optimise.seconds_spent(tmp_path) < 4.1
+    (tmp_path / f"other{checkpoints.SUFFIX}").write_bytes(b"half")
+    with pytest.raises(ValueError, match="is damaged or of an older version, remove it"):
+        training.maps.optimise.seconds_spent(tmp_path)
+
+
+class FullDisk:
+    """A writer of TensorBoard's whose thread and whose caller both meet a full disk."""
+
+    def __init__(self, folder):
+        pass
+
+    def __enter__(self):
+        for error in (OSError(errno.ENOSPC, "No space left on device"), ValueError("of something else")):
+            thread = threading.Thread(target=self.fail, args=(error,))
+            thread.start()
+            thread.join()
+        self.fail(OSError(errno.ENOSPC, "No space left on device"))
+
+    def __exit__(self, *arguments):
+        pass
+
+    def fail(self, error):
+        raise error
+
+
+def test_a_disk_that_is_full_of_scalars_is_told_once(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(threading, "excepthook", seen.append)
+    hook = threading.excepthook
+    monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", FullDisk)
+    with (
+        pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path}'")),
+        training.maps.optimise.log_to(tmp_path),
+    ):
+        raise AssertionError
+    (failed,) = seen
+    assert str(failed.exc_value) == "of something else"
+    assert threading.excepthook == hook

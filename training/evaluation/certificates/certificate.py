@@ -1,6 +1,7 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -24,6 +25,8 @@ from training.evaluation.metrics import nrmse
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
+
+WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 
 @dataclass(frozen=True)
@@ -131,6 +134,7 @@ def certify(
     name: str = "",
     policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
@@ -161,6 +165,8 @@ def certify(
         Acts on the system, for maps that were trained under one, see :func:`record_settled`.
     recorded : SettledTrajectories, optional
         What :func:`record_settled` returned for the same of all these, if it is there already.
+    report : callable, optional
+        Told how many of the :func:`parts` of the work are done.
 
     Returns
     -------
@@ -189,10 +195,13 @@ def certify(
     noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
+    report(1)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)
+    report(2)
     upper = lipschitz_upper(told)
+    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
         free = told  # a map that is not told the noise is bounded once
@@ -248,8 +257,14 @@ def certify(
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
+            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
+
+
+def parts(artifact: Artifact) -> int:
+    """Number of parts, of about the same length, that the work of :func:`certify` has."""
+    return WITHOUT_T if artifact.forward is None else WITH_T
 
 
 def _nrmse(x: np.ndarray, x_hat: np.ndarray) -> tuple[float, ...]:
