@@ -13,7 +13,6 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.checks import noise_levels
 from observers.storage import write
 from training.commands.options import (
     Duration,
@@ -33,7 +32,7 @@ from training.evaluation.errors import (
     kalman_errors,
     unseen_trajectories,
 )
-from training.evaluation.levels import Level, as_cell, beyond, own_level, show_level
+from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.controllers import Controller
@@ -166,7 +165,7 @@ class Evaluate:
         if frames:
             progress.console.print(smape, nrmse)
         for reason in left_out:
-            progress.console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
+            progress.say(f"{name}, left out: {reason}")
         return frames
 
     def _trajectories(
@@ -201,8 +200,8 @@ class Evaluate:
     def _levels(self, artifact: Artifact, system: System) -> tuple[list[Level], list[str]]:
         """Levels of measurement noise that a map can be told, and what is to be said of the others."""
         if self.measurement_noise is None:
-            return list(dict.fromkeys([0.0, own_level(artifact, system)])), []
-        levels = [noise_levels("measurement_noise", level, system.ny) for level in self.measurement_noise]
+            return list(dict.fromkeys([0.0, level_for(artifact, system)])), []
+        levels = [level_for(artifact, system, level) for level in self.measurement_noise]
         reasons = [beyond(artifact, level) for level in levels]
         inside = [level for level, reason in zip(levels, reasons, strict=True) if not reason]
         return inside, [reason for reason in reasons if reason]
