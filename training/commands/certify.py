@@ -39,13 +39,9 @@ class Certify:
     policy: OwnPolicy = None
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
-    process_noise: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the system's)")
-    ] = None
+    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Bound of the process noise, in multiples of the system's scale per second."""
-    psi: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the motion's diameter)")
-    ] = None
+    psi: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the motion's diameter)")] = None
     """Bound of how far process noise moves the state from where it would have been."""
     trajectories: int = 200
     """Number of trajectories, from starts uniform in X."""
