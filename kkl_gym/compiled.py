@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.equations import components, input_matrix, rate
+from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
@@ -143,7 +143,7 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    need = sympy.lambdify([(*x,)], sympy.sympify(rate(system, x)), "math", cse=True)
+    need = sympy.lambdify([(*x,)], sympy.sympify(rate_at(system, x)), "math", cse=True)
 
     def tupled(values: list[str]) -> str:
         return "(" + "".join(f"{value}, " for value in values) + ")"

@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from filelock import FileLock, Timeout
 
-from kkl_gym.equations import components, input_matrix, next_state
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
 from observers.storage import clear_unfinished, write
 
@@ -120,7 +120,7 @@ def describe(system: System) -> dict[str, Any]:
     x = system.draw_starts(rng, 20)
     if system.discrete:
         u = rng.uniform(-1, 1, (system.nu, 20)) * np.array(system.u_max)[:, None]
-        moved = next_state(system, x.T, u)
+        moved = components(system.step, x.T, u)
     else:
         moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
     rows = [*moved, *system.output(x).T]

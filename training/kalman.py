@@ -4,7 +4,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
@@ -244,6 +243,8 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     def _sigma_points(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         """Points (2 nx + 1, n, nx); NaN where P is not positive definite."""
+        import torch  # for this alone: whoever needs no such filter need not wait for it
+
         factor, failed = torch.linalg.cholesky_ex(torch.as_tensor(3.0 * P))
         columns = np.where(failed.numpy()[:, None], np.nan, np.moveaxis(factor.numpy(), -1, 0))
         return np.concatenate([x[None], x + columns, x - columns])

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import solve_continuous_are, solve_discrete_are
+import scipy
 
 from kkl_gym.system import System
 from training.trajectories.derivatives import linearised
@@ -38,10 +38,10 @@ def linear_quadratic(system: System) -> Controller:
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
     if system.discrete:
-        P = solve_discrete_are(A, B, Q, R)
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
     else:
-        K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
+        K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
 
     def act(x: np.ndarray) -> np.ndarray:
         action: np.ndarray = np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)

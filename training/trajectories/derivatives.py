@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from kkl_gym.equations import components, input_matrix, next_state
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
 
 # Functions in the derivatives that sympy does not print for NumPy, or prints for arrays of one shape only.
@@ -101,7 +101,7 @@ def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of a step in discrete time, by state and then by input."""
 
     def step(both: Components) -> Components:
-        return next_state(system, both[: system.nx], both[system.nx :])
+        return components(system.step, both[: system.nx], both[system.nx :])
 
     return jacobian(step, system.nx + system.nu)
 
