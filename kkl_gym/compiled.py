@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.simulate import MAX_SUBSTEPS, PER_RATE, advance_batch, check_substeps, runge_kutta
+from kkl_gym.equations import components, input_matrix, rate
+from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
 
@@ -131,7 +132,7 @@ def compiled_step(system: System) -> Step:
     def traced() -> list[Any]:
         return [
             sympy.sympify(fi + sum(gij * uj for gij, uj in zip(row, u, strict=True)))
-            for fi, row in zip(system.f(x), system.g(x), strict=True)
+            for fi, row in zip(components(system.f, x), input_matrix(system, x), strict=True)
         ]
 
     forced = traced()
@@ -141,7 +142,7 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    rate = sympy.lambdify([(*x,)], sympy.sympify(system.rate(x)), "math", cse=True)
+    need = sympy.lambdify([(*x,)], sympy.sympify(rate(system, x)), "math", cse=True)
 
     def tupled(values: list[str]) -> str:
         return "(" + "".join(f"{value}, " for value in values) + ")"
@@ -153,7 +154,7 @@ def compiled_step(system: System) -> Step:
         "    lost = False",
         "    for row in range(x.shape[1]):",
         f"        need = rate({tupled(states)}) * dt * {PER_RATE!r}",
-        f"        if not need <= {MAX_SUBSTEPS}:",
+        f"        if not need <= {MOST_EQUAL}:",
         "            out[:, row] = nan",
         "            lost = True",
         "            continue",
@@ -161,34 +162,48 @@ def compiled_step(system: System) -> Step:
         "        while n < need:",
         "            n *= 2",
         f"        end = integrate(field, {tupled(states + inputs)}, {tupled(noise + ['0.0'] * nu)}, dt / n, n)",
+        f"        if not rate({tupled([f'end[{i}]' for i in range(nx)])}) * dt * {PER_RATE!r} <= {GROWTH} * n:",
+        "            out[:, row] = nan",
+        "            lost = True",
+        "            continue",
         *[f"        out[{i}, row] = end[{i}]" for i in range(nx)],
         "    return lost",
     ]
     namespace: dict[str, Any] = {
         "field": compiled(field),
-        "rate": compiled(rate),
+        "rate": compiled(need),
         "integrate": compiled(runge_kutta(nx + nu)),
         "nan": math.nan,
     }
     exec("\n".join(lines), namespace)
     kernel = compiled(namespace["kernel"])
 
-    def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+    def substeps(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+        """What NumPy's substeps of one length make of it, NaN where they do not do, and whether there are such."""
         out = np.empty(x.shape)
         try:
             lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
         except ArithmeticError:  # negative powers of zero, which Numba raises even so
-            return advance_batch(system, x, u, w, dt)
+            return in_numpy(x, u, w, dt)
+        return out, lost
+
+    def in_numpy(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+        out, again = equal_substeps(system, x, u, w, dt)
+        out[:, again] = np.nan
+        return out, bool(again.any())
+
+    def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+        out, lost = substeps(x, u, w, dt)
         if lost:
-            check_substeps(system, x, dt)
+            rows = np.flatnonzero(np.isnan(out[0]))
+            out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
         return out
 
     # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.
     for points in _trials(system):
         rng, n = np.random.default_rng(0), points.shape[1]
         at = points, rng.uniform(-1, 1, (nu, n)), rng.uniform(-1, 1, (nx, n))
-        expected = advance_batch(system, *at, 0.01)
-        if not np.allclose(step(*at, 0.01), expected, rtol=1e-9, atol=1e-9, equal_nan=True):
+        if not np.allclose(substeps(*at, 0.01)[0], in_numpy(*at, 0.01)[0], rtol=1e-9, atol=1e-9, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
 

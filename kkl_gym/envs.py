@@ -7,9 +7,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
-from kkl_gym.simulate import advance
+from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, System
 from observers.checks import integer, mapping, real_array, shown
 
@@ -201,6 +202,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         w, v = self._next_noise()
         x = advance(self.system, self._x, u, w, self.dt)
         escaped = not self._inside(x)
+        if escaped:  # unless that is but an error of the method
+            x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
+            escaped = not self._inside(x)
         if not escaped:
             self._x = tuple(x)
             self._y = self._measure(v)
@@ -267,7 +271,11 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return u
 
     def _measure(self, v: list[float]) -> list[float]:
-        return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+        try:
+            return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+        except Exception:
+            components(self.system.h, self._x)  # says what went wrong
+            raise
 
     def _inside(self, x: Any) -> bool:
         for xi, (low, high) in zip(x, self._bounds):  # noqa: SIM110 - all() takes twice as long

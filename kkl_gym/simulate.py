@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
 from observers.checks import check_dt
 
@@ -19,7 +20,9 @@ from observers.checks import check_dt
 RATE_STEP = 0.4
 # A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
-MAX_SUBSTEPS = 1024
+MOST_EQUAL = 1 << 10  # substeps of one length; beyond, their length follows the rate
+MAX_SUBSTEPS = 1 << 16
+GROWTH = 8  # of the need for substeps within one interval, from which on it is done again with lengths that follow it
 
 # Butcher's explicit sixth-order method with seven stages (J. C. Butcher, Numerical Methods for Ordinary Differential
 # Equations, sec. 31). Order four needs four times as many evaluations for the same error on Lorenz.
@@ -37,6 +40,8 @@ WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 
 VectorField = Callable[[Any], Any]
+Feedback = Callable[[int, np.ndarray], np.ndarray]
+"""(k, x) to the inputs held over interval k, (n, nu)."""
 
 
 class SubstepsError(ValueError):
@@ -144,23 +149,88 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
-        If a state within the system's bounds moves too fast for this interval.
+        If the system moves too fast, within its bounds, to be followed over this interval.
     """
+    end: Components = (math.nan,) * len(x)
     try:
-        if system.discrete:
-            return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
-        need = system.rate(x) * dt * PER_RATE
-        if not need <= MAX_SUBSTEPS:  # far outside any declared bounds, or not a number
-            check_substeps(system, np.array(x, dtype=float)[:, None], dt)
-            return (math.nan,) * len(x)
-        n = 1
-        while n < need:
-            n *= 2
-        field, d = forced(system, u, w)
-        return runge_kutta(len(x))(field, x, d, dt / n, n)
-    except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
-        return (math.nan,) * len(x)
+        try:
+            if system.discrete:
+                return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
+            need = system.rate(x) * dt * PER_RATE
+            if need <= MOST_EQUAL:
+                n = 1
+                while n < need:
+                    n *= 2
+                field, d = forced(system, u, w)
+                end = runge_kutta(len(x))(field, x, d, dt / n, n)
+                if system.rate(end) * dt * PER_RATE <= GROWTH * n:
+                    return end
+        except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
+            pass
+        return followed(system, x, u, w, dt=dt, end=end)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x)
+        raise
+
+
+def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
+    """One sampling interval with substeps whose length follows the rate, as long as the motion stays within bounds.
+
+    For motions that change faster and faster within the interval, as when something ignites, and to make sure of an
+    escape: steps that were too long at the end may have led out of the bounds by themselves.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : sequence of float, length nx
+        State at the start of the interval.
+    u : sequence of float, length nu
+        Input, held over the interval.
+    w : sequence of float, length nx
+        Process noise, held over the interval.
+    dt : float
+        Length of the interval in seconds.
+    end : sequence of float, length nx
+        What equal substeps have made of it.
+
+    Returns
+    -------
+    sequence of float, length nx
+        State at the end; ``end`` if the motion leaves the bounds on the way.
+
+    Raises
+    ------
+    SubstepsError
+        If MAX_SUBSTEPS are not enough.
+    """
+    if system.discrete:
+        return end
+    left, field, d = dt, *forced(system, u, w)
+    try:
+        for _ in range(MAX_SUBSTEPS):
+            if not all(low <= xi <= high for xi, (low, high) in zip(x, system.bounds, strict=True)):
+                return end
+            if left <= 0.0:
+                return x
+            rate = system.rate(x)
+            if not math.isfinite(rate):
+                return end
+            h = left if rate * left <= RATE_STEP else RATE_STEP / rate
+            x = runge_kutta(len(x))(field, x, d, h, 1)
+            left -= h
+    except ArithmeticError:
+        return end
+    raise SubstepsError(
+        f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
+        f"are not enough for dt = {dt:g} s, of which {left:.2g} s are left; take a smaller dt, tighten the bounds, or "
+        "override rate(x) if it says too much"
+    )
 
 
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
@@ -186,60 +256,110 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
-        If a state within the system's bounds moves too fast for this interval.
+        If the system moves too fast, within its bounds, to be followed over this interval.
     """
+    try:
+        return _advance_batch(system, x, u, w, dt)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x)
+        raise
+
+
+def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         if system.discrete:
             moved = system.step(x, u)
             return np.array([np.broadcast_to(xi, x.shape[1:]) for xi in moved], dtype=float) + w * dt
-        need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
-        if (need <= 1).all():
-            return _step_batch(system, x, u, w, dt)
-        lost = ~(need <= MAX_SUBSTEPS)
-        if lost.any():
-            check_substeps(system, x[:, lost], dt)
-        mantissa, exponent = np.frexp(np.where(lost, 1, np.maximum(need, 1)))
-        substeps = 1 << (exponent - (mantissa == 0.5))  # the power of two that is not less than need
-        h = dt / substeps
-        out = _step_batch(system, x, u, w, h)
-        for k in range(2, substeps.max() + 1):
-            rows = np.flatnonzero(substeps >= k)
-            out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
-        out[:, lost] = np.nan
-        return out
+        out, again = equal_substeps(system, x, u, w, dt)
+    return followed_rows(system, x, u, w, dt=dt, end=out, rows=np.flatnonzero(again))
 
 
-def check_substeps(system: System, x: np.ndarray, dt: float) -> None:
-    """Raise an error if states within the bounds need more substeps than are made.
-
-    Beyond the bounds they need not be followed, and where the rate is no number the motion has escaped.
+def equal_substeps(
+    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """One sampling interval in substeps of one length for each row.
 
     Parameters
     ----------
     system : System
         The system.
     x : ndarray, shape (nx, n)
-        States, component first.
+        States at the start of the interval, component first.
+    u : ndarray, shape (nu, n)
+        Inputs, held over the interval.
+    w : ndarray, shape (nx, n)
+        Process noise, held over the interval.
     dt : float
-        Sampling interval in seconds.
+        Length of the interval in seconds.
+
+    Returns
+    -------
+    end : ndarray, shape (nx, n)
+        States at the end; NaN where MOST_EQUAL substeps are not enough.
+    again : ndarray of bool, shape (n,)
+        Rows for which one length does not do: the rate grew too much, or is too high.
+    """
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
+        if (need <= 1).all():
+            substeps: Any = 1
+            out = _step_batch(system, x, u, w, dt)
+        else:
+            mantissa, exponent = np.frexp(np.where(need <= MOST_EQUAL, np.maximum(need, 1), 1))
+            substeps = 1 << (exponent - (mantissa == 0.5))  # the power of two that is not less than need
+            h = dt / substeps
+            out = _step_batch(system, x, u, w, h)
+            for k in range(2, substeps.max() + 1):
+                rows = np.flatnonzero(substeps >= k)
+                out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
+        end = np.broadcast_to(system.rate(out) * dt * PER_RATE, x.shape[1:])
+        out[:, ~(need <= MOST_EQUAL)] = np.nan
+        return out, ~((end <= GROWTH * substeps) & (need <= MOST_EQUAL))
+
+
+def followed_rows(
+    system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, *, dt: float, end: np.ndarray, rows: np.ndarray
+) -> np.ndarray:
+    """What :func:`followed` makes of some rows of a batch that are within bounds.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : ndarray, shape (nx, n)
+        States at the start of the interval, component first.
+    u : ndarray, shape (nu, n)
+        Inputs, held over the interval.
+    w : ndarray, shape (nx, n)
+        Process noise, held over the interval.
+    dt : float
+        Length of the interval in seconds.
+    end : ndarray, shape (nx, n)
+        What equal substeps have made of it; it is changed in place.
+    rows : ndarray of int, shape (m,)
+        Which rows.
+
+    Returns
+    -------
+    ndarray, shape (nx, n)
+        ``end``.
 
     Raises
     ------
     SubstepsError
-        With a state, its rate and a sampling interval that would do.
+        If MAX_SUBSTEPS are not enough for one of them.
     """
-    low, high = np.array(system.bounds, dtype=float).T[..., None]
-    with np.errstate(all="ignore"):
-        rate = np.broadcast_to(system.rate(x), x.shape[1:])
-        fast = ((x >= low) & (x <= high)).all(0) & (rate * dt * PER_RATE > MAX_SUBSTEPS) & np.isfinite(rate)
-    if fast.any():
-        worst = int(np.where(fast, rate, -1.0).argmax())
-        raise SubstepsError(
-            f"{system.name} changes at a rate of {rate[worst]:.4g}/s at x = {x[:, worst].tolist()}, for which dt = "
-            f"{dt:g} s needs more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate[worst]:.2g} "
-            "s, tighten the bounds, or override rate(x) if it says too much"
-        )
+    if len(rows):
+        low, high = np.array(system.bounds, dtype=float).T[..., None]
+        for row in rows[((x[:, rows] >= low) & (x[:, rows] <= high)).all(0)]:
+            start = [values[:, row].tolist() for values in (x, u, w)]
+            end[:, row] = followed(system, *start, dt=dt, end=end[:, row])
+    return end
 
 
 def _step_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, h: Any) -> np.ndarray:
@@ -267,7 +387,7 @@ def simulate(
     x0: np.ndarray,
     steps: int,
     dt: float,
-    u: np.ndarray | None = None,
+    u: np.ndarray | Feedback | None = None,
     w: np.ndarray | None = None,
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
@@ -282,8 +402,9 @@ def simulate(
         Number of sampling intervals.
     dt : float
         Length of an interval in seconds.
-    u : ndarray, shape (steps, n, nu), optional
-        Inputs, held over each interval; None is zero.
+    u : ndarray, shape (steps, n, nu), or callable, optional
+        Inputs, held over each interval; None is zero. A callable gives those of interval k, of shape (n, nu), from
+        (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval; None is zero.
 
@@ -304,7 +425,7 @@ def simulate(
     check_dt(dt)
     n = len(x0)
     for name, signal, width in (("u", u, system.nu), ("w", w, system.nx)):
-        if signal is not None and np.shape(signal) != (steps, n, width):
+        if signal is not None and not callable(signal) and np.shape(signal) != (steps, n, width):
             raise ValueError(f"{name} must have shape {(steps, n, width)}, got {np.shape(signal)}")
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     no_u, no_w = np.zeros((system.nu, n)), np.zeros((system.nx, n))
@@ -312,14 +433,17 @@ def simulate(
     x = np.ascontiguousarray(x0.T)
     out[0] = x0
     for k in range(steps):
-        x = advance_batch(
-            system,
-            x,
-            no_u if u is None else np.ascontiguousarray(u[k].T),
+        acting = u(k, out[k]) if callable(u) else None if u is None else u[k]
+        held = (
+            no_u if acting is None else np.ascontiguousarray(acting.T),
             no_w if w is None else np.ascontiguousarray(w[k].T),
-            dt,
         )
-        x[:, ~((x >= low) & (x <= high)).all(0)] = np.nan
+        end = advance_batch(system, x, *held, dt)
+        beyond = np.flatnonzero(~((end >= low) & (end <= high)).all(0))
+        if len(beyond):
+            end = followed_rows(system, x, *held, dt=dt, end=end, rows=beyond)
+            end[:, ~((end >= low) & (end <= high)).all(0)] = np.nan
+        x = end
         out[k + 1] = x.T
     return out
 
@@ -346,6 +470,11 @@ def check_interval(system: System, dt: float) -> None:
         If the system is in discrete time and has another one; SubstepsError, if it is too long at the middle of X.
     """
     if not system.discrete:
-        check_substeps(system, np.mean(system.X, axis=1)[:, None], dt)
+        rate = float(system.rate(tuple(np.mean(system.X, axis=1).tolist())))
+        if rate * dt * PER_RATE > MAX_SUBSTEPS:
+            raise SubstepsError(
+                f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "
+                f"need more than {MAX_SUBSTEPS} substeps: take dt <= {MAX_SUBSTEPS / PER_RATE / rate:.2g} s"
+            )
     elif not math.isclose(dt, system.dt, rel_tol=1e-9):
         raise ValueError(f"{system.name} makes steps of dt = {system.dt} s, and no others: got dt = {dt}")

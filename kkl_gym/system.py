@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.loading import load_class
 from observers.checks import is_finite, mapping, shown
 
@@ -21,7 +22,8 @@ Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol fo
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
 
 DT = 0.01  # s, where it suits
-SHORT_STEP, LONG_STEP = (0.002, 0.02), (25.0, 5.0)  # rate * dt beyond which DT does not suit, and what then does
+SHORT_STEP, LONG_STEP = (0.002, 0.02), (5.0, 1.0)  # rate * dt beyond which DT does not suit, and what then does
+PROCESS_NOISE = 0.05  # in multiples of a system's scale in a second of its pace: where none is given
 NOISE_SHARE = 0.05  # of an output's range: measurement noise where none is given
 
 
@@ -59,7 +61,8 @@ class System:
     portrait : (int, int)
         The two states that a phase portrait shows, by index. The default is the first and the last.
     process_noise : float
-        Default bound of the process noise as a multiple of ``scale`` per second.
+        Default bound of the process noise as a multiple of ``scale`` per second. If it is not set, it is 0.05 at the
+        system's :attr:`pace`.
     measurement_noise : float or tuple of float, length ny
         Default standard deviation of the measurement noise, of all outputs or each. If it is not set, it is 5 % of the
         range of each output over X.
@@ -85,7 +88,6 @@ class System:
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
     scale: ClassVar[tuple[float, ...]] = ()
     portrait: ClassVar[tuple[int, int]] = (0, -1)
-    process_noise: ClassVar[float] = 0.05
     discrete: ClassVar[bool] = False  # whether there is a step; kept, as every step of an environment asks
 
     def __init_subclass__(cls) -> None:
@@ -147,7 +149,7 @@ class System:
     @property
     def ny(self) -> int:
         """Number of outputs."""
-        return len(self.h([(low + high) / 2 for low, high in self.X]))
+        return len(components(self.h, inner_state(self)))
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -186,6 +188,11 @@ class System:
     def duration(self) -> float:
         """Seconds for which motions are followed in training and evaluation, where nothing else is said."""
         return 50.0 * self.pace
+
+    @property
+    def process_noise(self) -> float:
+        """Bound of the process noise where none is given, in multiples of ``scale`` per second."""
+        return PROCESS_NOISE / self.pace
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
@@ -422,8 +429,19 @@ def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> n
     -------
     ndarray, shape (..., m)
         The values. Components that do not depend on the state are repeated.
+
+    Raises
+    ------
+    EquationError
+        If they fail, or return something else.
     """
-    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in equations(np.moveaxis(x, -1, 0))], axis=-1)
+    values = components(equations, np.moveaxis(x, -1, 0))
+    return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
+
+
+def inner_state(system: System) -> tuple[float, ...]:
+    """A state in X for a first look at the equations, off its centre, where some divide by zero."""
+    return tuple(low + (high - low) * ((0.5 + 0.618 * i) % 1.0) for i, (low, high) in enumerate(system.X, 1))
 
 
 def _starts(system: System) -> np.ndarray:

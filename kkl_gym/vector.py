@@ -10,8 +10,10 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import batch_step
+from kkl_gym.equations import components
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
+from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
 
@@ -344,6 +346,10 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         w, v = self._noise(rows)
         x = batch_step(self.system)(before, u, w, self.plant.dt)
         within = (x >= self._low) & (x <= self._high)
+        if not within.all():  # unless that is but an error of the method
+            beyond = np.flatnonzero(~within.all(0))
+            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=beyond)
+            within = (x >= self._low) & (x <= self._high)
         if within.all():
             inside = np.ones_like(within[0])
             y = self._measure(x, v)
@@ -398,7 +404,11 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _measure(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         # As System.output, component first and in a third of its time, which a step would feel.
-        return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+        try:
+            return np.array([hi + vi for hi, vi in zip(self.system.h(x), v, strict=True)])
+        except Exception:
+            components(self.system.h, x)  # says what went wrong
+            raise
 
     def _observation(self) -> np.ndarray:
         values = self._x if self.plant.observe == "state" else self._y

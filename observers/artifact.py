@@ -135,7 +135,8 @@ class InverseMap:
     Raises
     ------
     ArtifactError
-        If a shape does not fit the network, a unit is not positive and finite, or nor is the end of what is told.
+        If a shape does not fit the network, which has no outputs, a unit is not positive and finite, or nor is the end
+        of what is told.
     """
 
     mlp: MLP
@@ -174,6 +175,8 @@ class InverseMap:
                 f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
             )
         nx = self.mlp.outputs
+        if not nx:
+            raise ArtifactError("a map must estimate one state at least, its network has no outputs")
         _check_shapes(self, {"z_offset": (size,), "noise_gain": (modes,), "x_offset": (nx,), "x_scale": (nx,)})
 
     def gain(self, measurement_noise: float) -> np.ndarray:
@@ -428,8 +431,8 @@ class Artifact:
         Raises
         ------
         ArtifactError
-            If the file is missing, not readable, damaged, foreign or of a newer format, or holds what makes no
-            observer.
+            If the file is missing, not readable, damaged, foreign, of a newer format or too large (see
+            :func:`observers.storage.read`), or holds what makes no observer.
         """
         tensors, described = storage.read(path, key=_KEY, error=ArtifactError, what="an observer")
         with storage.explained(path, ArtifactError):

@@ -9,6 +9,7 @@ from observers.checks import check_dt, integer, real_array
 from observers.sparse import MANY_ROWS, SparseUpdate
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
+MOST_VALUES = 1024  # of its state, and of the output; beyond them memory and the decomposition of A would be felt
 
 
 class LinearFilter:
@@ -25,9 +26,9 @@ class LinearFilter:
     Parameters
     ----------
     A : ndarray, shape (nz, nz)
-        Hurwitz and diagonalisable, in 1/s.
+        Hurwitz and diagonalisable, in 1/s. The state may have 1024 values.
     B : ndarray, shape (nz, ny)
-        What the outputs act through.
+        What the outputs act through, 1 to 1024 of them.
     dt : float
         Sampling interval in seconds.
     nu : int, default 0
@@ -52,11 +53,17 @@ class LinearFilter:
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
         A, B = real_array("A", A), real_array("B", B)
-        if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A) or not B.size:
+        if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
         dt, nu = check_dt(dt), integer("nu, the number of inputs", nu, 0, MOST_INPUTS)
+        nz, ny = B.shape
+        if not (1 <= nz * (1 + nu) <= MOST_VALUES and 1 <= ny <= MOST_VALUES):
+            raise ValueError(
+                f"a filter has 1 to {MOST_VALUES} values, nz (1 + nu), and as many outputs at most; "
+                f"got nz = {nz}, nu = {nu} and {ny} outputs"
+            )
         if np.count_nonzero(A - np.diag(A.diagonal())):
             poles, V = np.linalg.eig(A)
         else:
@@ -69,7 +76,6 @@ class LinearFilter:
         def function_of_A(values: np.ndarray) -> np.ndarray:
             return np.real((V * values) @ np.linalg.inv(V))
 
-        nz, ny = B.shape
         blocks = 1 + nu
 
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:

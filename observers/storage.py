@@ -1,9 +1,11 @@
 """Files of ours: each appears whole or not at all, holds arrays and JSON alone, and says what is wrong with it.
 
 A file of arrays is in the safetensors format; a JSON object that describes them lies in its metadata under a key of its
-kind. Nothing in it can run.
+kind, ``KEY``. Nothing in it can run. Beside it, under ``KEY-sha256``, lies a checksum: the SHA-256 of the file as it is
+without that entry. Files from before there were checksums have none.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -19,6 +21,11 @@ from safetensors.numpy import save as serialise
 
 from observers.network import MLP
 
+MOST_BYTES = 256 * 2**20  # of a file; maps of the paper's sizes have one or two million
+MOST_HEADER = 2**20  # bytes of its header, which holds the JSON
+DEEPEST = 32  # objects and lists within one another
+UNFINISHED = ".part-"  # what names of temporary files begin with
+
 # All that files hold, as safetensors calls it.
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype(np.float64)}
 
@@ -29,6 +36,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary file lies in the same folder, which is made. It keeps the ending of the name, by which some writers
     choose a format, and has the rights that the umask gives. After an exception it is gone, and ``path`` is as it was.
+    After the end of the process it stays, see :func:`clear_unfinished`.
 
     Parameters
     ----------
@@ -43,19 +51,22 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises
     ------
     OSError
-        If the file cannot be written or put in its place.
+        If the file cannot be written or put in its place; it names ``path``.
     """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
-    temporary.touch(exist_ok=False)
+    temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)
         yield temporary
         with temporary.open("rb+") as written:
             os.fsync(written.fileno())
         os.replace(temporary, target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
+    except BaseException as problem:
+        with suppress(OSError):
+            temporary.unlink()
+        if isinstance(problem, OSError) and problem.errno and problem.filename in (None, str(temporary)):
+            raise OSError(problem.errno, problem.strerror, str(target)) from problem  # a full disk names no file
         raise
     with suppress(OSError):  # not every system can open a folder, or put it on disk
         folder = os.open(target.parent, os.O_RDONLY)
@@ -69,6 +80,18 @@ def write(path: str | os.PathLike[str], text: str) -> None:
     """Write a text file, whole or not at all; makes its folder."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+def clear_unfinished(folder: str | os.PathLike[str]) -> None:
+    """Remove the temporary files that processes which were killed have left in a folder.
+
+    Parameters
+    ----------
+    folder : str or PathLike
+        Where no other process is at work.
+    """
+    for left in Path(folder).glob(f"{UNFINISHED}*"):
+        left.unlink(missing_ok=True)
 
 
 def save(
@@ -92,7 +115,7 @@ def save(
     TypeError
         If an array is not of float32 or float64, or ``described`` is nothing that JSON can hold.
     ValueError
-        If a number in ``described`` is not finite.
+        If a number in ``described`` is not finite, or the file would be beyond the limits of :func:`read`.
     OSError
         If the file cannot be written.
     """
@@ -101,7 +124,14 @@ def save(
         if array.dtype not in _TYPES.values():
             raise TypeError(f"{name!r} is of type {array.dtype}, {path} can hold float32 and float64: convert it")
     text = json.dumps(dict(described), sort_keys=True, allow_nan=False)
-    content = serialise(arrays, metadata={key: text})
+    header, data = _parts(serialise(arrays, metadata={key: text}))
+    header["__metadata__"][f"{key}-sha256"] = hashlib.sha256(_whole(header, data)).hexdigest()
+    content = _whole(header, data)
+    if len(content) > MOST_BYTES or _header_size(content) > MOST_HEADER or _is_deeper(described, DEEPEST):
+        raise ValueError(
+            f"{path} would have {len(content)} bytes, {_header_size(content)} of them in its header; it may have "
+            f"{MOST_BYTES} and {MOST_HEADER}, and at most {DEEPEST} objects and lists within one another"
+        )
     with replacing(path) as temporary:
         temporary.write_bytes(content)
 
@@ -132,34 +162,112 @@ def read(
     Raises
     ------
     error
-        If the file is missing, not readable, damaged or of another kind, or an array is not of float32 or float64.
+        If the file is missing, not readable, damaged or of another kind, or an array is not of float32 or float64. Also
+        if it has more than 256 MiB, more than 1 MiB of them in its header, or more than 32 objects and lists within one
+        another; that is noticed before memory is taken.
     """
-    try:
-        if not Path(path).is_file():
-            raise error(f"there is no file {path}")
-        content = Path(path).read_bytes()  # as a whole: who rewrites a mapped file in place ends the process
-    except OSError as problem:
-        raise error(f"{path} cannot be read: {problem.strerror or problem}") from problem
+    content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
-        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        header, data = _parts(content)
     except (SafetensorError, ValueError) as problem:
         raise error(f"{path} is damaged or no safetensors file: {problem}") from problem
-    text = (header.get("__metadata__") or {}).get(key)
-    if text is None:
+    metadata = header.get("__metadata__") or {}
+    if key not in metadata:
         raise error(f"{path} is not {what} of kkl-gym: it carries no {key!r} metadata")
+    checksum = metadata.pop(f"{key}-sha256", None)
+    if set(metadata) != {key}:
+        raise error(f"{path} is damaged: nobody knows its metadata {', '.join(sorted(set(metadata) - {key}))}")
+    if checksum is not None and checksum != hashlib.sha256(_whole(header, data)).hexdigest():
+        raise error(f"{path} is damaged: it holds something else than its checksum says; get it again")
     try:
-        described = json.loads(text)
+        described = json.loads(metadata[key])
     except (ValueError, RecursionError) as problem:
         raise error(f"{path} is damaged: its {key!r} metadata is no JSON: {problem}") from problem
     if not isinstance(described, dict):
         raise error(f"{path} is damaged: its {key!r} metadata is no JSON object")
+    if _is_deeper(described, DEEPEST):
+        raise error(f"{path} is damaged: its {key!r} metadata has more than {DEEPEST} levels")
     tensors = {}
     for name, view in views:
         if view["dtype"] not in _TYPES:
             raise error(f"{path}: its tensor {name} is of type {view['dtype']}, expected one of {', '.join(_TYPES)}")
-        tensors[name] = np.frombuffer(view["data"], _TYPES[view["dtype"]]).reshape(view["shape"])
+        try:
+            tensors[name] = np.frombuffer(view["data"], _TYPES[view["dtype"]]).reshape(view["shape"])
+        except (ValueError, OverflowError) as problem:  # shapes may be as long, and empty arrays as wide, as they like
+            raise error(f"{path} is damaged: its tensor {name}: {problem}") from problem
     return tensors, described
+
+
+def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
+    """Compute the checksum of what a file of arrays holds, which stays the same when the file gets one.
+
+    Parameters
+    ----------
+    path : str or PathLike
+        A file in the safetensors format.
+    error : type of Exception
+        Raised, with a message that names the file, if it cannot be read.
+
+    Returns
+    -------
+    str
+        The SHA-256, in hexadecimal, of the file as it is without its own checksum.
+
+    Raises
+    ------
+    error
+        If the file is missing, not readable, too large or no safetensors file.
+    """
+    content = _content(path, error)
+    try:
+        header, data = _parts(content)
+        metadata = header.get("__metadata__") or {}
+        for name in [name for name in metadata if name.endswith("-sha256")]:
+            del metadata[name]
+            content = _whole(header, data)
+    except (ValueError, AttributeError, TypeError, RecursionError) as problem:
+        raise error(f"{path} is damaged or no safetensors file: {problem}") from problem
+    return hashlib.sha256(content).hexdigest()
+
+
+def _content(path: str | os.PathLike[str], error: type[Exception]) -> bytes:
+    """The bytes of a file that may be what it should be, by its size."""
+    try:
+        if not Path(path).is_file():  # to read a pipe may never end
+            is_other = Path(path).exists()
+            raise error(f"{path} is a folder, a pipe or a device" if is_other else f"there is no file {path}")
+        if (size := Path(path).stat().st_size) > MOST_BYTES:
+            raise error(f"{path} has {size} bytes, more than the {MOST_BYTES} that a file of kkl-gym may have")
+        content = Path(path).read_bytes()  # as a whole: who rewrites a mapped file in place ends the process
+    except OSError as problem:
+        raise error(f"{path} cannot be read: {problem.strerror or problem}") from problem
+    if (size := _header_size(content)) > MOST_HEADER:
+        raise error(f"{path} is damaged or no safetensors file: its header has {size} bytes, more than {MOST_HEADER}")
+    return content
+
+
+def _header_size(content: bytes) -> int:
+    return int.from_bytes(content[:8], "little")
+
+
+def _parts(content: bytes) -> tuple[dict[str, Any], bytes]:
+    """The header and the arrays' bytes of a safetensors file."""
+    end = 8 + _header_size(content)
+    return json.loads(content[8:end]), content[end:]
+
+
+def _whole(header: Mapping[str, Any], data: bytes) -> bytes:
+    """A safetensors file, as the library writes one whose metadata has a single entry; it shuffles several."""
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data
+
+
+def _is_deeper(value: Any, levels: int) -> bool:
+    """Whether objects and lists lie within one another on more levels than so many."""
+    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else None
+    return inner is not None and (levels == 0 or any(_is_deeper(one, levels - 1) for one in inner))
 
 
 @contextmanager

@@ -5,8 +5,11 @@ command is called.
 """
 
 import ast
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.resources import files
 from typing import Any
@@ -25,10 +28,13 @@ COMMANDS = {
     "speed": ("speed", "Speed"),
 }
 
+INTERRUPTED = 130  # exit status, as of any process that an interruption ends: 128 + SIGINT
+
 # What an interruption may be followed by, by the first words of the command.
 AFTER_INTERRUPTION = {
     ("train",): "--resume goes on from the last checkpoint",
     ("benchmark",): "the same command goes on",
+    ("agent", "train"): "--resume goes on from the last checkpoint",
     ("agent", "compare"): "the same command goes on",
 }
 
@@ -51,20 +57,43 @@ def main(arguments: list[str] | None = None) -> None:
     Raises
     ------
     SystemExit
-        After help, and with one line that says what is wrong where something is.
+        After help, with one line that says what is wrong where something is, and with 130 after an interruption.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    with _noticing_interruptions() as interrupted:
+        try:
+            _run(arguments)
+        except BaseException as error:
+            if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
+                hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
+                print("; ".join(["kkl-gym: interrupted", *hints]), file=sys.stderr)
+                sys.exit(INTERRUPTED)
+            if isinstance(error, ModuleNotFoundError):
+                module = (error.name or "").partition(".")[0]
+                extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
+                sys.exit(": ".join(["kkl-gym", str(error), *extras]))
+            if isinstance(error, ValueError | OSError | FloatingPointError):
+                sys.exit(f"kkl-gym: {_message(error)}")
+            raise
+
+
+@contextmanager
+def _noticing_interruptions() -> Iterator[list[int]]:
+    """Give a list that is empty until there is an interruption."""
+    noticed: list[int] = []
+
+    def handler(number: int, frame: object) -> None:
+        noticed.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # which alone has handlers of signals
+        yield noticed
+        return
+    before = signal.signal(signal.SIGINT, handler)
     try:
-        _run(arguments)
-    except ModuleNotFoundError as error:
-        module = (error.name or "").partition(".")[0]
-        hints = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
-        sys.exit(": ".join(["kkl-gym", str(error), *hints]))
-    except (ValueError, OSError, FloatingPointError) as error:
-        sys.exit(f"kkl-gym: {_message(error)}")
-    except KeyboardInterrupt:
-        hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
-        sys.exit("; ".join(["kkl-gym: interrupted", *hints]))
+        yield noticed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _run(arguments: list[str]) -> None:
@@ -104,6 +133,8 @@ def _message(error: Exception) -> str:
     """What is wrong; of a configuration, a line for each setting: ``name = value: what it should be``."""
     from pydantic import ValidationError
 
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
     if not isinstance(error, ValidationError):
         return str(error)
     lines = []

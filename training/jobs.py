@@ -16,8 +16,9 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from filelock import FileLock, Timeout
 
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
-from observers.storage import write
+from observers.storage import clear_unfinished, write
 
 
 class Named(Protocol):
@@ -116,7 +117,8 @@ def describe(system: System) -> dict[str, Any]:
         To be compared with another after a way through JSON, which makes lists of tuples.
     """
     x = system.draw_starts(np.random.default_rng(0), 20)
-    rows = [*system.f(x.T), *(entry for row in system.g(x.T) for entry in row), *system.output(x).T]
+    matrix = input_matrix(system, x.T)
+    rows = [*components(system.f, x.T), *(entry for row in matrix for entry in row), *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {
         "system": system.name,
@@ -160,7 +162,7 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in a folder.
+    """Keep other processes from working in a folder, and clear away what killed ones have left half-written.
 
     Parameters
     ----------
@@ -171,6 +173,8 @@ def locked(folder: Path) -> Iterator[None]:
     ------
     ValueError
         If another process is at work there already.
+    OSError
+        If the folder cannot be made or written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / ".lock", timeout=0)
@@ -179,6 +183,7 @@ def locked(folder: Path) -> Iterator[None]:
     except Timeout:
         raise ValueError(f"another process is at work in {folder}") from None
     try:
+        clear_unfinished(folder)
         yield
     finally:
         lock.release()
@@ -230,7 +235,7 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
         If checkpoints would be spoiled, or another process is at work there.
     """
     with locked(folder):
-        if any(folder.glob("*.checkpoint.*")):
+        if any(folder.glob("[!.]*.checkpoint.*")):
             if not resume:
                 raise ValueError(
                     f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, "

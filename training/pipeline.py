@@ -33,10 +33,11 @@ from training.maps.scaling import StateScale
 from training.progress import progress_bars
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum
-from training.systems import controller
+from training.systems import controller, named_policy
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
+from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
 
@@ -80,10 +81,10 @@ def train(
     The stages, in order; each that trains a network has checkpoints of its own:
 
     1. The run's folder is claimed, and the eigenvalues become a filter.
-    2. Free inverse (input-aware maps of a system with inputs, unless turned off): trajectories without input are
-       simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
-    3. The training trajectories are simulated with the filter beside them; those of input-aware maps have inputs and
-       process noise.
+    2. Free inverse (input-aware maps of a system with inputs, unless turned off or under a policy): trajectories
+       without input are simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
+    3. The training trajectories are simulated with the filter beside them; those of input-aware maps have process noise
+       and inputs, random ones or a policy's.
     4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
        the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
        added to z.
@@ -117,18 +118,22 @@ def train(
     ------
     ValueError
         If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
-        folder, or if the system's trajectories leave its bounds.
+        folder, or if the system's trajectories leave its bounds, or the policy is none.
     FloatingPointError
         If the loss stops being a number.
     """
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
     noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}
     identity = {**describe(system), **noise, **dataclasses.asdict(config)}
-    feedback = controller(system) if config.closed_loop_trajectories else None  # an error now, not in ten minutes
+    # Errors now, not in ten minutes.
+    policy = None if config.policy is None else named_policy(system, config.policy)
+    feedback = (policy or controller(system)) if config.closed_loop_trajectories else None
+    if policy:
+        identity["policy_actions"] = policy_fingerprint(policy, system)
     with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console) as progress:
         run = _Run(system, config, folder, resume, device, progress, log, identity)
         free = run.learn_free_inverse() if "free" in run.shares else None
-        trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS))
+        trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS, policy=policy))
         forward: ForwardMap | None = None
         sampler: Sampler
         if config.pipeline == "input-aware":
@@ -376,5 +381,5 @@ def shares(config: Config, nu: int) -> dict[str, float]:
     if config.pipeline == "spinn":
         return SOLVED_SHARES if config.random_features else SPINN_SHARES
     closed_loop = ["closed-loop"] if config.closed_loop_trajectories else []
-    stages = ["inverse", *(["free"] if config.free_inverse and nu else []), *closed_loop]
+    stages = ["inverse", *(["free"] if config.free_inverse and nu and config.policy is None else []), *closed_loop]
     return {stage: 1 / len(stages) for stage in stages}

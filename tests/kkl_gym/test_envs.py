@@ -236,12 +236,12 @@ def test_escape_terminates_with_the_last_state(observe):
 
 
 def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
-    for dt in (1000.0, 1e300):
-        with pytest.raises(SubstepsError, match=r"lorenz changes at a rate of 15\.48/s .* take dt <= 26 s"):
+    for dt in (1e5, 1e300):
+        with pytest.raises(SubstepsError, match=r"lorenz changes at a rate of 15\.48/s .* take dt <= 1.7e"):
             KKLEnv("lorenz", dt=dt)
-    env = KKLEnv("lorenz", dt=20.0)  # suits the middle of X, but not all states
-    env.reset(options={"x0": [50.0, 50.0, 150.0]})
-    with pytest.raises(SubstepsError, match="more than 1024 substeps"):
+    env = KKLEnv("lorenz", dt=1600.0)  # suits the middle of X, but not all states
+    env.reset(options={"x0": [1.0, 1.0, 20.0]})
+    with pytest.raises(SubstepsError, match="65536 substeps are not enough for dt = 1600 s"):
         env.step(np.zeros(1))
 
 

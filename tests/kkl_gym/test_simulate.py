@@ -8,15 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, get_system
+from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.elementary import exp, sin
 from kkl_gym.simulate import (
+    GROWTH,
     MAX_SUBSTEPS,
+    MOST_EQUAL,
     PER_RATE,
     SubstepsError,
     advance,
     advance_batch,
     check_dt,
+    equal_substeps,
     runge_kutta,
     simulate,
 )
@@ -258,7 +261,7 @@ def test_huge_states_and_steps_are_nan_without_warning(name):
             assert not np.isfinite(batch).any()
         one = np.ones((system.nx, 1))
         for step, x in ((advance, one[:, 0]), (advance_batch, one)):
-            with pytest.raises(SubstepsError, match=rf"{name} changes at a rate of .*/s at x = \[.*take dt <= "):
+            with pytest.raises(SubstepsError, match=rf"{name} changes at a rate of .*/s at x = \[.*take a smaller dt"):
                 step(system, x, 0 * x[: system.nu], 0 * x, 1e6)
 
 
@@ -274,15 +277,67 @@ def test_number_of_substeps_is_limited():
 
     system = Counting()
     rate = system.rate((1.0, 1.0))
-    dt = MAX_SUBSTEPS / (PER_RATE * rate)
+    dt = MOST_EQUAL / (PER_RATE * rate)
     assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 0.999)).all()
+    assert len(calls) == 7 * MOST_EQUAL
+    calls.clear()
+    assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)).all()  # of lengths by the rate
+    assert 7 * MOST_EQUAL / 3 < len(calls) < 7 * MOST_EQUAL * 1.01
+    calls.clear()
+    with pytest.raises(SubstepsError, match=f"{MAX_SUBSTEPS} substeps are not enough"):
+        advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1000)
     assert len(calls) == 7 * MAX_SUBSTEPS
     calls.clear()
-    with pytest.raises(SubstepsError, match="more than 1024 substeps"):
-        advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)
-    assert not calls
-    beyond = (1.0, 300.0)  # the bounds, where a motion need not be followed
+    beyond = (1.0, 3000.0)  # the bounds, where a motion need not be followed
     assert np.isnan(advance(system, beyond, (0.0,), (0.0, 0.0), dt)).all()
+    assert not calls
+
+
+class Igniting(System):
+    """x1' = -r, x2' = 100 r with r = x1 exp(0.06 x2): slow at first, then 400 times as fast, within one interval."""
+
+    name = "igniting"
+    X = ((0.5, 1.0), (0.0, 3.0))
+    bounds = ((0.0, 1.1), (-1.0, 110.0))
+
+    def f(self, x):
+        r = x[0] * exp(0.06 * x[1])
+        return -r, 100.0 * r
+
+    def h(self, x):
+        return (x[1],)
+
+
+def test_what_ignites_within_an_interval_is_followed_and_not_lost():
+    system, dt = Igniting(), 1.0
+    starts = np.array([(1.0, 0.0), (0.7, 2.0)])
+    expected = np.array(
+        [solve_ivp(lambda _, x: system.f(x), (0, dt), x0, "LSODA", rtol=1e-10, atol=1e-12).y[:, -1] for x0 in starts]
+    )
+    assert (system.rate(expected.T) > GROWTH * system.rate(starts.T)).all()
+    np.testing.assert_allclose(simulate(system, starts, 3, dt)[1], expected, rtol=1e-4, atol=1e-5)
+    env = KKLEnv(system, dt=dt, process_noise=0.0)
+    envs = KKLVectorEnv(system, 2, dt=dt, process_noise=0.0)
+    envs.reset(seed=0, options={"x0": starts})
+    *_, terminated, _, infos = envs.step(np.zeros((2, 0)))
+    assert not terminated.any()
+    for x0, end, x in zip(starts, expected, infos["x"], strict=True):
+        env.reset(seed=0, options={"x0": x0})
+        *_, terminated, _, info = env.step(np.zeros(0))
+        assert not terminated
+        np.testing.assert_allclose(info["x"], end, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(info["x"], x, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_shipped_systems_never_need_substeps_of_unequal_length(name):
+    system, rng = get_system(name), np.random.default_rng(0)
+    low, high = np.array(system.bounds, dtype=float).T
+    x = rng.uniform(low, high, (20_000, system.nx)).T
+    u = rng.uniform(-1, 1, (system.nu, 20_000)) * np.array(system.u_max)[:, None]
+    end, again = equal_substeps(system, x, u, np.zeros_like(x), 0.01)
+    inside = ((end >= low[:, None]) & (end <= high[:, None])).all(0)
+    assert not (again & inside).any()
 
 
 def test_overflow_in_a_users_functions_is_an_escape():

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, elementary, get_system
+from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 VARIANTS = {
@@ -317,55 +317,6 @@ def test_missing_methods_are_named():
         mine.f((0.0, 0.0))
     with pytest.raises(NotImplementedError, match="Mine does not define h"):
         mine.h((0.0, 0.0))
-
-
-FUNCTIONS = ("sin", "cos", "tan", "exp", "tanh", "sqrt")
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-@settings(deadline=None, max_examples=30, derandomize=True)
-@given(x=st.floats(0.01, 3.0))
-def test_elementary_functions_agree(name, x):
-    function = getattr(elementary, name)
-    expected = getattr(math, name)(x)
-    assert function(x) == expected
-    assert function(np.array([x, x])) == pytest.approx([expected] * 2, rel=1e-13)
-    assert function(np.float32(x)) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_symbols(name):
-    sympy = pytest.importorskip("sympy")
-    symbol = sympy.Symbol("x")
-    assert getattr(elementary, name)(symbol) == getattr(sympy, name)(symbol)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_tensors(name):
-    torch = pytest.importorskip("torch")
-    x = torch.linspace(0.01, 3.0, 30, dtype=torch.float64)
-    expected = [getattr(math, name)(value) for value in x.tolist()]
-    assert getattr(elementary, name)(x).tolist() == pytest.approx(expected, rel=1e-13)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_refuse_the_rest(name):
-    assert getattr(elementary, name)(1) == getattr(math, name)(1.0)
-    for wrong in ("1", None, [1.0]):
-        with pytest.raises(TypeError, match=name):
-            getattr(elementary, name)(wrong)
-
-
-def test_elementary_functions_outside_their_domain_are_nan():
-    assert math.isnan(elementary.sin(math.inf))
-    assert math.isnan(elementary.sqrt(-1.0))
-
-
-def test_elementary_gradient():
-    torch = pytest.importorskip("torch")
-    x = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(elementary.sin(x), x)
-    assert float(slope) == pytest.approx(math.cos(0.3))
 
 
 @pytest.mark.parametrize(

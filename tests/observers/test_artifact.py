@@ -46,6 +46,17 @@ def file(tmp_path, make_artifact):
     return path
 
 
+def test_random_flipped_bits_are_all_noticed(file):
+    """tests/campaign has many more of them, and in files that ship."""
+    whole, rng = file.read_bytes(), np.random.default_rng(0)
+    for place in rng.integers(8 * len(whole), size=100):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        file.write_bytes(flipped)
+        with raises_naming(file):
+            Artifact.read(file)
+
+
 def raises_naming(path):
     return pytest.raises(ArtifactError, match=re.escape(str(path)))
 
@@ -229,6 +240,42 @@ def test_the_number_of_inputs_is_a_small_whole_one(file, inputs):
     with raises_naming(file) as raised:
         Artifact.read(file)
     assert f"number of inputs must be an integer from 0 to 64, got {inputs!r}" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("nz", "ny", "inputs"), [(3000, 1, 1), (1025, 1, 0), (513, 1, 1), (16, 1, 64), (5, 1025, 1), (5, 10**6, 64)]
+)
+def test_filters_beyond_all_measure_are_refused_before_their_matrices_are_made(nz, ny, inputs, file, monkeypatch):
+    def grow(tensors, meta):
+        tensors["A"], tensors["B"] = -np.eye(nz), np.ones((nz, ny))
+        meta["inputs"] = inputs
+
+    rewrite(file, grow)
+    for name in ("eig", "cond", "inv"):
+        monkeypatch.setattr(np.linalg, name, lambda *arguments: pytest.fail("decomposed"))
+    monkeypatch.setattr(np, "kron", lambda *arguments: pytest.fail("memory taken"))
+    with raises_naming(file) as raised:
+        Artifact.read(file)
+    assert f"got nz = {nz}, nu = {inputs} and {ny} outputs" in str(raised.value)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 1), (1, 0)])
+def test_filters_of_nothing(shape, file):
+    rewrite(file, lambda tensors, meta: tensors.update(A=-np.eye(shape[0]), B=np.ones(shape)))
+    with raises_naming(file) as raised:
+        Artifact.read(file)
+    assert f"got nz = {shape[0]}" in str(raised.value)
+
+
+def test_maps_that_estimate_nothing(file):
+    def empty(tensors, meta):
+        tensors["inverse.2.weight"], tensors["inverse.2.bias"] = tensors["inverse.2.weight"][:0], np.zeros(0)
+        tensors["inverse.x_offset"] = tensors["inverse.x_scale"] = np.zeros(0)
+
+    rewrite(file, empty)
+    with raises_naming(file) as raised:
+        Artifact.read(file)
+    assert "must estimate one state at least" in str(raised.value)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, True, "0.01", None, 10**400, np.inf, np.nan, [0.01]])

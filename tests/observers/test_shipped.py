@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 import observers
 from kkl_gym import SYSTEMS, get_system
@@ -21,6 +22,12 @@ def test_shipped_maps_say_what_they_are(name, suffix):
     assert resolve(name + suffix) == resolve(f"{name}{suffix}-v2")
     assert (artifact.free_inverse is not None) == (not suffix)
     assert resolve(name + suffix).stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize("name", sorted(set(observers.shipped().values())))
+def test_every_map_has_a_checksum(name):
+    with safe_open(resolve(name), framework="numpy") as opened:
+        assert len(opened.metadata()["kkl-gym-sha256"]) == 64
 
 
 @pytest.mark.parametrize("name", NAMES)

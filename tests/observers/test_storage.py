@@ -1,3 +1,5 @@
+import errno
+import hashlib
 import json
 import os
 import re
@@ -152,8 +154,12 @@ def named(path, words):
 
 def test_missing_files_and_folders(tmp_path):
     (tmp_path / "file").write_text("")
-    for name in ("none", "no/folder/none", "file/none", ""):
+    for name in ("none", "no/folder/none", "file/none"):
         with named(tmp_path / name, "there is no file"):
+            read(tmp_path / name)
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("", "pipe"):
+        with named(tmp_path / name, "is a folder, a pipe or a device"):
             read(tmp_path / name)
     with pytest.raises(UnreadableError, match="there is no file"):
         read("a\0b")
@@ -302,4 +308,163 @@ def test_networks_that_lack_a_layer(mlp):
 def test_metadata_is_json_with_sorted_keys(path):
     text = path.read_bytes()
     header = json.loads(text[8 : 8 + int.from_bytes(text[:8], "little")])
+    assert header["__metadata__"].pop("ours-sha256")
     assert header["__metadata__"] == {"ours": '{"format": 1, "text": "\\u00e4"}'}
+
+
+def test_saving_twice_gives_the_same_bytes(path):
+    """safetensors itself shuffles the entries of the metadata."""
+    whole = path.read_bytes()
+    for _ in range(8):
+        storage.save(path, ARRAYS, key="ours", described={"format": 1, "text": "ä"})
+        assert path.read_bytes() == whole
+
+
+def test_every_flipped_bit_is_noticed(path):
+    whole = path.read_bytes()
+    for place in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        with pytest.raises(UnreadableError):
+            read(path)
+
+
+def test_zeroed_and_exchanged_parts_are_noticed(path):
+    storage.save(path, {"a": np.arange(500.0)}, key="ours", described={})
+    whole = path.read_bytes()
+    for start in range(0, len(whole), 512):
+        path.write_bytes(whole[:start] + bytes(len(whole[start : start + 512])) + whole[start + 512 :])
+        with pytest.raises(UnreadableError):
+            read(path)
+    path.write_bytes(whole[:-16] + whole[-8:] + whole[-16:-8])
+    with named(path, "it holds something else than its checksum says"):
+        read(path)
+
+
+def test_files_from_before_there_were_checksums(path):
+    """They are read, and the checksum of what they hold is theirs."""
+    with_one = storage.checksum(path, UnreadableError)
+    save_file(ARRAYS, path, metadata={"ours": '{"format": 1, "text": "\\u00e4"}'})
+    tensors, described = read(path)
+    assert described == {"format": 1, "text": "ä"}
+    assert np.array_equal(tensors["a"], ARRAYS["a"])
+    assert storage.checksum(path, UnreadableError) == hashlib.sha256(path.read_bytes()).hexdigest() == with_one
+
+
+def test_metadata_that_nobody_knows(path):
+    save_file(ARRAYS, path, metadata={"ours": "{}", "ours-sha257": "0", "more": ""})
+    with named(path, "nobody knows its metadata more, ours-sha257"):
+        read(path)
+
+
+@pytest.mark.parametrize("whole", [b"", b"\0" * 64, b"\2\0\0\0\0\0\0\0[]", content({}, {"a-sha256": "0"})[:-9]])
+def test_checksums_of_what_is_no_file_of_tensors(path, whole):
+    path.write_bytes(whole)
+    with named(path, "damaged or no safetensors file"):
+        storage.checksum(path, UnreadableError)
+
+
+@pytest.mark.parametrize("size", [2 * 2**30, storage.MOST_BYTES + 1])
+def test_files_that_are_too_large_are_not_read(path, size, monkeypatch):
+    os.truncate(path, size)  # a sparse file, which takes no room on disk
+    monkeypatch.setattr(Path, "read_bytes", lambda self: pytest.fail("read"))
+    with named(path, f"has {size} bytes, more than the {storage.MOST_BYTES}"):
+        read(path)
+
+
+def test_headers_that_are_too_large_are_not_looked_into(path, monkeypatch):
+    path.write_bytes(content({"a": ("F32", [1], bytes(4))}, {"ours": "{}" + " " * storage.MOST_HEADER}))
+    monkeypatch.setattr(storage, "deserialize", lambda content: pytest.fail("looked into"))
+    with named(path, f"its header has [0-9]+ bytes, more than {storage.MOST_HEADER}"):
+        read(path)
+
+
+@pytest.mark.parametrize("shape", [[1] * 100, [0, 2**40, 2**40], [0, 2**63]])
+def test_shapes_that_numpy_knows_not(path, shape):
+    path.write_bytes(content({"a": ("F32", shape, bytes(4 * (0 not in shape)))}, {"ours": "{}"}))
+    with named(path, "its tensor a|no safetensors file"):
+        read(path)
+
+
+def nested(levels):
+    return {"a": nested(levels - 1)} if levels > 1 else [1.0] if levels else 1.0
+
+
+def test_metadata_is_nested_32_times_at_most(path):
+    storage.save(path, {}, key="ours", described=nested(32))
+    assert read(path)[1] == nested(32)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="at most 32 objects and lists within one another"):
+        storage.save(path, {}, key="ours", described=nested(33))
+    assert path.read_bytes() == before
+    path.write_bytes(content({}, {"ours": json.dumps(nested(33))}))
+    with named(path, "has more than 32 levels"):
+        read(path)
+
+
+def test_what_could_not_be_read_is_not_saved(path, monkeypatch):
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match=f"{re.escape(str(path))} would have"):
+        storage.save(path, {}, key="ours", described={"text": "a" * storage.MOST_HEADER})
+    monkeypatch.setattr(storage, "MOST_BYTES", 1000)
+    with pytest.raises(ValueError, match=f"{re.escape(str(path))} would have"):
+        storage.save(path, {"a": np.zeros(200)}, key="ours", described={})
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("place", ["write", "fsync", "replace"])
+def test_a_full_disk_is_told_by_the_name_of_the_file(path, place, monkeypatch):
+    before = path.read_bytes()
+
+    def fail(*arguments):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    if place == "write":
+        monkeypatch.setattr(Path, "write_bytes", fail)
+    else:
+        monkeypatch.setattr(os, place, fail)
+    with pytest.raises(OSError, match=re.escape(f"No space left on device: '{path}'")) as raised:
+        storage.save(path, {"a": np.zeros(3)}, key="ours", described={})
+    assert raised.value.filename == str(path)
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_a_folder_that_one_may_not_write_to(path, monkeypatch):
+    def refuse(self, **options):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "touch", refuse)
+    with pytest.raises(PermissionError, match=re.escape(f"Permission denied: '{path}'")):
+        storage.write(path, "text")
+    assert os.listdir(path.parent) == [path.name]
+
+
+def test_other_errors_while_writing_stay_as_they_are(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'other'"), storage.replacing(tmp_path / "a"):
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory", "other")
+    with pytest.raises(KeyboardInterrupt), storage.replacing(tmp_path / "a"):
+        raise KeyboardInterrupt
+    assert not os.listdir(tmp_path)
+
+
+KILLED = """
+import os, signal, sys
+from observers import storage
+
+with storage.replacing(sys.argv[1]) as temporary:
+    temporary.write_bytes(b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_killed_processes_leave_is_cleared_away(path):
+    before = path.read_bytes()
+    root = str(Path(observers.__file__).parents[1])
+    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], env={**os.environ, "PYTHONPATH": root}, timeout=60)
+    assert done.returncode == -9
+    assert path.read_bytes() == before
+    assert len(os.listdir(path.parent)) == 2
+    storage.clear_unfinished(path.parent)
+    assert os.listdir(path.parent) == [path.name]

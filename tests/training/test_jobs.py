@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from kkl_gym import get_system
+from observers.storage import UNFINISHED
 from training.jobs import check_identity, claimed_job, claimed_run, describe, locked, run_all
 
 WAIT = 120.0  # seconds, for processes that import torch on a busy machine
@@ -183,7 +184,18 @@ def test_a_lock_ends_with_its_work(tmp_path):
         pass
 
 
-@pytest.mark.parametrize("text", ["{", "3", "[1]"])
+def test_a_lock_clears_away_what_killed_processes_left(tmp_path):
+    half = tmp_path / f"{UNFINISHED}1234-inverse.checkpoint.pt"
+    half.write_bytes(b"half")
+    with claimed_run(tmp_path, {"width": 8}, resume=False):  # it is no checkpoint
+        assert not half.exists()
+        half.write_bytes(b"half")
+        with pytest.raises(ValueError, match="another process"), locked(tmp_path):
+            raise AssertionError
+        assert half.exists()
+
+
+@pytest.mark.parametrize("text", ["", "{", "3", "[]", "[1]"])
 def test_identities_that_are_damaged(text, tmp_path):
     path = tmp_path / "job.json"
     path.write_text(text)

@@ -16,7 +16,7 @@ import training.pipeline
 import training.trajectories.record
 from kkl_gym import VanDerPol
 from observers import Artifact, KKLObserver
-from training import errors, preset, train, unseen_trajectories
+from training import checkpoints, errors, preset, train, unseen_trajectories
 from training.config import override
 from training.trajectories.record import record
 
@@ -95,7 +95,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
     config = toy(system, method, duration=20.0, inverse_steps=400, **options)
     whole = train(system, config, tmp_path / "whole").artifact
 
-    monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
     save, saved = training.maps.optimise._save, []
 
     def save_and_stop(stage, parts, generator, course):

@@ -130,7 +130,7 @@ def _run(case: Case) -> None:
     else:
         information: Any = case.information
         policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
-        env = agent.make(case.episodes)
+        env = agent.make(case.episodes, system=task.system)
     seconds = time.process_time() - began
     x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
     result = {

@@ -8,6 +8,7 @@ from PIL import Image
 
 from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
+from observers.storage import replacing
 from training.agents.play import Episodes
 from training.systems import ControlTask
 
@@ -50,7 +51,8 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
         axes[i, 0].set_ylabel(name)
     axes[0, 0].legend(loc="upper right", fontsize="x-small")
     figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {task.measurement_noise:g}")
-    figure.savefig(path, dpi=110)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
@@ -76,4 +78,5 @@ def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
         for k in range(1, len(x), every)
     ]
     duration = round(1000 * SECONDS / len(frames))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    with replacing(path) as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=duration, loop=0)

@@ -13,11 +13,12 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from kkl_gym import SYSTEMS, get_system
+from kkl_gym import SYSTEMS, System, get_system
 from training.agents.agent import Agent, AgentError
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
+from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
 from training.jobs import locked
 from training.progress import progress_bars
@@ -62,6 +63,8 @@ class Train:
         Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(default: runs/agents/SYSTEM-INFORMATION-SEED)")
     ] = None
     """The run's folder."""
+    resume: bool = False
+    """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
     threads: int = 1
     """CPU threads of the networks."""
 
@@ -78,7 +81,7 @@ class Train:
         ValueError
             If an option makes no sense, or the observer cannot be had.
         FileExistsError
-            If the folder holds an agent already.
+            If the folder holds an agent or a checkpoint already, and nothing is to be resumed.
         """
         from training.agents.learn import learn  # stable-baselines3 takes seconds to import
 
@@ -89,8 +92,13 @@ class Train:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         torch.set_num_threads(self.threads)
         with locked(folder), progress_bars(console) as progress:
-            if (folder / "agent.safetensors").exists():
+            if (folder / "agent.safetensors").exists() and not self.resume:
                 raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
+            if (folder / f"agent{SUFFIX}").exists() and not self.resume:
+                raise FileExistsError(
+                    f"{folder} holds the checkpoint of a training: go on with it (--resume), remove it, or choose "
+                    "another folder with --out"
+                )
             agent = learn(
                 task,
                 self.information,
@@ -99,9 +107,10 @@ class Train:
                 timesteps=self.timesteps,
                 observer=self.observer,
                 algorithm=self.algorithm,
+                resume=self.resume,
                 progress=progress,
             )
-        show(console, agent, 100)
+        show(console, agent, 100, trusted=agent.task.system)
         console.print(f"wrote agent.safetensors and progress.csv in {folder}")
 
 
@@ -142,10 +151,9 @@ class Evaluate:
         task = agent.task
         if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
-        episodes = show(console, agent, self.episodes, self.seed)
+        episodes = show(console, agent, self.episodes, self.seed, trusted=self.system)
         system = get_system(task.system).name
-        name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.training.get('seed', 0)}"
-        self.out.mkdir(parents=True, exist_ok=True)
+        name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.seed}"
         draw(task, episodes, self.out / f"{name}.png")
         animate(task, episodes, self.out / f"{name}.gif")
         console.print(f"wrote {name}.png and {name}.gif in {self.out}")
@@ -167,7 +175,7 @@ class AgentCommand:
         self.command.run(console)
 
 
-def show(console: Console, agent: Agent, n: int, seed: int = 0) -> Episodes:
+def show(console: Console, agent: Agent, n: int, seed: int = 0, *, trusted: str | System | None = None) -> Episodes:
     """Play episodes; print score and success.
 
     Parameters
@@ -180,6 +188,8 @@ def show(console: Console, agent: Agent, n: int, seed: int = 0) -> Episodes:
         Number of episodes.
     seed : int
         Seed of the episodes.
+    trusted : str or System, optional
+        The agent's system, if it may be imported.
 
     Returns
     -------
@@ -194,11 +204,11 @@ def show(console: Console, agent: Agent, n: int, seed: int = 0) -> Episodes:
     first = agent_evaluation_seed(seed, n)
     task = agent.task
     system = get_system(task.system)
-    episodes = play(agent.make(n), agent, steps=task.steps, seed=first)
+    episodes = play(agent.make(n, system=trusted), agent, steps=task.steps, seed=first)
     score, success = scores(system, episodes.x), successes(task, episodes.x)
     table = Table(show_header=False)
     for label, value in (
-        ("system", task.system),
+        ("system", str(task.system)),
         ("information", agent.information),
         ("measurement noise", f"{task.measurement_noise:g}"),
         ("episodes", str(n)),

@@ -15,7 +15,7 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnSystem, read_observers
+from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.certificates.certificate import Certificate, certify
 from training.evaluation.certificates.forward import AGES, QUANTILES
 from training.evaluation.certificates.gains import noise_variance
@@ -36,6 +36,7 @@ class Certify:
     observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
+    policy: OwnPolicy = None
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
     process_noise: Annotated[
@@ -82,6 +83,7 @@ class Certify:
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
                 KKLObserver(artifact, self.measurement_noise, process_noise=process_noise)  # refuses bad levels now
                 levels = (self.measurement_noise, process_noise)
+                policy = read_policy(artifact, system, self.policy)
                 motion = record_settled(
                     artifact,
                     system,
@@ -89,6 +91,7 @@ class Certify:
                     process_noise=process_noise,
                     trajectories=self.trajectories,
                     seed=self.seed,
+                    policy=policy,
                 )
                 certificate = certify(
                     artifact,

@@ -13,7 +13,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
-from training.commands.options import Observers, OwnSystem, read_observers
+from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.errors import Domain, errors, unseen_trajectories
 
 
@@ -25,12 +25,13 @@ class Evaluate:
     after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines. Observers are
     told the levels of noise if they can use them. Trajectories that leave the system's declared bounds are counted, and
     left out. The column "driven" is there for observers that take inputs, "process noise" where there is any; the CSV
-    file always has both.
+    file always has both. Under a policy, those are driven in which it errs about the state and explores.
     """
 
     observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
+    policy: OwnPolicy = None
     measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)
     """Standard deviations of the noise on each sample of y, one table row for each."""
     process_noise: float = 0.0
@@ -77,6 +78,7 @@ class Evaluate:
         return found
 
     def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> pd.DataFrame:
+        policy = read_policy(artifact, system, self.policy)
         cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
         if artifact.nu:
             cases.append(("X", "X", True))
@@ -100,6 +102,7 @@ class Evaluate:
                 domain=domain,
                 driven=driven,
                 process_noise=self.process_noise,
+                policy=policy,
             )
             for level in self.measurement_noise:
                 found = errors(

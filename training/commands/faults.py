@@ -13,7 +13,7 @@ from rich.table import Column, Table
 from kkl_gym import SYSTEMS
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnSystem, read_observers
+from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.faults import FAULTS, simulate_faults
 
 
@@ -31,6 +31,7 @@ class Faults:
     observers: Observers = tuple(SYSTEMS)
     """Shipped maps, or .safetensors files, with limits for a monitor; by default the newest of each shipped system."""
     system: OwnSystem = None
+    policy: OwnPolicy = None
     trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 500
     """Number of trajectories for each observer."""
     duration: float = 50.0
@@ -76,6 +77,7 @@ class Faults:
                     duration=self.duration,
                     measurement_noise=self.measurement_noise,
                     seed=self.seed,
+                    policy=read_policy(artifact, system, self.policy),
                 )
             found.insert(0, "observer", name)
             frames.append(found)

@@ -13,6 +13,7 @@ from rich.table import Table
 from kkl_gym.systems import get_system
 from training.config import Config, Pipeline, read_changes, setting_types
 from training.presets import CLOSED_LOOP, Preset, preset
+from training.systems import named_policy
 
 
 def _options() -> type[Any]:
@@ -97,6 +98,7 @@ class Train:
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         config = preset(system, self.pipeline, self.preset, changes=changes)
+        policy = None if config.policy is None else named_policy(system, config.policy)
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
         name += "-closed-loop" if config.closed_loop_trajectories else ""
         folder = self.out or Path("runs") / name
@@ -113,11 +115,11 @@ class Train:
         elif self.monitor:
             try:
                 with console.status("finding the monitor's limits"):
-                    calibrate(result.artifact, system, seed=config.seed).save(path)
+                    calibrate(result.artifact, system, seed=config.seed, policy=policy).save(path)
             except ValueError as error:
                 console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
         console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
-        write_report(folder / "report.png", result, system)
+        write_report(folder / "report.png", result, system, policy=policy)
         console.print(f"wrote {folder / 'report.png'}")
         return path
 

@@ -10,7 +10,9 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.metrics import smape
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
@@ -141,6 +143,7 @@ def unseen_trajectories(
     driven: bool = False,
     stream: Stream = Stream.EVALUATION,
     process_noise: float = 0.0,
+    policy: Controller | None = None,
 ) -> UnseenTrajectories:
     """Simulate test trajectories, whose random numbers training never draws.
 
@@ -159,11 +162,13 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where they start, see :func:`starts`.
     driven : bool
-        Whether inputs act: random bounded steps and sines in turn.
+        Whether inputs act: random bounded steps and sines in turn. Under a policy, whether it errs and explores.
     stream : Stream
         Random numbers to draw: those of evaluation or those of validation.
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
+    policy : callable, optional
+        Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
 
     Returns
     -------
@@ -186,12 +191,16 @@ def unseen_trajectories(
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = np.zeros((steps, n, system.nu))
-    if driven:
+    if driven and not policy:
         u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
     w = None
     if process_noise:
         w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
-    x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
+    if policy:
+        exploring, own = generator(stream, seed, 3), np.full(n, not driven)
+        x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w)
+    else:
+        x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
 

@@ -10,6 +10,7 @@ from observers import Artifact, KKLObserver
 from training.evaluation.calibration import sound_trajectories
 from training.seeds import Stream, generator
 from training.systems import profile
+from training.trajectories.controllers import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
@@ -22,7 +23,14 @@ def deadline(system: System, duration: float) -> float:
 
 
 def simulate_faults(
-    artifact: Artifact, system: System, *, trajectories: int, duration: float, measurement_noise: float, seed: int
+    artifact: Artifact,
+    system: System,
+    *,
+    trajectories: int,
+    duration: float,
+    measurement_noise: float,
+    seed: int,
+    policy: Controller | None = None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -40,6 +48,8 @@ def simulate_faults(
         Standard deviation of the noise on each sample of y.
     seed : int
         Seed of starts, inputs and noise.
+    policy : callable, optional
+        Acts on the system, as for :func:`training.evaluation.calibration.calibrate`.
 
     Returns
     -------
@@ -60,11 +70,11 @@ def simulate_faults(
             f"a fault in the middle of {duration} s leaves less than the {allowed:g} s within which it is to be noticed"
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng, policy=policy)
     clean = system.output(x)
     y = clean + measurement_noise * rng.standard_normal(clean.shape)
-    undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
-    width = np.ptp(undriven, axis=(0, 1))
+    counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it
+    width = np.ptp(clean[len(clean) // 2 :, counted], axis=(0, 1))
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []

@@ -2,7 +2,6 @@
 
 import math
 import operator
-import pickle
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,13 +13,11 @@ import torch
 from rich.progress import Progress
 from torch import nn
 
-from observers.storage import replacing
+from training import checkpoints
 from training.config import Optimiser
 
-CHECKPOINT_SECONDS = 20.0
 LOG_EVERY = 100
 WARM_UP = 0.01  # part of a stage in which the learning rate rises
-SUFFIX = ".checkpoint.pt"
 
 # A batch is drawn with the generator it is given and nothing else, so that a resumed run goes on as it would have.
 Loss = Callable[[torch.Generator], dict[str, torch.Tensor]]
@@ -65,7 +62,7 @@ class Stage:
     @property
     def checkpoint(self) -> Path:
         """The file that keeps how far it has come."""
-        return self.folder / f"{self.name}{SUFFIX}"
+        return self.folder / f"{self.name}{checkpoints.SUFFIX}"
 
 
 @dataclass
@@ -147,7 +144,7 @@ def optimise(
                 for name, value in terms.items():
                     log(f"{stage.name}/{name}", float(value.detach()), step + 1)
             progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
-            if time.monotonic() - saved_at > CHECKPOINT_SECONDS or last:
+            if time.monotonic() - saved_at > checkpoints.SECONDS or last:
                 course.step, course.seconds = step + 1, seconds()
                 _save(stage, parts, generator, course)
                 saved_at = time.monotonic()
@@ -178,41 +175,25 @@ def log_to(folder: Path) -> Iterator[Log | None]:
 
 def seconds_spent(folder: Path) -> float:
     """CPU seconds of all stages whose checkpoints are in a folder, interruptions included."""
-    return float(sum(_load(path)["seconds"] for path in folder.glob(f"*{SUFFIX}")))
+    spent = 0.0
+    for path in sorted(folder.glob(f"[!.]*{checkpoints.SUFFIX}")):  # not those that somebody writes or has left
+        found = checkpoints.load(path)
+        with checkpoints.restoring(path):
+            spent += float(found["seconds"])
+    return spent
 
 
 def _save(stage: Stage, parts: dict[str, Any], generator: torch.Generator, course: _Course) -> None:
-    state = {name: part.state_dict() for name, part in parts.items()}
-    with replacing(stage.checkpoint) as temporary:
-        torch.save(
-            {"fingerprint": stage.fingerprint, "generator": generator.get_state(), **state, **vars(course)}, temporary
-        )
+    states = {name: part.state_dict() for name, part in parts.items()}
+    state = {"generator": generator.get_state(), **states, **vars(course)}
+    checkpoints.save(stage.checkpoint, state, fingerprint=stage.fingerprint)
 
 
 def _restore(stage: Stage, parts: dict[str, Any], generator: torch.Generator) -> _Course:
-    path = stage.checkpoint
-    found = _load(path)
-    if found["fingerprint"] != stage.fingerprint:
-        raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
-    try:
+    found = checkpoints.load(stage.checkpoint, fingerprint=stage.fingerprint)
+    with checkpoints.restoring(stage.checkpoint):
         for name, part in parts.items():
             part.load_state_dict(found[name])
-        generator.set_state(found["generator"].cpu())
+        generator.set_state(found["generator"])
         history = [(int(step), float(error)) for step, error in found["history"]]
         return _Course(operator.index(found["step"]), float(found["seconds"]), history)
-    except (KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise _damaged(path, error) from error
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        found = torch.load(path, weights_only=True)  # tensors and plain values; nothing in the file can run
-        return {"fingerprint": None, "seconds": 0.0, **found}
-    except (pickle.UnpicklingError, OSError, EOFError, RuntimeError, TypeError, ValueError, KeyError) as error:
-        raise _damaged(path, error) from error
-
-
-def _damaged(path: Path, error: Exception) -> ValueError:
-    return ValueError(
-        f"the checkpoint {path} is damaged or of an older version, remove it to train that stage anew: {error}"
-    )

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 
+from kkl_gym.equations import components
 from kkl_gym.system import Components
 
 TensorMap = Callable[[torch.Tensor], torch.Tensor]
@@ -11,7 +12,7 @@ TensorMap = Callable[[torch.Tensor], torch.Tensor]
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:
     """A system's f or h, which take and give components, on states (n, nx), as (n, components)."""
-    values = equations(x.unbind(-1))
+    values = components(equations, x.unbind(-1))
     return torch.stack([torch.as_tensor(value, dtype=x.dtype, device=x.device).expand(len(x)) for value in values], -1)
 
 

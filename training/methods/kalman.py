@@ -31,7 +31,7 @@ class EKF(Method[Arrays]):
     filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of diffusion, in multiples of the scale per square root of a second."""
+        """Three levels of diffusion, in multiples of the scale per square root of a second of its pace."""
         return tuple({"diffusion": level} for level in DIFFUSION)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
@@ -40,7 +40,7 @@ class EKF(Method[Arrays]):
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
         """The filter, told the noise level."""
-        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2)
+        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
         R = measurement_covariance(system, noise)
         return self.filter(self.model(system), dt, Q=Q, R=R)
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from gymnasium.vector import AutoresetMode
 
 from kkl_gym import KKLVectorEnv, VectorActionRepeat
-from kkl_gym.system import Box
+from kkl_gym.system import Box, System
 from kkl_gym.wrappers.vector import VectorEnv
+from observers.checks import is_finite
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,8 @@ class ControlTask:
 
     Parameters
     ----------
-    system : str
-        A shipped name, "module:Class" or "script.py:Class".
+    system : str or System
+        A shipped name, "module:Class" or "script.py:Class", or the system itself. Agents can be saved with a name only.
     measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     period : float
@@ -37,7 +38,7 @@ class ControlTask:
         If a number makes no sense, or a time is no whole multiple of the next shorter one.
     """
 
-    system: str
+    system: str | System
     measurement_noise: float | tuple[float, ...] = 0.5
     period: float = 0.05
     duration: float = 20.0
@@ -46,6 +47,9 @@ class ControlTask:
     dt: float = 0.01
 
     def __post_init__(self) -> None:
+        for name in ("period", "duration", "tolerance", "dt"):
+            if not is_finite(getattr(self, name)):
+                raise ValueError(f"a task's {name} must be a finite number, got {getattr(self, name)!r}")
         if not self.tolerance > 0 or not 0 < self.dt <= self.period <= self.duration:
             raise ValueError(f"a task needs tolerance > 0 and 0 < dt <= period <= duration, got {self}")
         for name, time, unit in (("period", self.period, self.dt), ("duration", self.duration, self.period)):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kkl_gym.simulate import advance_batch
+from kkl_gym.simulate import advance_batch, followed_rows
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
@@ -125,6 +125,8 @@ def record_closed_loop(
             if disturbance:
                 w = np.ascontiguousarray(draw_process_noise(system, disturbance, n=count, steps=1, rng=rng)[0].T)
             after = advance_batch(system, x, np.ascontiguousarray(u.T), w, dt)
+            beyond = np.flatnonzero(~((after >= low) & (after <= high)).all(0))
+            after = followed_rows(system, x, np.ascontiguousarray(u.T), w, dt=dt, end=after, rows=beyond)
             inside &= ((after >= low) & (after <= high)).all(0)
             x = np.where(inside, after, x)
         xs.append(x_rows[:, inside])

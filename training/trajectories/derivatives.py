@@ -1,15 +1,27 @@
 """Derivatives of a system from its own equations."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
+
+# Functions in the derivatives that sympy does not print for NumPy, or prints for arrays of one shape only.
+_IN_NUMPY = {
+    "Max": lambda *values: functools.reduce(np.maximum, values),
+    "Min": lambda *values: functools.reduce(np.minimum, values),
+    "Heaviside": np.heaviside,
+}
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of f or h from its own equations.
+
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of those on both sides; at a jump it is that
+    beside it.
 
     Parameters
     ----------
@@ -25,23 +37,43 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
     Raises
     ------
-    ValueError
+    EquationError
         If the equations do not take sympy symbols.
+    ValueError
+        If sympy cannot differentiate them.
     """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
     x = sympy.symbols(f"x:{nx}", real=True)
     rows = []
-    try:
-        values = [sympy.sympify(value) for value in equations(list(x))]
-    except TypeError as error:
-        raise ValueError(f"derivatives need equations that take symbols, from kkl_gym.elementary: {error}") from error
-    for value in values:
+    for i, value in enumerate(components(equations, list(x))):
+        value = _differentiable(sympy.sympify(value))
         derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
-        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
+        if any(derivative.has(sympy.Derivative) for derivative in derivatives.values()):
+            raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative that sympy knows: {value}")
+        rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in derivatives.items() if d != 0})
     return rows
 
 
+def _differentiable(value: Any) -> Any:
+    """An expression in which functions with kinks and jumps are written so that sympy knows their derivatives."""
+    import sympy
+
+    def flat(name: str) -> Any:
+        return type(name, (sympy.Function,), {"fdiff": lambda self, argindex=1: sympy.Integer(0)})
+
+    floor = flat("floor")
+    for function, real in (
+        (sympy.Mod, lambda a, b: a - b * floor(a / b)),
+        (sympy.floor, floor),
+        (sympy.sign, flat("sign")),
+        (sympy.Abs, lambda u: sympy.Max(u, -u)),
+    ):
+        value = value.replace(function, real)
+    return value
+
+
+@np.errstate(all="ignore")  # where(x > 0, log(x), 0) is evaluated on both sides of zero
 def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
     """Evaluate what :func:`jacobian` returned at states (..., nx), as (..., rows, nx)."""
     out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
@@ -53,13 +85,13 @@ def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Linearise a system at a state x: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx)."""
-    g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
+    g = np.array(input_matrix(system, x), dtype=float).reshape(system.nx, system.nu)
     at = np.array(x, dtype=float)
     return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
-    """Put a system beside its variational equation, x' = f(x) + G u and Phi' = df/dx Phi.
+    """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
 
     Parameters
     ----------
@@ -76,29 +108,37 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
     Raises
     ------
     ValueError
-        If it is driven through an input matrix that depends on the state, or f does not take sympy symbols.
+        If f, or a g that depends on the state, does not take sympy symbols.
     """
     nx, rows = system.nx, jacobian(system.f, system.nx)
     nu = system.nu if driven else 0
-    if nu and type(system).g is not System.g:
-        raise ValueError(
-            f"{system.name} has an input matrix that depends on the state, which the variational equation would need"
-        )
+    varying = nu > 0 and type(system).g is not System.g
+
+    def entries(x: Components) -> Components:
+        return [entry for row in input_matrix(system, x) for entry in row]
+
+    input_rows = jacobian(entries, nx) if varying else []
+
+    def carried(row: dict[int, Callable[..., Any]], x: Components) -> list[Any]:
+        """A row of derivatives by the states, times Phi."""
+        at = {k: derivative(*x[:nx]) for k, derivative in row.items()}
+        return [sum(value * x[nx + k * nx + j] for k, value in at.items()) for j in range(nx)]
 
     class Sensitivity(System):
         name = f"{system.name}-sensitivity"
         X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
         bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
         u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu else ()
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not varying else ()
 
         def f(self, x: Components) -> Components:
-            state, Phi = x[:nx], x[nx:]
-            out = list(system.f(state))
-            for row in rows:
-                at = {k: derivative(*state) for k, derivative in row.items()}
-                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
-            return out
+            return [*system.f(x[:nx]), *(value for row in rows for value in carried(row, x))]
+
+        if varying:
+
+            def g(self, x: Components) -> Sequence[Components]:
+                by_input = [[carried(input_rows[i * nu + m], x) for m in range(nu)] for i in range(nx)]
+                return [*system.g(x[:nx]), *(column for row in by_input for column in zip(*row, strict=True))]
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])

@@ -8,6 +8,8 @@ import training.evaluation.errors
 import training.maps.optimise
 import training.pipeline
 import training.trajectories.record
+from observers.storage import UNFINISHED
+from training import checkpoints
 from training.progress import progress_bars
 
 
@@ -54,7 +56,7 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
         rates.extend(np.abs(np.diff(calls)))
         return len(calls)
 
-    monkeypatch.setattr(training.maps.optimise, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
     with pytest.raises(KeyboardInterrupt):
         fit(stop_after=150)  # the checkpoint is of step 100
     spent = training.maps.optimise.seconds_spent(tmp_path)
@@ -64,3 +66,8 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
     assert rest == pytest.approx(100 * (4.0 - spent) / spent, rel=0.1)
     assert rates[-1] < 1e-4  # the learning rate has followed the clock to zero
     assert fit() == 0
+    (tmp_path / f"{UNFINISHED}1234-line{checkpoints.SUFFIX}").write_bytes(b"half")  # of a process that was killed
+    assert 4.0 <= training.maps.optimise.seconds_spent(tmp_path) < 4.1
+    (tmp_path / f"other{checkpoints.SUFFIX}").write_bytes(b"half")
+    with pytest.raises(ValueError, match="is damaged or of an older version, remove it"):
+        training.maps.optimise.seconds_spent(tmp_path)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from linear_system import Oscillator
 
-from kkl_gym import get_system
+from kkl_gym import SYSTEMS, get_system
+from kkl_gym.elementary import sin
 from kkl_gym.simulate import simulate
 from training.trajectories.derivatives import jacobian, output_matrix, with_sensitivity
 
@@ -24,19 +25,29 @@ def test_output_matrix_of_linear_and_other_outputs():
     assert output_matrix(Squared()) is None
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
-def test_sensitivity_is_the_derivative_of_the_flow(name):
-    system, dt, eps = get_system(name), 0.05, 1e-5
-    nx = system.nx
+class Steered(Oscillator):
+    """Two inputs through a matrix that depends on the state."""
+
+    name: ClassVar[str] = "steered"
+    u_max: ClassVar[tuple[float, ...]] = (1.0, 2.0)
+
+    def g(self, x):
+        return (x[1], 1.0), (x[0] * x[1], sin(x[0]))
+
+
+@pytest.mark.parametrize("system", [*map(get_system, SYSTEMS), Steered()], ids=lambda system: system.name)
+def test_sensitivity_is_the_derivative_of_the_flow(system):
+    dt, eps, nx = 0.05, 1e-5, system.nx
     x = np.random.default_rng(0).uniform(*system.box(0.5), (4, nx))
     start = np.concatenate([x, np.tile(np.eye(nx).ravel(), (4, 1))], 1)
-    Phi = simulate(with_sensitivity(system), start, 1, dt)[1][:, nx:].reshape(4, nx, nx)
+    u = np.random.default_rng(1).uniform(-1, 1, (1, 4, system.nu)) * system.u_max
+    Phi = simulate(with_sensitivity(system), start, 1, dt, u=u)[1][:, nx:].reshape(4, nx, nx)
     for j in range(nx):
         step = eps * np.eye(nx)[j]
-        difference = (simulate(system, x + step, 1, dt)[1] - simulate(system, x - step, 1, dt)[1]) / (2 * eps)
+        difference = np.subtract(*(simulate(system, x + one, 1, dt, u=u)[1] for one in (step, -step))) / (2 * eps)
         np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
 
 
 def test_equations_that_take_no_symbols_are_named():
-    with pytest.raises(ValueError, match=r"take symbols, from kkl_gym\.elementary"):
+    with pytest.raises(ValueError, match=r"x held sympy symbols: use kkl_gym\.elementary\.sin"):
         jacobian(lambda x: (np.sin(x[0]),), 2)

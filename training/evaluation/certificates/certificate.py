@@ -20,6 +20,7 @@ from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschit
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ def certify(
     delta: float = 0.05,
     seed: int = 0,
     name: str = "",
+    policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
@@ -128,7 +130,7 @@ def certify(
     artifact : Artifact
         The observer.
     system : System
-        What it was made for, without input.
+        What it was made for, without input unless there is a policy.
     measurement_noise : float, default 0.5
         Standard deviation of v; the theorems are about the same noise, cut at three of these.
     process_noise : float, optional
@@ -145,8 +147,10 @@ def certify(
         Of everything random.
     name : str, optional
         Of the observer, for the report.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one, see :func:`record_settled`.
     recorded : SettledTrajectories, optional
-        What :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+        What :func:`record_settled` returned for the same of all these, if it is there already.
 
     Returns
     -------
@@ -173,7 +177,7 @@ def certify(
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
     noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
     if recorded is None:
-        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
+        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)

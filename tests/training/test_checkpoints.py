@@ -1,0 +1,128 @@
+"""Checkpoints: damage is noticed, and nothing in them runs."""
+
+import errno
+import os
+import pickle
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from training import checkpoints
+
+STATE = {
+    "module": {"weight": torch.arange(600.0).reshape(20, 30), "bias": torch.ones(20, dtype=torch.float64)},
+    "step": 7,
+    "history": [(100, 0.5), (200, 0.25)],
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    found = tmp_path / "inverse.checkpoint.pt"
+    checkpoints.save(found, STATE, fingerprint="mine")
+    return found
+
+
+def same(found):
+    return (
+        found.keys() == STATE.keys()
+        and all(torch.equal(found["module"][name], tensor) for name, tensor in STATE["module"].items())
+        and (found["step"], [tuple(pair) for pair in found["history"]]) == (STATE["step"], STATE["history"])
+    )
+
+
+def test_what_is_saved_is_loaded(path):
+    assert same(checkpoints.load(path, fingerprint="mine"))
+    assert same(checkpoints.load(path))
+    with pytest.raises(ValueError, match="belongs to another configuration"):
+        checkpoints.load(path, fingerprint="other")
+
+
+def damaged(path):
+    """A single line that names the file."""
+    return pytest.raises(
+        ValueError, match=rf"\Athe checkpoint {re.escape(str(path))} is damaged or of an older.*: .+\Z"
+    )
+
+
+def test_a_flipped_bit_is_noticed_or_changes_nothing(path):
+    """The format has checksums of its parts; what lies between them says nothing."""
+    whole, rng, said = path.read_bytes(), np.random.default_rng(0), []
+    with zipfile.ZipFile(path) as file:
+        (weights,) = (part for part in file.infolist() if part.file_size == 2400)
+    begin = whole.index(np.arange(600.0, dtype=np.float32).tobytes())
+    places = [*rng.integers(8 * len(whole), size=300), *rng.integers(8 * begin, 8 * (begin + weights.file_size), 100)]
+    for i, place in enumerate(places):
+        flipped = bytearray(whole)
+        flipped[place // 8] ^= 1 << place % 8
+        path.write_bytes(flipped)
+        try:
+            assert same(checkpoints.load(path, fingerprint="mine"))
+            assert i < 300
+        except ValueError as error:
+            said.append(str(error))
+    assert len(said) > 200
+    assert all(str(path) in message and "\n" not in message for message in said)
+
+
+def test_truncated_and_empty_files(path):
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 97):
+        path.write_bytes(whole[:length])
+        with damaged(path):
+            checkpoints.load(path)
+
+
+@pytest.mark.parametrize("content", [{}, [1, 2], "text", torch.zeros(2), {"fingerprint": "mine", 1: object}])
+def test_files_of_torch_that_hold_something_else(path, content):
+    torch.save(content, path)
+    with damaged(path):
+        checkpoints.load(path)
+
+
+class Evil:
+    def __reduce__(self):
+        return Path.touch, (Path("ran"),)
+
+
+def test_nothing_in_a_checkpoint_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"fingerprint": "mine", "module": Evil()}, path)
+    with damaged(path):
+        checkpoints.load(path)
+    path.write_bytes(pickle.dumps(Evil()))
+    with damaged(path):
+        checkpoints.load(path)
+    assert not Path("ran").exists()
+
+
+def test_checkpoints_that_one_may_not_read(path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} cannot be read: Permission denied"):
+        checkpoints.load(path)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(path, monkeypatch):
+    before = path.read_bytes()
+
+    def full(self, content):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=re.escape(f"No space left on device: '{path}'")):
+        checkpoints.save(path, STATE, fingerprint="mine")
+    assert path.read_bytes() == before
+    assert os.listdir(path.parent) == [path.name]
+
+
+@pytest.mark.parametrize("raised", [KeyError("step"), RuntimeError("size mismatch\n\tof weights"), TypeError("None")])
+def test_states_that_do_not_fit(path, raised):
+    with damaged(path), checkpoints.restoring(path):
+        raise raised

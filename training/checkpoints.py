@@ -1,0 +1,100 @@
+"""Checkpoints: tensors and plain values in torch's own format, of which loading runs nothing and damage is noticed."""
+
+import io
+import pickle
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from observers.storage import replacing
+
+SECONDS = 20.0  # between two checkpoints, at least
+SUFFIX = ".checkpoint.pt"
+
+
+def save(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
+    """Write a checkpoint, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its name ends in ``SUFFIX``.
+    state : mapping of str to object
+        Tensors, plain values, and lists and dictionaries of them.
+    fingerprint : str
+        What identifies the training that it belongs to.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written.
+    """
+    content = io.BytesIO()  # torch itself says of a full disk that it is "unexpected pos"
+    torch.save({**state, "fingerprint": fingerprint}, content)
+    with replacing(path) as temporary:
+        temporary.write_bytes(content.getbuffer())
+
+
+def load(path: Path, *, fingerprint: str | None = None) -> dict[str, Any]:
+    """Read a checkpoint.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    fingerprint : str, optional
+        What identifies the training that is to go on; by default any will do.
+
+    Returns
+    -------
+    dict
+        The state that was saved, its tensors on the CPU.
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, is damaged, or belongs to another training.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"the checkpoint {path} cannot be read: {error.strerror}") from error
+    with restoring(path):
+        try:
+            with zipfile.ZipFile(io.BytesIO(content)) as file:
+                if part := file.testzip():  # torch writes the checksums of its parts, and does not look at them
+                    raise ValueError(f"the checksum of {part} is wrong")
+            found = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+            belongs_to = found.pop("fingerprint")
+        except (pickle.UnpicklingError, zipfile.BadZipFile, EOFError, AttributeError, NotImplementedError) as error:
+            raise ValueError(str(error)) from error
+    if fingerprint not in (None, belongs_to):
+        raise ValueError(f"the checkpoint {path} belongs to another configuration; train into another folder")
+    return dict(found)
+
+
+@contextmanager
+def restoring(path: Path) -> Iterator[None]:
+    """Turn what goes wrong while a checkpoint's state is taken up into an error that names the file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    ValueError
+        If the body raises what contents that are missing or of a wrong type lead to.
+    """
+    try:
+        yield
+    except (ValueError, KeyError, RuntimeError, TypeError, IndexError, AttributeError) as error:
+        line = (str(error) if not isinstance(error, KeyError) else f"it lacks {error}").partition("\n")[0]
+        raise ValueError(
+            f"the checkpoint {path} is damaged or of an older version, remove it to train that stage anew: {line}"
+        ) from error
