@@ -174,7 +174,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
@@ -226,6 +226,9 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             left -= h
     except ArithmeticError:
         return end
+    except Exception as error:
+        blame(error, system, x, u)
+        raise
     raise SubstepsError(
         f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
         f"are not enough for dt = {dt:g} s, of which {left:.2g} s are left; take a smaller dt, tighten the bounds, or "
@@ -266,7 +269,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -20,6 +21,7 @@ LARGEST = 1.0  # for maps that are not told the noise
 WINDOW, WARM_UP = 0.5, 5.0  # seconds at the pace of the shipped systems
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
+PARTS = 1 + len(LEVELS)  # of the work: simulating, and each level
 
 
 def calibrate(
@@ -31,6 +33,7 @@ def calibrate(
     false_alarms: float = 0.01,
     seed: int = 0,
     policy: Controller | None = None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Artifact:
     """Find limits for an observer's monitor.
 
@@ -55,6 +58,8 @@ def calibrate(
     policy : callable, optional
         Acts on the system, for maps that were trained under one; half of the trajectories then are its own, and in the
         others it explores.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -84,7 +89,10 @@ def calibrate(
     x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng, policy=policy)
     largest = artifact.inverse.measurement_noise_max
     levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
-    rows = [_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng) for level in levels]
+    rows = []
+    for done, level in enumerate(levels, 1):
+        report(done)
+        rows.append(_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng))
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
         artifact, limits=Limits(levels, mean, low, high, window, warm_up, false_alarms, duration)

@@ -1,5 +1,6 @@
 """Faulty sensors, and how soon an observer's monitor notices them."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
@@ -15,6 +16,7 @@ from training.trajectories.controllers import Controller
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
+PARTS = 1 + len(FAULTS)  # of the work: simulating, and each fault
 
 
 def deadline(system: System, duration: float) -> float:
@@ -31,6 +33,7 @@ def simulate_faults(
     measurement_noise: float,
     seed: int,
     policy: Controller | None = None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -50,6 +53,8 @@ def simulate_faults(
         Seed of starts, inputs and noise.
     policy : callable, optional
         Acts on the system, as for :func:`training.evaluation.calibration.calibrate`.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -78,7 +83,8 @@ def simulate_faults(
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
-    for fault in FAULTS:
+    for done, fault in enumerate(FAULTS, 1):
+        report(done)
         seen = y.copy()
         if fault == "bias":
             seen[at:] += BIAS * width
