@@ -3,6 +3,7 @@
 import gymnasium as gym
 
 from kkl_gym.envs import KKLEnv
+from kkl_gym.equation_errors import EquationError
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
@@ -27,6 +28,7 @@ __all__ = [
     "ENV_IDS",
     "SYSTEMS",
     "ActionRepeat",
+    "EquationError",
     "KKLEnv",
     "KKLObservation",
     "KKLVectorEnv",

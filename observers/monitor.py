@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from observers.checks import is_finite
+from observers.checks import check_dt, is_finite, noise_level, real_array, shown
+
+_LARGEST = 1e30  # of limits and levels; their squares are within the range of floats
 
 
 @dataclass(frozen=True)
@@ -48,18 +50,21 @@ class Limits:
     duration: float
 
     def __post_init__(self) -> None:
-        k = len(self.levels)
+        for name in ("levels", "mean", "low", "high"):
+            object.__setattr__(self, name, real_array(f"the limits' {name}", getattr(self, name)))
+        k = self.levels.size
         if self.levels.ndim != 1 or k < 1 or self.levels[0] != 0 or not (np.diff(self.levels) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not self.mean.shape == self.low.shape == self.high.shape == (k, *self.mean.shape[1:]) or self.mean.ndim != 2:
             raise ValueError(f"limits must be (levels, ny), got {self.mean.shape}, {self.low.shape}, {self.high.shape}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
-        if not all(np.isfinite(limit).all() for limit in (self.levels, self.mean, self.high)):
-            raise ValueError("limits and their levels must be finite")
+        if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
+            raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
             if not is_finite(getattr(self, name)):
-                raise ValueError(f"the limits' {name} must be a finite number, got {getattr(self, name)!r}")
+                raise ValueError(f"the limits' {name} must be a finite number, got {shown(getattr(self, name))}")
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not (self.window > 0 and 0 <= self.warm_up < self.duration and 0 < self.false_alarms < 1):
             raise ValueError(
                 "limits need window > 0, 0 <= warm_up < duration and 0 < false_alarms < 1, got "
@@ -82,8 +87,9 @@ class Limits:
         Raises
         ------
         ValueError
-            If the level is beyond the last one.
+            If the level is no number, negative or beyond the last one.
         """
+        level = noise_level("the noise level", level)
         if level > self.levels[-1]:
             raise ValueError(f"no limits beyond noise {self.levels[-1]:g}, got {level:g}: calibrate for it")
 
@@ -111,13 +117,16 @@ class Monitor:
     Raises
     ------
     ValueError
-        If there are no limits for the level.
+        If there are no limits for the level, or dt is not positive and finite.
     """
 
     def __init__(self, limits: Limits, level: float, dt: float) -> None:
+        if not isinstance(limits, Limits):
+            raise ValueError(f"limits must be observers.Limits, got {shown(limits)}")
+        level, dt = noise_level("the noise level", level), check_dt(dt)
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
-        self._silent = round(limits.warm_up / dt)
+        self._silent = np.round(limits.warm_up / dt)
         self._sound = np.maximum(level**2, self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:

@@ -1,7 +1,7 @@
 """What measurement noise becomes in the filter, in closed form."""
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+import scipy
 
 from observers import LinearFilter
 
@@ -49,7 +49,7 @@ def stationary_covariance(linear: LinearFilter) -> np.ndarray:
     """Limit of :func:`noise_covariance` at great ages, (size, size)."""
     phi, late = linear.transition, linear.late_y
     drive = phi @ late + linear.early_y
-    return np.asarray(solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
+    return np.asarray(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
 
 
 def root(covariance: np.ndarray) -> np.ndarray:

@@ -117,7 +117,7 @@ def learn(
         folder=folder,
         checkpoint=checkpoint,
         progress=progress,
-        description=f"{task.system} {information}",
+        description=f"{get_system(task.system).name} {information}",
     )
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     agent = Agent(
@@ -179,7 +179,7 @@ def learn_recurrent(
         seed=seed,
         folder=folder,
         progress=progress,
-        description=f"{task.system} recurrent {of}",
+        description=f"{get_system(task.system).name} recurrent {of}",
     )
 
     def policy() -> Policy:

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
+import scipy
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import bootstrap
 
 from kkl_gym import SYSTEMS, System, get_system
 from training.agents.agent import Agent, AgentError
@@ -20,6 +19,8 @@ from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
+from training.commands.options import NoiseLevel
+from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import progress_bars
 from training.seeds import agent_evaluation_seed
@@ -39,9 +40,7 @@ class Train:
     """What the agent knows: docs/agents.md explains each."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
-    measurement_noise: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the task's, 0.5)")
-    ] = None
+    measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
     timesteps: Annotated[
         int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
@@ -83,7 +82,9 @@ class Train:
         FileExistsError
             If the folder holds an agent or a checkpoint already, and nothing is to be resumed.
         """
-        from training.agents.learn import learn  # stable-baselines3 takes seconds to import
+        import torch  # which takes seconds to import, as stable-baselines3 does
+
+        from training.agents.learn import learn
 
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name
@@ -153,7 +154,7 @@ class Evaluate:
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
         episodes = show(console, agent, self.episodes, self.seed, trusted=self.system)
         system = get_system(task.system).name
-        name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.seed}"
+        name = f"{system}-{agent.information}-{as_name(task.measurement_noise)}-{agent.seed}"
         draw(task, episodes, self.out / f"{name}.png")
         animate(task, episodes, self.out / f"{name}.gif")
         console.print(f"wrote {name}.png and {name}.gif in {self.out}")
@@ -210,7 +211,7 @@ def show(console: Console, agent: Agent, n: int, seed: int = 0, *, trusted: str 
     for label, value in (
         ("system", str(task.system)),
         ("information", agent.information),
-        ("measurement noise", f"{task.measurement_noise:g}"),
+        ("measurement noise", show_level(task.measurement_noise)),
         ("episodes", str(n)),
         ("score", "{:.3f} [{:.3f}, {:.3f}]".format(*interval(score))),
         (f"holds the target within {task.tolerance:g}", "{:.0f} % [{:.0f}, {:.0f}]".format(*interval(100.0 * success))),
@@ -237,7 +238,7 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, np.nan, np.nan
-    ends = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return mean, float(ends.low), float(ends.high)
 
 

@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -15,12 +15,12 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnSystem, read_observers
-from training.evaluation.certificates.certificate import Certificate, certify
-from training.evaluation.certificates.forward import AGES, QUANTILES
-from training.evaluation.certificates.gains import noise_variance
-from training.evaluation.certificates.settled import SettledTrajectories, record_settled
-from training.evaluation.report import draw_residual
+from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
+from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    from training.evaluation.certificates.certificate import Certificate
+    from training.evaluation.certificates.settled import SettledTrajectories
 
 SHOWN = 30_000  # states in the figure
 
@@ -36,6 +36,7 @@ class Certify:
     observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
+    policy: OwnPolicy = None
     measurement_noise: float = 0.5
     """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
     process_noise: Annotated[
@@ -55,7 +56,7 @@ class Certify:
     out: Path = Path("runs/certificates")
     """Folder for what is written."""
 
-    def run(self, console: Console) -> list[Certificate]:
+    def run(self, console: Console) -> "list[Certificate]":
         """Certify.
 
         Parameters
@@ -73,15 +74,20 @@ class Certify:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        from training.evaluation.certificates.certificate import certify, parts  # torch takes seconds to import
+        from training.evaluation.certificates.settled import record_settled
+
         names = [Path(given).stem if given.endswith(".safetensors") else given for given in self.observers]
         if len(set(names)) < len(names):
             raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
         found = []
-        for name, (_, artifact, system) in zip(names, read_observers(self.observers, self.system), strict=True):
-            with console.status(f"certifying {name}"):
+        observers = read_observers(self.observers, self.system)
+        for name, (_, artifact, system) in zip(names, observers, strict=True):
+            with progress_bars(console) as progress, progress.phase(f"certifying {name}", parts(artifact)) as report:
                 process_noise = system.process_noise if self.process_noise is None else self.process_noise
                 KKLObserver(artifact, self.measurement_noise, process_noise=process_noise)  # refuses bad levels now
                 levels = (self.measurement_noise, process_noise)
+                policy = read_policy(artifact, system, self.policy)
                 motion = record_settled(
                     artifact,
                     system,
@@ -89,6 +95,7 @@ class Certify:
                     process_noise=process_noise,
                     trajectories=self.trajectories,
                     seed=self.seed,
+                    policy=policy,
                 )
                 certificate = certify(
                     artifact,
@@ -101,6 +108,7 @@ class Certify:
                     seed=self.seed,
                     name=name,
                     recorded=motion,
+                    report=report,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
                 draw(self.out / f"{name}.png", artifact, system, name=name, levels=levels, motion=motion)
@@ -111,7 +119,7 @@ class Certify:
         return found
 
 
-def lines(found: Certificate) -> list[dict[str, str]]:
+def lines(found: "Certificate") -> list[dict[str, str]]:
     """What a certificate says, in sections: label to value.
 
     Parameters
@@ -124,6 +132,8 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     list of dict
         The sections, with the same labels for all observers.
     """
+    from training.evaluation.certificates.forward import AGES, QUANTILES
+
     forward = found.forward
 
     def number(value: float | None) -> str:
@@ -195,7 +205,7 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     ]
 
 
-def table(found: Sequence[Certificate]) -> Table:
+def table(found: "Sequence[Certificate]") -> Table:
     """Certificates side by side, one row for each label."""
     out = Table("", *(certificate.observer for certificate in found))
     for sections in zip(*map(lines, found), strict=True):
@@ -205,7 +215,7 @@ def table(found: Sequence[Certificate]) -> Table:
     return out
 
 
-def page(found: Sequence[Certificate]) -> str:
+def page(found: "Sequence[Certificate]") -> str:
     """Certificates side by side in Markdown, with the noise that they were made for."""
     rows = [
         [label, *(section[label] for section in sections)]
@@ -227,7 +237,7 @@ def draw(
     *,
     name: str,
     levels: tuple[float, float],
-    motion: SettledTrajectories,
+    motion: "SettledTrajectories",
 ) -> None:
     """Draw the PDE's residual over X, and along the motion the error that noise will make.
 
@@ -248,6 +258,9 @@ def draw(
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
+
+    from training.evaluation.certificates.gains import noise_variance
+    from training.evaluation.report import draw_residual
 
     panels = 1 + (artifact.forward is not None)
     figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")

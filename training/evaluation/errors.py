@@ -1,16 +1,20 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.evaluation.metrics import smape
+from observers.checks import noise_levels
+from training.evaluation.levels import Level
+from training.evaluation.metrics import nrmse, smape
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
@@ -26,20 +30,23 @@ class NoStartsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
+    """Errors in percent of each trajectory that stayed within bounds, and how many did not.
 
     Parameters
     ----------
     full : ndarray, shape (n,)
-        Over all steps (the paper's).
+        SMAPE over all steps (the paper's).
     late : ndarray, shape (n,)
-        After the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+        SMAPE after the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+    nrmse : ndarray, shape (n, nx)
+        Of each state after the transient, see :func:`training.evaluation.metrics.nrmse`.
     escaped : int
-        Number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+        Number of trajectories that left the system's declared bounds and are not among these.
     """
 
     full: np.ndarray
     late: np.ndarray
+    nrmse: np.ndarray
     escaped: int
 
 
@@ -141,6 +148,7 @@ def unseen_trajectories(
     driven: bool = False,
     stream: Stream = Stream.EVALUATION,
     process_noise: float = 0.0,
+    policy: Controller | None = None,
 ) -> UnseenTrajectories:
     """Simulate test trajectories, whose random numbers training never draws.
 
@@ -159,11 +167,13 @@ def unseen_trajectories(
     domain : {"X", "1.5X", "2X"}
         Where they start, see :func:`starts`.
     driven : bool
-        Whether inputs act: random bounded steps and sines in turn.
+        Whether inputs act: random bounded steps and sines in turn. Under a policy, whether it errs and explores.
     stream : Stream
         Random numbers to draw: those of evaluation or those of validation.
     process_noise : float
         Level of the process noise, in multiples of the system's scale per second.
+    policy : callable, optional
+        Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
 
     Returns
     -------
@@ -186,12 +196,16 @@ def unseen_trajectories(
     x0 = starts(system, domain, n, rng)
     steps = round(duration / dt)
     u = np.zeros((steps, n, system.nu))
-    if driven:
+    if driven and not policy:
         u = random_inputs(system, n, steps, dt=dt, rng=rng, kinds=("steps", "sine"))
     w = None
     if process_noise:
         w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
-    x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
+    if policy:
+        exploring, own = generator(stream, seed, 3), np.full(n, not driven)
+        x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w)
+    else:
+        x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
     return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
 
@@ -201,7 +215,7 @@ def errors(
     system: System,
     trajectories: UnseenTrajectories,
     *,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int,
     skip: float | None = None,
 ) -> Errors:
@@ -215,8 +229,8 @@ def errors(
         What it was made for.
     trajectories : UnseenTrajectories
         What it is to follow.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of the measurement noise.
     skip : float, optional
@@ -226,10 +240,16 @@ def errors(
     -------
     Errors
         One for each trajectory.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or beyond the map's range.
     """
+    level: Any = noise_levels("measurement_noise", measurement_noise, system.ny)
+    observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
     rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(system, trajectories.x, measurement_noise=measurement_noise, rng=rng)
-    observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
-    x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
+    y = noisy_output(system, trajectories.x, measurement_noise=level, rng=rng)
+    x, x_hat = trajectories.x, observer.estimate(y, trajectories.u if artifact.nu else None)
     first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
-    return Errors(smape(trajectories.x, x_hat), smape(trajectories.x, x_hat, first), trajectories.escaped)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)

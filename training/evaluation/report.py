@@ -12,14 +12,17 @@ from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.maps.smooth import residual
 from training.pipeline import Result
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import noisy_output
 
 
-def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
+def write_report(
+    path: Path, result: Result, system: System, *, policy: Controller | None = None, seed: int = 1_000_000
+) -> None:
     """Draw the errors in training, the PDE residual over the domain, and estimates against the truth.
 
     Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
-    unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
+    unseen, without process noise and input but a policy's, and not those that ``kkl-gym evaluate`` takes.
 
     Parameters
     ----------
@@ -29,6 +32,8 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
         What the training made.
     system : System
         What it was made for.
+    policy : callable, optional
+        Acts on the system, with errors and exploration.
     seed : int
         Seed of the trajectories and their noise.
     """
@@ -36,7 +41,9 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
 
     artifact = result.artifact
     seconds = min(20.0 * system.pace, artifact.training["duration"])
-    trajectories = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
+    trajectories = unseen_trajectories(
+        system, artifact.filter.dt, n=20, duration=seconds, seed=seed, driven=policy is not None, policy=policy
+    )
     figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
@@ -51,12 +58,13 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
         draw_residual(right, artifact, system)
 
     x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
+    u = trajectories.u[:, :1] if policy else None
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
     for column, noise in enumerate((0.0, 0.5)):
         level = min(noise, artifact.inverse.measurement_noise_max)
         y = noisy_output(system, x, measurement_noise=level, rng=rng)
-        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
+        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y, u)
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])
             ax.plot(t, x[..., i], "k", lw=1.2, label="true")

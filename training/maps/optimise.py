@@ -120,8 +120,11 @@ def optimise(
     def seconds() -> float:
         return spent + time.process_time() - began
 
+    def part(step: int) -> float:
+        return max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
+
     def rate(step: int) -> float:
-        done = max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
+        done = part(step)
         return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
 
     task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
@@ -145,7 +148,8 @@ def optimise(
             if log is not None:
                 for name, value in terms.items():
                     log(f"{stage.name}/{name}", float(value.detach()), step + 1)
-            progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
+            total_steps = round((step + 1) / part(step + 1))  # that there will be by the time the clock ends it
+            progress.update(task, completed=step + 1, total=total_steps, description=f"{stage.name} (error {mean:.3g})")
             if time.monotonic() - saved_at > checkpoints.SECONDS or last:
                 course.step, course.seconds = step + 1, seconds()
                 _save(stage, parts, generator, course)

@@ -1,6 +1,7 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,6 +21,9 @@ from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschit
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
+
+WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,9 @@ def certify(
     delta: float = 0.05,
     seed: int = 0,
     name: str = "",
+    policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
@@ -128,7 +134,7 @@ def certify(
     artifact : Artifact
         The observer.
     system : System
-        What it was made for, without input.
+        What it was made for, without input unless there is a policy.
     measurement_noise : float, default 0.5
         Standard deviation of v; the theorems are about the same noise, cut at three of these.
     process_noise : float, optional
@@ -145,8 +151,12 @@ def certify(
         Of everything random.
     name : str, optional
         Of the observer, for the report.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one, see :func:`record_settled`.
     recorded : SettledTrajectories, optional
-        What :func:`record_settled` returned for the same observer, system, noise and seed, if it is there already.
+        What :func:`record_settled` returned for the same of all these, if it is there already.
+    report : callable, optional
+        Told how many of the :func:`parts` of the work are done.
 
     Returns
     -------
@@ -173,11 +183,14 @@ def certify(
     KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
     noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
     if recorded is None:
-        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed)
+        recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
+    report(1)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)
+    report(2)
     upper = lipschitz_upper(told)
+    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
         free = told  # a map that is not told the noise is bounded once
@@ -230,8 +243,14 @@ def certify(
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
+            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
+
+
+def parts(artifact: Artifact) -> int:
+    """Number of parts, of about the same length, that the work of :func:`certify` has."""
+    return WITHOUT_T if artifact.forward is None else WITH_T
 
 
 def _plain(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """What a learned T allows to say: its risks, its residual, what stands in the way of T_inv, and the paper's bounds."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,6 +125,7 @@ def certify_forward(
     error: float,
     delta: float,
     rng: np.random.Generator,
+    report: Callable[[float], object] = lambda share: None,
 ) -> Forward | None:
     """Say what a learned T allows to say.
 
@@ -148,6 +149,8 @@ def certify_forward(
         Probability with which the generalisation term may fail.
     rng : Generator
         Of the states drawn in X.
+    report : callable, optional
+        Told the share of the work that is done.
 
     Returns
     -------
@@ -167,15 +170,20 @@ def certify_forward(
     dimension, samples = pseudo_dimension_bound(artifact.forward.mlp), forward_samples(artifact.training)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
 
+    same = told.T_inv is noise_free.T_inv
+
     def sharp(used: Inverse) -> tuple[float, float, float, float]:
+        first = 0.0 if used is noise_free else 0.5
         some = np.linspace(0, len(z) - 1, min(SEGMENTS, len(z))).astype(int)
-        between = np.minimum(segment_lipschitz(used.T_inv, images[some], z[some]), used.lipschitz)
+        found = segment_lipschitz(
+            used.T_inv, images[some], z[some], lambda share: report(first + share / (1 if same else 2))
+        )
+        between = np.minimum(found, used.lipschitz)
         reconstruction = float(squared(recorded.x - used.T_inv(images)).mean())
         steep = float((between**2 * data_losses[some]).mean())
         return reconstruction, float(between.max()), steep, (math.sqrt(reconstruction) + math.sqrt(steep)) ** 2
 
     reconstruction_risk, lipschitz_between, steep_risk, sharp_bound = sharp(noise_free)
-    same = told.T_inv is noise_free.T_inv
     told_reconstruction, _, _, told_sharp = (reconstruction_risk, 0.0, 0.0, sharp_bound) if same else sharp(told)
     forward_part = 2 * noise_free.lipschitz**2 * physics_risk
     total = 2 * reconstruction_risk + forward_part
