@@ -307,10 +307,14 @@ class _Bar(BaseCallback):
 
     def __init__(self, progress: Progress | None, name: str, total: int) -> None:
         super().__init__()
-        self._progress = progress
-        self._bar = None if progress is None else progress.add_task(name, total=total)
+        self._progress, self._name, self._total = progress, name, total
+
+    def _on_training_start(self) -> None:
+        if self._progress is not None:
+            done = self.model.num_timesteps  # more than none where a training goes on
+            self._bar = self._progress.add_task(self._name, total=self._total, completed=done)
 
     def _on_step(self) -> bool:
-        if self._progress is not None and self._bar is not None:
-            self._progress.update(self._bar, completed=self.num_timesteps)
+        if self._progress is not None:  # the last rollout ends past the last step
+            self._progress.update(self._bar, completed=min(self.num_timesteps, self._total))
         return True

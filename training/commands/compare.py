@@ -62,9 +62,7 @@ class Compare:
     """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
     episodes: int = 100
     """Number of episodes that each agent is played on."""
-    timesteps: Annotated[
-        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
-    ] = None
+    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
     """Actions to learn from, in all environments together."""
     more_noise: bool = True
     """Compare also at noise 0.2 on Van der Pol and at noise 2 on Lorenz."""

@@ -1,6 +1,8 @@
 """``kkl-gym evaluate``."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,7 +13,6 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.checks import noise_levels
 from observers.storage import write
 from training.commands.options import (
     Duration,
@@ -22,8 +23,16 @@ from training.commands.options import (
     read_observers,
     read_policy,
 )
-from training.evaluation.errors import Domain, NoStartsError, UnseenTrajectories, errors, unseen_trajectories
-from training.evaluation.levels import Level, as_cell, beyond, own_level, show_level
+from training.evaluation.errors import (
+    Domain,
+    Errors,
+    NoStartsError,
+    UnseenTrajectories,
+    errors,
+    kalman_errors,
+    unseen_trajectories,
+)
+from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.controllers import Controller
@@ -65,6 +74,8 @@ class Evaluate:
     """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
     """Seed of the trajectories and the noise; no seed gives any that training draws."""
+    ekf: bool = False
+    """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
@@ -116,6 +127,10 @@ class Evaluate:
             for measure in measures:
                 table.add_column(measure, justify="right")
         frames = []
+        shown = Path(name).stem if self.ekf else name
+        everyone: dict[str, Callable[..., Errors]] = {shown: partial(errors, artifact, system)}
+        if self.ekf:
+            everyone["exact EKF"] = lambda runs, **how: kalman_errors(system, runs, artifact.filter.dt, **how)
         policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
         cases = CASES[: 3 if artifact.nu else 2] if levels else ()
@@ -129,27 +144,28 @@ class Evaluate:
             progress.advance(bar)
             skip = min(SKIPPED * system.pace, duration / 2) if driven else None
             for level in levels:
-                found = errors(artifact, system, trajectories, measurement_noise=level, seed=self.seed, skip=skip)
-                case = [starts, *(["yes" if driven else "no"] if artifact.nu else [])]
-                case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
-                smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
-                nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
-                columns: dict[str, Any] = {
-                    "observer": name,
-                    "starts": starts,
-                    "driven": driven,
-                    "process_noise": self.process_noise,
-                    "measurement_noise": as_cell(level),
-                    "trajectory": np.arange(len(found.full)),
-                    "smape": found.full,
-                    "smape_late": found.late,
-                }
-                frames.append(pd.DataFrame(columns | by_state(found.nrmse)))
+                for who, measure_errors in everyone.items():
+                    found = measure_errors(trajectories, measurement_noise=level, seed=self.seed, skip=skip)
+                    case = [*([who] if self.ekf else []), starts, *(["yes" if driven else "no"] if artifact.nu else [])]
+                    case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
+                    smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
+                    nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
+                    columns: dict[str, Any] = {
+                        "observer": who,
+                        "starts": starts,
+                        "driven": driven,
+                        "process_noise": self.process_noise,
+                        "measurement_noise": as_cell(level),
+                        "trajectory": np.arange(len(found.full)),
+                        "smape": found.full,
+                        "smape_late": found.late,
+                    }
+                    frames.append(pd.DataFrame(columns | by_state(found.nrmse)))
                 progress.advance(bar)
         if frames:
             progress.console.print(smape, nrmse)
         for reason in left_out:
-            progress.console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
+            progress.say(f"{name}, left out: {reason}")
         return frames
 
     def _trajectories(
@@ -184,8 +200,8 @@ class Evaluate:
     def _levels(self, artifact: Artifact, system: System) -> tuple[list[Level], list[str]]:
         """Levels of measurement noise that a map can be told, and what is to be said of the others."""
         if self.measurement_noise is None:
-            return list(dict.fromkeys([0.0, own_level(artifact, system)])), []
-        levels = [noise_levels("measurement_noise", level, system.ny) for level in self.measurement_noise]
+            return list(dict.fromkeys([0.0, level_for(artifact, system)])), []
+        levels = [level_for(artifact, system, level) for level in self.measurement_noise]
         reasons = [beyond(artifact, level) for level in levels]
         inside = [level for level, reason in zip(levels, reasons, strict=True) if not reason]
         return inside, [reason for reason in reasons if reason]
@@ -193,6 +209,8 @@ class Evaluate:
     def _table(self, title: str, artifact: Artifact) -> Table:
         """A table with the columns that say of what a row is."""
         table = Table(title=title)
+        if self.ekf:
+            table.add_column("observer")
         table.add_column("starts")
         if artifact.nu:
             table.add_column("driven")

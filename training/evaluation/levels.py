@@ -72,8 +72,8 @@ def multiple(system: System, factor: float) -> Level:
     return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
 
 
-def own_level(artifact: Artifact, system: System) -> Level:
-    """Return the system's own level of measurement noise, as far as a map was trained for it.
+def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
+    """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
 
     Parameters
     ----------
@@ -81,14 +81,21 @@ def own_level(artifact: Artifact, system: System) -> Level:
         The observer.
     system : System
         What it was made for.
+    given : float or sequence of float, length ny, optional
+        What is asked for.
 
     Returns
     -------
     float or tuple of float, length ny
-        The level.
+        The level; a float if it is the same for all outputs.
+
+    Raises
+    ------
+    ValueError
+        If what is given is no level, or not one for each output.
     """
-    cut = np.minimum(system.measurement_noise, _largest(artifact))
-    return noise_levels("measurement_noise", cut, system.ny)
+    level = np.minimum(system.measurement_noise, _largest(artifact)) if given is None else given
+    return noise_levels("measurement_noise", level, system.ny)
 
 
 def beyond(artifact: Artifact, level: Level) -> str:

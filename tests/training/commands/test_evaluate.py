@@ -45,6 +45,12 @@ def test_every_column_of_the_printed_tables_holds_one_thing(inputs, process_nois
     assert [row[:-3] for row in smape[1:]] == [row[:-2] for row in nrmse[1:]] == expected
 
 
+def test_an_exact_kalman_filter_stands_beside_the_observer(saved):
+    (smape, nrmse), _ = printed((saved(),), trajectories=2, duration=2.0, ekf=True)
+    assert smape[0][:2] == nrmse[0][:2] == ["observer", "starts"]
+    assert [row[0] for row in smape[1:]] == [row[0] for row in nrmse[1:]] == [Path(saved()).stem, "exact EKF"] * 6
+
+
 def printed(observers, **options):
     """What the command prints: its tables, each a header and rows of cells, and the lines below them."""
     console = Console(width=200, record=True, file=io.StringIO())

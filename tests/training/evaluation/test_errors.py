@@ -12,7 +12,7 @@ from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import starts
+from training.evaluation.errors import kalman_errors, starts
 
 
 def test_starts_outside_lie_outside():
@@ -84,3 +84,16 @@ def test_levels_of_noise_that_are_none(make_artifact):
     for wrong in (-0.1, np.nan, True, "0.5", (0.1, 0.2)):
         with pytest.raises(ValueError, match="measurement_noise"):
             errors(make_artifact(), VanDerPol(), runs, measurement_noise=wrong, seed=0)
+
+
+def test_an_exact_kalman_filter_follows_the_same_runs():
+    system, dt = Oscillator(), 0.05
+    runs = unseen_trajectories(system, dt, n=20, duration=20.0, seed=0, driven=True)
+    found = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0)
+    assert found.nrmse.shape == (20, 2)
+    assert 0.5 < np.median(found.nrmse) < 10  # noise of some 15 % of the output, averaged
+    assert np.median(found.late) < np.median(found.full)
+    longer = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0, skip=15.0)
+    assert np.median(longer.nrmse) < np.median(found.nrmse)
+    louder = kalman_errors(system, runs, dt, measurement_noise=0.4, seed=0)
+    assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()

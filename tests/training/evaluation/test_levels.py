@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from linear_system import TwoOutputs
 
 from kkl_gym import VanDerPol
-from training.evaluation.levels import beyond, multiple, own_level, read_level, show_level
+from training.evaluation.levels import beyond, level_for, multiple, read_level, show_level
 
 LEVELS = st.integers(0, 999_999).map(lambda n: n / 1000)
 
@@ -34,12 +34,12 @@ def told_up_to(artifact, largest):
 
 def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
     artifact = make_artifact()  # told up to 1
-    assert own_level(artifact, VanDerPol()) == 0.5
-    assert own_level(told_up_to(artifact, 0.1), VanDerPol()) == 0.1
-    assert own_level(make_artifact(noise=False), VanDerPol()) == 0.5
-    assert own_level(artifact, TwoOutputs()) == (0.1, 0.3)
-    assert own_level(told_up_to(artifact, 0.2), TwoOutputs()) == (0.1, 0.2)
-    assert own_level(told_up_to(artifact, 0.05), TwoOutputs()) == 0.05
+    assert level_for(artifact, VanDerPol()) == 0.5
+    assert level_for(told_up_to(artifact, 0.1), VanDerPol()) == 0.1
+    assert level_for(make_artifact(noise=False), VanDerPol()) == 0.5
+    assert level_for(artifact, TwoOutputs()) == (0.1, 0.3)
+    assert level_for(told_up_to(artifact, 0.2), TwoOutputs()) == (0.1, 0.2)
+    assert level_for(told_up_to(artifact, 0.05), TwoOutputs()) == 0.05
 
 
 def test_multiples_of_the_systems_own_level():
