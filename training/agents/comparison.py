@@ -16,10 +16,11 @@ from observers.storage import write
 from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
-from training.agents.tasks import TASKS, Noise, get_task, noise_text, scores, successes
+from training.agents.tasks import TASKS, get_task, scores, successes
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
+from training.trajectories.noise import Noise, noise_text
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,8 +10,8 @@ from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from observers.storage import replacing
 from training.agents.play import Episodes
-from training.agents.tasks import noise_text
 from training.systems import ControlTask
+from training.trajectories.noise import noise_text
 
 SHOWN = 5  # episodes in a figure
 FRAMES = 150  # of an animation, at most

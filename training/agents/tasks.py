@@ -7,9 +7,7 @@ import numpy as np
 from kkl_gym import get_system
 from kkl_gym.system import System
 from training.systems import PROFILES, ControlTask, profile
-
-Noise = float | tuple[float, ...]
-"""Standard deviation of the noise on each sample of y: of all outputs, or of each."""
+from training.trajectories.noise import Noise
 
 TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.items() if found.task}
 
@@ -41,22 +39,6 @@ def get_task(name: str, measurement_noise: Noise | None = None) -> ControlTask:
         name, system.measurement_noise, period=5 * system.dt, duration=2000 * system.dt, dt=system.dt
     )
     return task if measurement_noise is None else replace(task, measurement_noise=measurement_noise)
-
-
-def noise_text(level: Noise) -> str:
-    """Levels of noise for people and names of files: 0.5, or 0.1-0.02 where each output has its own.
-
-    Parameters
-    ----------
-    level : float or tuple of float
-        Of all outputs, or of each.
-
-    Returns
-    -------
-    str
-        Without spaces.
-    """
-    return "-".join(f"{one:g}" for one in (level if isinstance(level, tuple) else (level,)))
 
 
 def deviation(system: System, x: np.ndarray) -> np.ndarray:

@@ -16,13 +16,14 @@ from kkl_gym import SYSTEMS, System, get_system
 from training.agents.agent import Agent, AgentError
 from training.agents.information import Information
 from training.agents.play import Episodes, play
-from training.agents.tasks import get_task, noise_text, scores, successes
+from training.agents.tasks import get_task, scores, successes
 from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
 from training.commands.options import SystemName
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
+from training.trajectories.noise import noise_text
 
 
 @dataclass(frozen=True)

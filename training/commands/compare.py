@@ -26,9 +26,10 @@ from training.agents.comparison import (
     run_case,
 )
 from training.agents.information import observer_of
-from training.agents.tasks import TASKS, noise_text
+from training.agents.tasks import TASKS
 from training.jobs import run_all
 from training.progress import LOG, progress_bars, under_way
+from training.trajectories.noise import noise_text
 
 if TYPE_CHECKING:
     import pandas as pd
