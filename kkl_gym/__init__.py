@@ -3,7 +3,7 @@
 import gymnasium as gym
 
 from kkl_gym.envs import KKLEnv
-from kkl_gym.equations import EquationError
+from kkl_gym.equation_errors import EquationError
 from kkl_gym.own import OWN_ID
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.equations import components
+from kkl_gym.equations import complex_motion, components
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
 from kkl_gym.simulate import advance, followed
@@ -272,15 +272,18 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _measure(self, v: list[float]) -> list[float]:
         try:
-            return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+            return [float(hi + vi) for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
         except Exception:
             components(self.system.h, self._x)  # says what went wrong
             raise
 
     def _inside(self, x: Any) -> bool:
-        for xi, (low, high) in zip(x, self._bounds):  # noqa: SIM110 - all() takes twice as long
-            if not low <= xi <= high:  # false for NaN too
-                return False
+        try:
+            for xi, (low, high) in zip(x, self._bounds):
+                if not low <= xi <= high:  # false for NaN too
+                    return False
+        except TypeError:  # complex numbers cannot be compared
+            raise complex_motion(self.system, self._x) from None
         return True
 
     def _observation(self) -> np.ndarray:

@@ -6,10 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.simulate import check_dt, check_interval
+from kkl_gym.simulate import check_interval
 from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
-from observers.checks import choice, noise_level, noise_levels, real_array, shown
+from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
 NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 

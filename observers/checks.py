@@ -9,6 +9,7 @@ import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
 _FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
+_NO_NUMBERS = (bool, np.timedelta64)  # though Python takes one for an integer, and NumPy the other
 _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
 
 
@@ -33,9 +34,9 @@ def shown(value: object) -> str:
 
 
 def is_finite(value: object) -> bool:
-    """Whether a value is a real number, not a bool, that is finite as a float."""
+    """Whether a value is a real number, not a bool or an interval of time, that is finite as a float."""
     try:
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, Real) and not isinstance(value, _NO_NUMBERS) and math.isfinite(value)
     except OverflowError:  # an integer beyond every float
         return False
 
@@ -62,9 +63,10 @@ def noise_level(name: str, level: Any) -> float:
     """
     if not is_finite(level) or level < 0:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
+    level = float(level)
     if level > _LARGEST_LEVEL:
-        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {shown(level)}")
-    return float(level)
+        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {level!r}")
+    return level
 
 
 def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
@@ -97,6 +99,29 @@ def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
     return each[0] if len(set(each)) == 1 else each
 
 
+def check_dt(dt: Any) -> float:
+    """Return a sampling interval as a float.
+
+    Parameters
+    ----------
+    dt : float
+        Sampling interval in seconds.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive, finite number.
+    """
+    if not is_finite(dt) or not float(dt) > 0:
+        raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
+    return float(dt)
+
+
 def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
     """Return a whole number as an int.
 
@@ -121,7 +146,7 @@ def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
     ValueError
         If it is no integer, or out of range.
     """
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
     if not whole or value < least or (most is not None and value > most):
         wanted = "a positive integer" if least == 1 else "an integer, not negative"
         if most is not None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from observers.checks import integer, is_finite, real_array, shown
+from observers.checks import check_dt, integer, real_array
 from observers.sparse import MANY_ROWS, SparseUpdate
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
@@ -57,9 +57,7 @@ class LinearFilter:
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
-        if not is_finite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
-        dt, nu = float(dt), integer("nu, the number of inputs", nu, 0, MOST_INPUTS)
+        dt, nu = check_dt(dt), integer("nu, the number of inputs", nu, 0, MOST_INPUTS)
         nz, ny = B.shape
         if not (1 <= nz * (1 + nu) <= MOST_VALUES and 1 <= ny <= MOST_VALUES):
             raise ValueError(

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from observers.checks import is_finite, noise_level, real_array, shown
+from observers.checks import check_dt, is_finite, noise_level, real_array, shown
+
+_LARGEST = 1e30  # of limits and levels; their squares are within the range of floats
 
 
 @dataclass(frozen=True)
@@ -57,11 +59,12 @@ class Limits:
             raise ValueError(f"limits must be (levels, ny), got {self.mean.shape}, {self.low.shape}, {self.high.shape}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
-        if not all(np.isfinite(limit).all() for limit in (self.levels, self.mean, self.high)):
-            raise ValueError("limits and their levels must be finite")
+        if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
+            raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
             if not is_finite(getattr(self, name)):
                 raise ValueError(f"the limits' {name} must be a finite number, got {shown(getattr(self, name))}")
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not (self.window > 0 and 0 <= self.warm_up < self.duration and 0 < self.false_alarms < 1):
             raise ValueError(
                 "limits need window > 0, 0 <= warm_up < duration and 0 < false_alarms < 1, got "
@@ -120,11 +123,10 @@ class Monitor:
     def __init__(self, limits: Limits, level: float, dt: float) -> None:
         if not isinstance(limits, Limits):
             raise ValueError(f"limits must be observers.Limits, got {shown(limits)}")
-        if not is_finite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
+        level, dt = noise_level("the noise level", level), check_dt(dt)
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
-        self._silent = round(limits.warm_up / dt)
+        self._silent = np.round(limits.warm_up / dt)
         self._sound = np.maximum(level**2, self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:

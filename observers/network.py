@@ -66,7 +66,7 @@ class MLP:
             with np.errstate(over="ignore"):  # what is too large is infinite, and refused
                 layers.append((np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32)))
             if not all(np.isfinite(values).all() for values in layers[-1]):
-                raise ValueError("the network holds weights that are not finite")
+                raise ValueError("the network holds weights or biases that are not finite")
             width = len(bias)
         object.__setattr__(self, "_layers", layers)
 

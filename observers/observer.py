@@ -358,7 +358,7 @@ class KKLObserver:
         """
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
-            raise ValueError(f"a record must have shape (steps, ..., {self.artifact.ny}), got {y.shape}")
+            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
         self._check_output(y, y.shape[:-1])
         steps, batch = len(y), y.shape[1:-1]
         if u is not None:

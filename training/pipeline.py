@@ -27,12 +27,13 @@ from training.maps.inverse import InverseProblem
 from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
+from training.maps.pde import check_continuous
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum
-from training.systems import controller, named_policy
+from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
@@ -125,8 +126,10 @@ def train(
     noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}
     identity = {**describe(system), **noise, **dataclasses.asdict(config)}
     # Errors now, not in ten minutes.
+    if config.pipeline == "spinn":
+        check_continuous(system)
     policy = None if config.policy is None else named_policy(system, config.policy)
-    feedback = (policy or controller(system)) if config.closed_loop_trajectories else None
+    feedback = (policy or named_policy(system, "controller")) if config.closed_loop_trajectories else None
     if policy:
         identity["policy_actions"] = policy_fingerprint(policy, system)
     with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:

@@ -10,6 +10,7 @@ import scipy
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.maps.coordinates import settling_time
+from training.maps.pde import check_continuous
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, evenly_spaced
 from training.trajectories.record import recording_ages
@@ -89,9 +90,10 @@ def smoothness(
     Raises
     ------
     ValueError
-        If the system does not say how fast f changes, or motions leave its bounds before any of the filters has
-        forgotten its start.
+        If the system is in discrete time or does not say how fast f changes, or motions leave its bounds before any of
+        the filters has forgotten its start.
     """
+    check_continuous(system)
     spectra, rate = list(spectra), system.typical_rate
     step = max(dt, FINEST / rate)
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]

@@ -1,6 +1,6 @@
 """A linear system on which everything is known in closed form."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -39,9 +39,58 @@ class Autonomous(Oscillator):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ()
 
 
+@dataclass(frozen=True)
+class TwoOutputs(Oscillator):
+    """Both states are measured, with noise of different size."""
+
+    name: ClassVar[str] = "two-outputs"
+    measurement_noise: ClassVar = (0.1, 0.3)
+
+    def h(self, x):
+        return x[0], x[1]
+
+
+@dataclass(frozen=True)
+class Reactor(System):
+    """The oscillator in mixed units: a temperature of 300 K, give or take 20, and 1e-3 mol/l, give or take as much."""
+
+    name: ClassVar[str] = "reactor"
+    state_names: ClassVar = ("T in K", "c in mol/l")
+    X: ClassVar = ((280, 320), (0.0, 2e-3))
+    bounds: ClassVar = ((200, 400), (-1e-2, 1e-2))
+    dt: ClassVar = 0.05
+
+    def f(self, x):
+        return 2e4 * (x[1] - 1e-3), -5e-5 * (x[0] - 300)
+
+    def h(self, x):
+        return (x[0],)
+
+
 def sylvester(A, B):
     """M with T(x) = M x: M F = A M + B C."""
     return solve_sylvester(-A, F, B @ C)
+
+
+REACTOR_OFFSET, REACTOR_SCALE = np.array([300.0, 1e-3]), np.array([20.0, 1e-3])  # of the oscillator's states in it
+
+
+def reactor_observer(dt=0.05, offset=0.0, gain=1.0):
+    """An artifact for the reactor, exact but for an error of the temperature and a factor on the concentration.
+
+    The filter is fed y in K: T(x) = M (x - offset) / scale in units of 20 K, and beside it what 300 K leave.
+    """
+    exact = exact_observer(dt)
+    linear, inverse = exact.filter, exact.inverse
+    z_offset = linear.equilibrium @ REACTOR_OFFSET[:1]
+    inverse = replace(
+        inverse,
+        z_offset=z_offset,
+        whiten=np.eye(3) / REACTOR_SCALE[0],
+        x_offset=np.add(REACTOR_OFFSET, (offset, 0.0)),
+        x_scale=np.multiply(REACTOR_SCALE, (1.0, gain)),
+    )
+    return Artifact(linear, inverse, "reactor", {}, C=C)
 
 
 def exact_observer(dt=0.05):

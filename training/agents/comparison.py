@@ -12,15 +12,15 @@ import scipy
 
 import kkl_gym
 from kkl_gym import get_system
-from observers.storage import write
+from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
+from training.evaluation.levels import Level, as_cell, as_name
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
-from training.trajectories.noise import Noise, noise_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +33,7 @@ MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if fo
 SEEDS = 5
 RECURRENT_SEEDS = 3
 MORE_NOISE_RECURRENT_SEEDS = 1
-Level = TypeVar("Level", bound=Hashable)
+Key = TypeVar("Key", bound=Hashable)  # a level, or how a table shows it
 
 MANY = 1000  # seeds, more than anyone trains
 OTHER = "an agent of another comparison"
@@ -66,7 +66,7 @@ class Case:
     """
 
     system: str
-    measurement_noise: Noise
+    measurement_noise: Level
     information: Compared
     seed: int
     episodes: int
@@ -77,7 +77,7 @@ class Case:
     @property
     def name(self) -> str:
         """For people."""
-        system, noise = get_system(self.system).name, noise_text(self.measurement_noise)
+        system, noise = get_system(self.system).name, as_name(self.measurement_noise)
         return f"{system} at noise {noise}/{self.information}/{self.seed}"
 
     @property
@@ -160,7 +160,7 @@ def _run(case: Case) -> None:
     write(case.folder / "scores.json", json.dumps(result) + "\n")
 
 
-def idle(system: str, measurement_noise: Noise, episodes: int) -> np.ndarray:
+def idle(system: str, measurement_noise: Level, episodes: int) -> np.ndarray:
     """Scores of zero input on the evaluation's episodes.
 
     Parameters
@@ -185,8 +185,8 @@ def idle(system: str, measurement_noise: Noise, episodes: int) -> np.ndarray:
 
 
 def kinds(
-    levels: Mapping[str, Sequence[Level]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
-) -> Iterator[tuple[str, Level, Compared, int]]:
+    levels: Mapping[str, Sequence[Key]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
+) -> Iterator[tuple[str, Key, Compared, int]]:
     """Agents of a comparison, the first seed of each first.
 
     Parameters
@@ -212,7 +212,7 @@ def kinds(
                         yield system, level, what, seed
 
 
-def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[Noise, ...]]:
+def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[Level, ...]]:
     """Levels of measurement noise at which agents are compared on each system.
 
     Parameters
@@ -288,7 +288,7 @@ def planned(
             seed=seed,
             episodes=episodes,
             timesteps=timesteps,
-            folder=out / "jobs" / f"{names[system]}-{noise_text(level)}" / what / str(seed),
+            folder=out / "jobs" / f"{names[system]}-{as_name(level)}" / what / str(seed),
             observer=(observers or {}).get(names[system]),
         )
         for system, level, what, seed in kinds(noise_levels(systems, more_noise), information, seeds)
@@ -332,7 +332,7 @@ def collect(
 
     systems = (*TASKS, *own)
     plan = planned(out, systems=systems, seeds=MANY, episodes=episodes, timesteps=timesteps, observers=observers)
-    idle_scores: dict[tuple[str, Noise], float] = {}
+    idle_scores: dict[tuple[str, Level], float] = {}
     rows = []
     for case in plan:
         if not case.done:
@@ -340,19 +340,20 @@ def collect(
         key = (case.system, case.measurement_noise)
         if key not in idle_scores:
             idle_scores[key] = float(idle(*key, case.episodes).mean())
-        result = json.loads((case.folder / "scores.json").read_text())
-        rows.append(
-            {
-                "system": get_system(case.system).name,
-                "noise": noise_text(key[1]) if isinstance(key[1], tuple) else key[1],
-                "knows": case.information,
-                "seed": case.seed,
-                "score": np.mean(result["scores"]),
-                "success": np.mean(result["successes"]),
-                "idle": idle_scores[key],
-                "seconds": result["seconds"],
-            }
-        )
+        with explained(case.folder / "scores.json", ValueError):
+            result = json.loads((case.folder / "scores.json").read_text())
+            rows.append(
+                {
+                    "system": get_system(case.system).name,
+                    "noise": as_cell(key[1]),
+                    "knows": case.information,
+                    "seed": case.seed,
+                    "score": np.mean(result["scores"]),
+                    "success": np.mean(result["successes"]),
+                    "idle": idle_scores[key],
+                    "seconds": result["seconds"],
+                }
+            )
     return pd.DataFrame(rows)
 
 

@@ -23,9 +23,10 @@ from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
 from observers import MLP
+from observers.storage import naming
 from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
-from training.agents.checkpoint import Checkpoint
+from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
@@ -228,19 +229,20 @@ def _fit(
     )
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
-    model.set_logger(configure(str(folder), ["csv"]))
-    try:
-        if checkpoint is not None:
-            callbacks.append(checkpoint)
-            checkpoint.restore(model, timesteps)
-            if checkpoint.resumed:
-                first = agent_training_seed(seed, checkpoint.resumed, env.num_envs)
-                model.set_random_seed(first)
-        vec_env.seed(first)  # only now: the model has seeded it with ``seed``
-        model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
-    finally:
-        model.logger.close()
-        vec_env.close()
+    with naming(folder / CURVE):  # which alone is written without its name in errors
+        model.set_logger(configure(str(folder), ["csv"]))
+        try:
+            if checkpoint is not None:
+                callbacks.append(checkpoint)
+                checkpoint.restore(model, timesteps)
+                if checkpoint.resumed:
+                    first = agent_training_seed(seed, checkpoint.resumed, env.num_envs)
+                    model.set_random_seed(first)
+            vec_env.seed(first)  # only now: the model has seeded it with ``seed``
+            model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
+        finally:
+            model.logger.close()
+            vec_env.close()
     return model
 
 

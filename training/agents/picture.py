@@ -10,8 +10,8 @@ from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from observers.storage import replacing
 from training.agents.play import Episodes
+from training.evaluation.levels import show_level
 from training.systems import ControlTask
-from training.trajectories.noise import noise_text
 
 SHOWN = 5  # episodes in a figure
 FRAMES = 150  # of an animation, at most
@@ -51,7 +51,7 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
     for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
         axes[i, 0].set_ylabel(name)
     axes[0, 0].legend(loc="upper right", fontsize="x-small")
-    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {noise_text(task.measurement_noise)}")
+    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
 

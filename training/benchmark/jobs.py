@@ -13,8 +13,8 @@ import torch
 
 import kkl_gym
 from kkl_gym.systems import get_system
-from observers.storage import write
-from training.benchmark.protocol import Protocol, measure, step_time, validate
+from observers.storage import explained, write
+from training.benchmark.protocol import Protocol, measure, step_time, tuned_for, validate
 from training.jobs import check_identity, claimed_job, describe
 from training.maps.optimise import seconds_spent
 from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
@@ -82,7 +82,7 @@ class Job:
             "system": describe(system),
             "method": method.name,
             "configurations": method.configurations(system),
-            "tuned_for": method.tuned_for,
+            "tuned_for": tuned_for(method, system),
             "version": kkl_gym.__version__,
             "revision": REVISION,
         }
@@ -177,7 +177,8 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
             except FloatingPointError:  # a training that blows up is no candidate
                 score = FAILED
             write(path, json.dumps({"configuration": dict(configuration), "score": score}) + "\n")
-        scores.append(float(json.loads(path.read_text())["score"]))
+        with explained(path, ValueError):
+            scores.append(float(json.loads(path.read_text())["score"]))
     best = scores.index(min(scores))
     if min(scores) == FAILED:
         return configurations[best], scores
@@ -201,4 +202,6 @@ def _train(job: Job, method: Method[Any], configuration: Configuration, budget: 
         write(timing, f"{seconds_spent(folder):.1f}\n")
         method.save(trained, path)
         shutil.rmtree(folder)
-    return method.load(path), float(timing.read_text())
+    with explained(timing, ValueError):
+        seconds = float(timing.read_text())
+    return method.load(path), seconds

@@ -19,11 +19,11 @@ from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
-from training.commands.options import SystemName
+from training.commands.options import NoiseLevel, SystemName
+from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
-from training.trajectories.noise import noise_text
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,7 @@ class Train:
     """What the agent knows: docs/agents.md explains each."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
-    measurement_noise: Annotated[
-        float | None, tyro.conf.arg(help_behavior_hint="(default: the task's, 0.5 for those that ship)")
-    ] = None
+    measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
     """Actions to learn from, in all environments together."""
@@ -153,7 +151,7 @@ class Evaluate:
         with progress_bars(console) as progress:
             episodes = show(progress, agent, self.episodes, self.seed, trusted=self.system)
             system = get_system(task.system).name
-            name = f"{system}-{agent.information}-{noise_text(task.measurement_noise)}-{agent.seed}"
+            name = f"{system}-{agent.information}-{as_name(task.measurement_noise)}-{agent.seed}"
             with progress.phase("drawing", 2) as report:
                 draw(task, episodes, self.out / f"{name}.png")
                 report(1)
@@ -216,7 +214,7 @@ def show(
     for label, value in (
         ("system", system.name),
         ("information", agent.information),
-        ("measurement noise", noise_text(task.measurement_noise)),
+        ("measurement noise", show_level(task.measurement_noise)),
         ("episodes", str(n)),
         ("score", "{:.3f} [{:.3f}, {:.3f}]".format(*interval(score))),
         (f"holds the target within {task.tolerance:g}", "{:.0f} % [{:.0f}, {:.0f}]".format(*interval(100.0 * success))),

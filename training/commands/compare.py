@@ -27,9 +27,9 @@ from training.agents.comparison import (
 )
 from training.agents.information import observer_of
 from training.agents.tasks import TASKS
+from training.evaluation.levels import as_name
 from training.jobs import run_all
 from training.progress import LOG, progress_bars, under_way
-from training.trajectories.noise import noise_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -160,7 +160,7 @@ def report(out: Path) -> None:
     results = pd.read_csv(out / "results.csv")
     results["noise"] = [_plain(level) for level in results.noise]
     shipped = noise_levels() if set(results.system) & set(TASKS) else {}
-    levels = {name: tuple(map(noise_text, at)) for name, at in shipped.items()}
+    levels = {name: tuple(map(as_name, at)) for name, at in shipped.items()}
     for name, group in results.groupby("system", sort=False):
         if name not in TASKS:
             levels[str(name)] = tuple(group.noise.unique())
@@ -198,9 +198,9 @@ def report(out: Path) -> None:
 
 
 def _plain(level: float | str) -> str:
-    """A level of noise as :func:`noise_text` gives it, from a column in which some are numbers."""
+    """A level of noise as :func:`as_name` gives it, from a column in which some are numbers."""
     try:
-        return noise_text(float(level))
+        return as_name(float(level))
     except ValueError:  # one for each output
         return str(level)
 

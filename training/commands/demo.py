@@ -17,9 +17,9 @@ from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
 from training.commands.options import OneObserver, OneSystem, Shown, shown
+from training.evaluation.levels import show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
-from training.trajectories.noise import noise_text
 
 EVERY = 100  # steps between two reports
 
@@ -127,7 +127,7 @@ class Episode:
     @property
     def measurement_noise(self) -> str:
         """Its level, for people."""
-        return noise_text(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
+        return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
 
 
 def play(

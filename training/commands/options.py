@@ -1,16 +1,18 @@
-"""What several commands ask for: observers by name or file, and the system of one's own that they are for."""
+"""What several commands ask for: observers, the system of one's own that they are for, levels of noise, durations."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
 from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.artifact import resolve
+from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
 
@@ -52,6 +54,30 @@ OwnSystem = Annotated[
         help_behavior_hint="",
     ),
 ]
+# A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
+NoiseLevel = Annotated[
+    Level | None,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="LEVEL",
+        instance_from_str=lambda words: read_level(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda level: [str(level)],
+    ),
+    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: the system's own)"),
+]
+NoiseLevels = Annotated[
+    tuple[Level, ...] | None,
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="LEVEL [LEVEL ...]",
+        instance_from_str=lambda words: tuple(map(read_level, words)),
+        is_instance=lambda value: True,
+        str_from_instance=lambda levels: [str(levels)],
+    ),
+    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: 0 and the system's own)"),
+]
+Duration = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
 OwnPolicy = Annotated[
     str | None,
     tyro.conf.arg(

@@ -2,6 +2,7 @@
 
 import math
 import operator
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import torch
 from rich.progress import Progress
 from torch import nn
 
+from observers.storage import naming
 from training import checkpoints
 from training.config import Optimiser
 
@@ -173,8 +175,14 @@ def log_to(folder: Path) -> Iterator[Log | None]:
     except ImportError:
         yield None
         return
-    with SummaryWriter(folder) as writer:
-        yield writer.add_scalar
+    hook = threading.excepthook
+    # The thread that writes tells its errors to whoever calls next: it need not print them as well.
+    threading.excepthook = lambda failed: None if isinstance(failed.exc_value, OSError) else hook(failed)
+    try:
+        with naming(folder), SummaryWriter(folder) as writer:
+            yield writer.add_scalar
+    finally:
+        threading.excepthook = hook
 
 
 def seconds_spent(folder: Path) -> float:

@@ -10,25 +10,6 @@ import numpy as np
 
 from kkl_gym.system import System
 
-Noise = float | tuple[float, ...]
-"""Standard deviation of the noise on each sample of y: of all outputs, or of each."""
-
-
-def noise_text(level: Noise) -> str:
-    """Levels of noise for people and names of files: 0.5, or 0.1-0.02 where each output has its own.
-
-    Parameters
-    ----------
-    level : float or tuple of float
-        Of all outputs, or of each.
-
-    Returns
-    -------
-    str
-        Without spaces.
-    """
-    return "-".join(f"{one:g}" for one in (level if isinstance(level, tuple) else (level,)))
-
 
 def draw_process_noise(
     system: System, level: float | np.ndarray, *, n: int, steps: int, rng: np.random.Generator

@@ -1,6 +1,7 @@
 """The comparison of agents, at toy size."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +15,19 @@ from rich.console import Console
 import training.agents.comparison
 import training.agents.learn
 import training.commands.compare
-from training.agents.comparison import COMPARED, MORE_NOISE, interval, middle, normalised, planned, run_case
+from training.agents.comparison import (
+    COMPARED,
+    MORE_NOISE,
+    OTHER,
+    collect,
+    interval,
+    middle,
+    normalised,
+    planned,
+    run_case,
+)
 from training.commands.compare import Compare, report
-from training.jobs import locked
+from training.jobs import claimed_job, locked
 from training.systems import PROFILES
 
 
@@ -89,6 +100,15 @@ def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path
         with pytest.raises(ValueError, match="of another comparison: hyperparameters"):
             assert not case.done
     assert case.done
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"scores": [0.0]}', '{"scores": [0.0], "successes": [1], "seconds": '])
+def test_scores_that_are_damaged_are_named(text, tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    with claimed_job(case.folder, case.identity, OTHER):
+        (case.folder / "scores.json").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(case.folder / "scores.json"))):
+        collect(tmp_path, case.episodes, case.timesteps)
 
 
 def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):

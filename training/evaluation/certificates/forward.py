@@ -19,7 +19,7 @@ from training.evaluation.certificates.settled import SettledTrajectories
 from training.maps.smooth import Smooth, encoder, residual
 
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
-AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s, at which the envelope of the start is reported
+AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s at the pace of the shipped systems, at which the envelope is reported
 SEGMENTS = 400  # recorded states at which T_inv is bounded between T(x) and z
 DRAWN = 20_000  # states in X
 
@@ -78,8 +78,8 @@ class Forward:
         The noise-free theorem with l(x) in place of l, R_T in place of R_1, and no squares of sums,
         (sqrt(R_2) + sqrt(steep_risk))^2.
     sharp_noisy_bound : float
-        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + sqrt(ny) v))^2; s is the root
-        of the sharp bound of the T_inv that is told the noise.
+        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + |v|))^2; s is the root of the
+        sharp bound of the T_inv that is told the noise.
     """
 
     forward_risk: float
@@ -140,7 +140,7 @@ def certify_forward(
     told, noise_free : Inverse
         T_inv that is told the noise, and that there is none.
     noise_error : float
-        Most that noise and psi can do to the estimate through z, l gain (l_h psi + sqrt(ny) v).
+        Most that noise and psi can do to the estimate through z, l gain (l_h psi + |v|).
     psi : float
         Bound of how far process noise moves the state.
     error : float
@@ -189,7 +189,8 @@ def certify_forward(
     total = 2 * reconstruction_risk + forward_part
     told_bound = 2 * (2 * told_reconstruction + 2 * told.lipschitz**2 * physics_risk)
     start_error = float(np.sqrt(squared(linear.start(system.output(x)) - T(x)).max()))
-    left = envelope(linear, np.array(AGES), start=start_error)
+    ages = system.pace * np.array(AGES)
+    left = envelope(linear, ages, start=start_error)
     added = noise_free.lipschitz * float(left[0])  # at first; it then decays with the slowest mode
     return Forward(
         forward_risk=forward_risk,
@@ -206,7 +207,7 @@ def certify_forward(
         forward_dimension=dimension,
         forward_term=generalisation_term(largest, pseudo_dimension=dimension, samples=samples, delta=delta),
         start_error=start_error,
-        envelope=dict(zip(AGES, left.tolist(), strict=True)),
+        envelope=dict(zip(ages.tolist(), left.tolist(), strict=True)),
         forgets_start=max(0.0, math.log(added / math.sqrt(error)) / slowest(linear)) if added * error > 0 else math.inf,
         bound=2 * total,
         forward_share=forward_part / total if total > 0 else math.nan,
