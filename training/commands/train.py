@@ -62,8 +62,8 @@ class Train:
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
     monitor: bool = True
-    """Find limits for the observer's monitor as well, which takes a minute or two; left out where the output is not
-    linear."""
+    """Find limits for the observer's monitor as well, which takes a minute or two; left out where h takes no
+    symbols."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: dict[str, float] = field(default_factory=dict)
@@ -83,6 +83,7 @@ class Train:
         from training.evaluation.calibration import calibrate
         from training.evaluation.report import write_report
         from training.pipeline import train
+        from training.trajectories.expression import output_expression
 
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
@@ -108,14 +109,14 @@ class Train:
         result = train(system, config, folder, resume=self.resume, device=device, console=console)
         path = folder / f"{name}.safetensors"
         result.artifact.save(path)  # before anything else may fail
-        if self.monitor and result.artifact.C is None:
-            console.print("[yellow]no monitor:[/yellow] the output is not linear, so there is no C x_hat to compare")
-        elif self.monitor:
-            try:
+        try:
+            if not result.artifact.knows_output:
+                output_expression(system)  # an error that says why
+            if self.monitor:
                 with console.status("finding the monitor's limits"):
                     calibrate(result.artifact, system, seed=config.seed).save(path)
-            except ValueError as error:
-                console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
+        except ValueError as error:
+            console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
         console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
         write_report(folder / "report.png", result, system)
         console.print(f"wrote {folder / 'report.png'}")

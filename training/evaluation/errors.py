@@ -1,5 +1,6 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -201,7 +202,7 @@ def errors(
     system: System,
     trajectories: UnseenTrajectories,
     *,
-    measurement_noise: float,
+    measurement_noise: float | Sequence[float],
     seed: int,
     skip: float | None = None,
 ) -> Errors:
@@ -215,8 +216,8 @@ def errors(
         What it was made for.
     trajectories : UnseenTrajectories
         What it is to follow.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of the measurement noise.
     skip : float, optional

@@ -22,7 +22,13 @@ def deadline(system: System, duration: float) -> float:
 
 
 def simulate_faults(
-    artifact: Artifact, system: System, *, trajectories: int, duration: float, measurement_noise: float, seed: int
+    artifact: Artifact,
+    system: System,
+    *,
+    trajectories: int,
+    duration: float,
+    measurement_noise: float | tuple[float, ...],
+    seed: int,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -36,8 +42,8 @@ def simulate_faults(
         Number of trajectories; each has every fault once.
     duration : float
         Length of each in seconds.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of starts, inputs and noise.
 
@@ -62,7 +68,7 @@ def simulate_faults(
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng)
     clean = system.output(x)
-    y = clean + measurement_noise * rng.standard_normal(clean.shape)
+    y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
     width = np.ptp(undriven, axis=(0, 1))
     at, within = len(y) // 2, round(allowed / dt)

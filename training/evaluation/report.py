@@ -1,5 +1,6 @@
 """A training run in one picture."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
     x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
-    for column, noise in enumerate((0.0, 0.5)):
-        level = min(noise, artifact.inverse.measurement_noise_max)
+    for column, level in enumerate((0.0, artifact.measurement_noise)):
         y = noisy_output(system, x, measurement_noise=level, rng=rng)
         x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
         for i in range(system.nx):
@@ -63,7 +63,7 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
             ax.plot(t, x_hat[..., i], "m--", lw=1.2, label="estimated")
             ax.set_ylabel(system.state_names[i])
             if i == 0:
-                ax.set_title(f"measurement noise {level:g}")
+                ax.set_title(f"measurement noise {_shown(level)}")
                 ax.legend(loc="upper right")
         ax.set_xlabel("t in s")
     with replacing(path) as temporary:
@@ -75,13 +75,19 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: Un
     if not trajectories.x.shape[1]:
         ax.set_title("every trajectory left the declared bounds")
         return
-    levels = [0.0, *np.geomspace(0.01, 1.0, 7) * artifact.inverse.measurement_noise_max]
+    largest = np.asarray(artifact.inverse.measurement_noise_max)
+    levels = [0.0, *((part * largest).tolist() for part in np.geomspace(0.01, 1.0, 7))]
     medians = [
         np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels
     ]
     ax.plot(range(len(levels)), medians, "o-")
-    ax.set_xticks(range(len(levels)), [f"{level:.2g}" for level in levels])
+    ax.set_xticks(range(len(levels)), [_shown(level, digits=2) for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
+
+
+def _shown(level: float | Sequence[float], digits: int = 6) -> str:
+    """A level of noise as text, one for each output where they differ, in lines of their own."""
+    return "\n".join(f"{each:.{digits}g}" for each in np.atleast_1d(level))
 
 
 def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 150) -> None:
