@@ -1,11 +1,15 @@
-"""Elementary functions for equations of motion that serve every number type.
+"""Elementary functions for equations of motion, which serve every number type.
 
-Plain arithmetic already works on Python floats, NumPy arrays, torch tensors and sympy expressions alike;
-``sin`` and its kind do not. A system whose equations need them takes them from here::
+Plain arithmetic and comparisons already work on Python floats, NumPy arrays, torch tensors and sympy expressions alike;
+``sin`` and its kind do not, nor does ``if``. A system whose equations need them takes them from here::
 
-    from kkl_gym.elementary import sin
+    from kkl_gym.elementary import sin, where
+
+Numbers may stand beside arrays, tensors or expressions. Everywhere exp(1000) is infinite, log(0) minus infinite and
+sqrt(-1) not a number, without a warning. "Your own system" in ``docs/systems.md`` has a table of the functions.
 """
 
+import builtins
 import math
 import sys
 from collections.abc import Callable
@@ -13,32 +17,128 @@ from typing import Any
 
 import numpy as np
 
+_NUMBERS = (float, int, np.generic)
+_SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
-def _dispatching(name: str, array_name: str | None = None) -> Callable[[Any], Any]:
-    on_floats, on_arrays = getattr(math, name), getattr(np, array_name or name)
+
+def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callable[[Any], Any]:
+    on_arrays = getattr(np, name)
+    if name in ("exp", "log", "sqrt"):  # the others warn of infinite arguments only, and silence takes time
+        on_arrays = np.errstate(all="ignore")(on_arrays)
 
     def function(x: Any) -> Any:
-        if isinstance(x, float | int):
+        if isinstance(x, _NUMBERS):
             try:
-                return on_floats(x)
-            except ValueError:  # sin(inf), sqrt(-1): not a number on arrays too
-                return math.nan
-        if isinstance(x, np.ndarray | np.generic):
+                return on_numbers(x)
+            except (ValueError, OverflowError):  # exp(1000), log(0), sin(inf)
+                with np.errstate(all="ignore"):
+                    return float(on_arrays(float(x)))
+        if isinstance(x, np.ndarray):
             return on_arrays(x)
-        for library in ("torch", "sympy"):  # only if the caller has imported it already
-            module = sys.modules.get(library)
-            if module is not None and isinstance(x, module.Tensor if library == "torch" else module.Basic):
-                return getattr(module, name)(x)
-        raise TypeError(f"{name} takes a float, an array, a torch tensor or a sympy expression, not {type(x)}")
+        return _elsewhere(name, x)
 
-    function.__name__ = name
-    function.__doc__ = f"{name}(x) for floats, NumPy arrays, torch tensors and sympy expressions."
+    return _named(function, f"{name}(x)", meaning)
+
+
+def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> Callable[[Any, Any], Any]:
+    def function(a: Any, b: Any) -> Any:
+        if isinstance(a, _NUMBERS) and isinstance(b, _NUMBERS):
+            return on_numbers(a, b)
+        return _elsewhere(name, a, b)
+
+    return _named(function, f"{name}(a, b)", meaning)
+
+
+def _named(function: Any, call: str, meaning: str) -> Any:
+    function.__name__ = function.__qualname__ = call.partition("(")[0]
+    function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 
 
-sin = _dispatching("sin")
-cos = _dispatching("cos")
-tan = _dispatching("tan")
-exp = _dispatching("exp")
-tanh = _dispatching("tanh")
-sqrt = _dispatching("sqrt")
+def _elsewhere(name: str, *args: Any) -> Any:
+    """A function of arguments that are not all numbers, by the library that they are of."""
+    if all(isinstance(arg, (np.ndarray, *_NUMBERS)) for arg in args):
+        return getattr(np, name)(*args)
+    if sympy := _library("sympy", "Basic", args):
+        return getattr(sympy, _SYMPY_NAMES.get(name, name))(*args)
+    if torch := _library("torch", "Tensor", args):
+        return getattr(torch, name)(*_as_tensors(torch, args))
+    wrong = ", ".join(type(arg).__name__ for arg in args)
+    raise TypeError(f"{name} takes floats, arrays, torch tensors and sympy expressions, not {wrong}")
+
+
+def _library(name: str, kind: str, args: tuple[Any, ...]) -> Any:
+    """The library if one of the arguments is of it; only if the caller has imported it already."""
+    library = sys.modules.get(name)
+    return library if library is not None and any(isinstance(arg, getattr(library, kind)) for arg in args) else None
+
+
+def _as_tensors(torch: Any, args: tuple[Any, ...]) -> list[Any]:
+    """Arguments as tensors; numbers take the type of the tensors beside them."""
+    tensors = [arg for arg in args if isinstance(arg, torch.Tensor)]
+    dtype = next((tensor.dtype for tensor in tensors if tensor.is_floating_point()), torch.float64)
+    device = tensors[0].device
+    return [arg if isinstance(arg, torch.Tensor) else torch.as_tensor(arg, dtype=dtype, device=device) for arg in args]
+
+
+def _sign(x: Any) -> float:
+    return 1.0 if x > 0 else -1.0 if x < 0 else 0.0 * x  # of NaN, NaN
+
+
+def _maximum(a: Any, b: Any) -> Any:
+    return a if a >= b or a != a else b  # NaN wins, as with arrays
+
+
+def _minimum(a: Any, b: Any) -> Any:
+    return a if a <= b or a != a else b
+
+
+sin = _unary("sin", math.sin, "the sine of an angle in rad")
+cos = _unary("cos", math.cos, "the cosine of an angle in rad")
+tan = _unary("tan", math.tan, "the tangent of an angle in rad")
+exp = _unary("exp", math.exp, "e to the power of x")
+log = _unary("log", math.log, "the natural logarithm")
+sqrt = _unary("sqrt", math.sqrt, "the square root")
+tanh = _unary("tanh", math.tanh, "the hyperbolic tangent")
+abs = _unary("abs", builtins.abs, "the absolute value, as Python's own")
+sign = _unary("sign", _sign, "-1, 0 or 1")
+atan2 = _binary("atan2", math.atan2, "the angle of the point (b, a) in rad")
+minimum = _binary("minimum", _minimum, "the smaller of the two")
+maximum = _binary("maximum", _maximum, "the larger of the two")
+
+
+def clip(x: Any, low: Any, high: Any) -> Any:
+    """clip(x, low, high), x within bounds, for floats, NumPy arrays, torch tensors and sympy expressions."""
+    return minimum(maximum(x, low), high)
+
+
+def where(condition: Any, a: Any, b: Any) -> Any:
+    """where(condition, a, b), a where the condition holds, else b: what ``if`` cannot say to arrays and symbols.
+
+    Parameters
+    ----------
+    condition : bool, or array, tensor or sympy expression of that
+        A comparison such as ``x[0] > 0``. Several are combined by ``&`` and ``|``, each in parentheses. ``~`` means
+        something else to Python's own True and False: write the opposite comparison.
+    a, b : float, array, tensor or sympy expression
+        Both are evaluated everywhere; what the one that is not taken makes of its arguments is of no concern.
+
+    Returns
+    -------
+    float, array, tensor or sympy expression
+        Of the kind of the arguments.
+
+    Raises
+    ------
+    TypeError
+        If the condition is no comparison.
+    """
+    if isinstance(condition, bool | np.bool_):
+        return a if condition else b
+    if isinstance(condition, np.ndarray) and condition.dtype == bool:
+        return np.where(condition, a, b)
+    if sympy := _library("sympy", "Basic", (condition,)):
+        return sympy.Piecewise((a, condition), (b, True))
+    if (torch := _library("torch", "Tensor", (condition,))) and condition.dtype == torch.bool:
+        return torch.where(*_as_tensors(torch, (condition, a, b)))
+    raise TypeError(f"where takes a comparison such as x[0] > 0 as its condition, not {type(condition).__name__}")

@@ -6,9 +6,11 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
+
+from kkl_gym.user_lines import user_line
 
 Class = TypeVar("Class")
 
@@ -34,14 +36,61 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
         If it cannot be found or is not a subclass of ``base``.
     """
     where, _, class_name = name.rpartition(":")
-    try:
-        found = getattr(_module(where), class_name)
-    except (ImportError, AttributeError, OSError, SyntaxError, TypeError) as error:
-        raise ValueError(f"cannot load the {base.__name__.lower()} {name!r}: {error}") from error
+    failure = f"cannot load the {base.__name__.lower()} {name!r}"
+    module = _imported(where, failure)
+    found = getattr(module, class_name, None)
+    if found is None:
+        others = [key for key, value in vars(module).items() if _is_own(value, base, module.__name__)]
+        raise ValueError(f"{failure}: {where} defines no {class_name}; it defines {', '.join(others) or 'none'}")
     if not (inspect.isclass(found) and issubclass(found, base) and found is not base):
         package = base.__module__.rpartition(".")[0]
         raise ValueError(f"{name!r} is {found!r}, not a subclass of {package}.{base.__name__}")
     return found
+
+
+def load_function(name: str) -> Callable[..., Any]:
+    """Find a function by where it is written.
+
+    Parameters
+    ----------
+    name : str
+        ``"package.module:function"`` or ``"path/to/script.py:function"``.
+
+    Returns
+    -------
+    callable
+        The function.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be found or called.
+    """
+    where, _, function_name = name.rpartition(":")
+    failure = f"cannot load the function {name!r}"
+    found = getattr(_imported(where, failure), function_name, None)
+    if not callable(found):
+        raise ValueError(f"{failure}: {where} defines no function {function_name}")
+    return found
+
+
+def _is_own(value: Any, base: type, module: str) -> bool:
+    """Whether a value is a subclass that a module, or a package's part, defines itself."""
+    return (
+        inspect.isclass(value)
+        and issubclass(value, base)
+        and value is not base
+        and f"{value.__module__}.".startswith(f"{module}.")
+    )
+
+
+def _imported(where: str, failure: str) -> Any:
+    """The module at a place, or a ValueError that begins with what failed for it."""
+    try:
+        return _module(where)
+    except Exception as error:  # whatever a user's script raises
+        line = user_line(error)
+        raise ValueError(f"{failure}: {f'{line}: {type(error).__name__}: ' if line else ''}{error}") from error
 
 
 def _module(where: str) -> Any:
@@ -49,7 +98,9 @@ def _module(where: str) -> Any:
         if not where or where.startswith("."):
             raise ImportError(f"{where!r} is no absolute module name")
         with _importing_from(Path.cwd()):
-            return importlib.import_module(where)
+            found = importlib.import_module(where)
+        vars(found).setdefault("__kkl_gym_script__", where)  # worker processes look where this one did
+        return found
     path = Path(where).resolve()
     key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
     if key not in sys.modules:

@@ -7,12 +7,13 @@ on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-
 import functools
 import math
 from collections.abc import Callable, Iterable
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
+from observers.checks import check_dt
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
 # motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
@@ -39,6 +40,8 @@ WEIGHTS = (11 / 120, 0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120)
 _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 
 VectorField = Callable[[Any], Any]
+Feedback = Callable[[int, np.ndarray], np.ndarray]
+"""(k, x) to the inputs held over interval k, (n, nu)."""
 
 
 class SubstepsError(ValueError):
@@ -146,25 +149,33 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If the system moves too fast, within its bounds, to be followed over this interval.
     """
     end: Components = (math.nan,) * len(x)
     try:
-        if system.discrete:
-            return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
-        need = system.rate(x) * dt * PER_RATE
-        if need <= MOST_EQUAL:
-            n = 1
-            while n < need:
-                n *= 2
-            field, d = forced(system, u, w)
-            end = runge_kutta(len(x))(field, x, d, dt / n, n)
-            if system.rate(end) * dt * PER_RATE <= GROWTH * n:
-                return end
-    except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
-        pass
-    return followed(system, x, u, w, dt=dt, end=end)
+        try:
+            if system.discrete:
+                return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
+            need = system.rate(x) * dt * PER_RATE
+            if need <= MOST_EQUAL:
+                n = 1
+                while n < need:
+                    n *= 2
+                field, d = forced(system, u, w)
+                end = runge_kutta(len(x))(field, x, d, dt / n, n)
+                if system.rate(end) * dt * PER_RATE <= GROWTH * n:
+                    return end
+        except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
+            pass
+        return followed(system, x, u, w, dt=dt, end=end)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x, u)
+        raise
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
@@ -213,8 +224,11 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             h = left if rate * left <= RATE_STEP else RATE_STEP / rate
             x = runge_kutta(len(x))(field, x, d, h, 1)
             left -= h
-    except (ArithmeticError, TypeError):  # the second of complex numbers, which Python makes of (-1.0) ** 0.5
+    except ArithmeticError:
         return end
+    except Exception as error:
+        blame(error, system, x, u)
+        raise
     raise SubstepsError(
         f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
         f"are not enough for dt = {dt:g} s, of which {left:.2g} s are left; take a smaller dt, tighten the bounds, or "
@@ -245,9 +259,21 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
 
     Raises
     ------
+    EquationError
+        If the equations fail, or return something else than components.
     SubstepsError
         If the system moves too fast, within its bounds, to be followed over this interval.
     """
+    try:
+        return _advance_batch(system, x, u, w, dt)
+    except SubstepsError:
+        raise
+    except Exception as error:
+        blame(error, system, x, u)
+        raise
+
+
+def _advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         if system.discrete:
             moved = system.step(x, u)
@@ -364,7 +390,7 @@ def simulate(
     x0: np.ndarray,
     steps: int,
     dt: float,
-    u: np.ndarray | None = None,
+    u: np.ndarray | Feedback | None = None,
     w: np.ndarray | None = None,
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
@@ -379,8 +405,9 @@ def simulate(
         Number of sampling intervals.
     dt : float
         Length of an interval in seconds.
-    u : ndarray, shape (steps, n, nu), optional
-        Inputs, held over each interval; None is zero.
+    u : ndarray, shape (steps, n, nu), or callable, optional
+        Inputs, held over each interval; None is zero. A callable gives those of interval k, of shape (n, nu), from
+        (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval; None is zero.
 
@@ -401,7 +428,7 @@ def simulate(
     check_dt(dt)
     n = len(x0)
     for name, signal, width in (("u", u, system.nu), ("w", w, system.nx)):
-        if signal is not None and np.shape(signal) != (steps, n, width):
+        if signal is not None and not callable(signal) and np.shape(signal) != (steps, n, width):
             raise ValueError(f"{name} must have shape {(steps, n, width)}, got {np.shape(signal)}")
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     no_u, no_w = np.zeros((system.nu, n)), np.zeros((system.nx, n))
@@ -409,8 +436,9 @@ def simulate(
     x = np.ascontiguousarray(x0.T)
     out[0] = x0
     for k in range(steps):
+        acting = u(k, out[k]) if callable(u) else None if u is None else u[k]
         held = (
-            no_u if u is None else np.ascontiguousarray(u[k].T),
+            no_u if acting is None else np.ascontiguousarray(acting.T),
             no_w if w is None else np.ascontiguousarray(w[k].T),
         )
         end = advance_batch(system, x, *held, dt)
@@ -427,29 +455,6 @@ def check_duration(duration: float, dt: float) -> None:
     """Raise ValueError unless ``duration`` is a finite number of seconds, and not shorter than a sample of ``dt``."""
     if not dt <= duration < math.inf:
         raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
-
-
-def check_dt(dt: float) -> float:
-    """Raise an error unless ``dt`` is a sampling interval.
-
-    Parameters
-    ----------
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive, finite number.
-    """
-    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
-        raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
-    return dt
 
 
 def check_interval(system: System, dt: float) -> None:

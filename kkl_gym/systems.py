@@ -3,15 +3,15 @@
 # ruff: noqa: D102 - what each system overrides is documented on System
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
 from typing import Any, ClassVar
 
-import numpy as np
-
+from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
 from kkl_gym.system import Box, Components, System
 from observers import Artifact
+from observers.checks import mapping, shown
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class ReverseDuffing(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 1.5)
     dt: ClassVar[float] = 0.01
+    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
@@ -65,6 +66,7 @@ class VanDerPol(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,))
     scale: ClassVar[tuple[float, ...]] = (2.0, 4.0)
     dt: ClassVar[float] = 0.01
+    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
@@ -109,6 +111,7 @@ class Rossler(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((1.0,), (0.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (8.0, 8.0, 10.0)
     dt: ClassVar[float] = 0.01
+    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
     portrait: ClassVar[tuple[int, int]] = (0, 1)
 
@@ -163,6 +166,7 @@ class Lorenz(System):
     G: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (1.0,), (0.0,))
     scale: ClassVar[tuple[float, ...]] = (15.0, 18.0, 20.0)
     dt: ClassVar[float] = 0.01
+    process_noise: ClassVar[float] = 0.05
     measurement_noise: ClassVar[float] = 0.5
 
     def f(self, x: Components) -> Components:
@@ -207,26 +211,27 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     ------
     ValueError
         If the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
+    EquationError
+        If a user's equations fail, or return something else than components.
     """
     if isinstance(system, str):
         system = _find(system)
     if isinstance(system, type) and issubclass(system, System):
-        system = system()
-    if not isinstance(system, System):
-        raise ValueError(f"expected a system or the name of one, got {system!r}")
-    found = system.replace(parameters or {})
+        missing = [field.name for field in fields(system) if field.default is MISSING]
+        if missing:
+            raise ValueError(
+                f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
+            )
+        try:
+            system = system()
+        except TypeError as error:  # not decorated as a dataclass
+            raise ValueError(str(error)) from error
+    if not isinstance(system, System) or type(system) is System:
+        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
+    found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
-        _check_components(found)
+        check_equations(found)
     return found
-
-
-def _check_components(system: System) -> None:
-    """Raise ValueError if f or h of a user's system does not return components, as when a comma is missing."""
-    middle = [(low + high) / 2 for low, high in system.X]
-    for name, found, n in (("f", system.f(middle), system.nx), ("h", system.h(middle), None)):
-        if not isinstance(found, Sequence | np.ndarray) or n not in (None, len(found)):
-            wanted = "its components, as in (y,)" if n is None else f"{n} components"
-            raise ValueError(f"{name}(x) of {system.name} must return {wanted}; it returns {found!r}")
 
 
 def _find(name: str) -> type[System]:
@@ -234,7 +239,8 @@ def _find(name: str) -> type[System]:
         return SYSTEMS[name]
     if ":" not in name:
         raise ValueError(
-            f"unknown system {name!r}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
+            "'script.py:Class'"
         )
     return load_class(name, System)
 

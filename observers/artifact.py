@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from observers import storage
-from observers.checks import is_finite, noise_levels
+from observers.checks import is_finite, noise_levels, shown
 from observers.expression import Expression
 from observers.filter import LinearFilter
 from observers.monitor import Limits
@@ -681,14 +681,16 @@ def resolve(name_or_path: str | os.PathLike[str]) -> Path:
     Raises
     ------
     ArtifactError
-        If no map of this name ships.
+        If it is neither, or no map of this name ships.
     """
-    text = os.fspath(name_or_path)
+    text = os.fspath(name_or_path) if isinstance(name_or_path, str | os.PathLike) else None
+    if not isinstance(text, str):
+        raise ArtifactError(f"an observer is a shipped name or a path, got {shown(name_or_path)}")
     if text.endswith(".safetensors"):
         return Path(text)
     names = shipped()
     if text not in names:
         raise ArtifactError(
-            f"unknown observer {text!r}; shipped: {', '.join(names) or 'none'}; a file's name ends in .safetensors"
+            f"unknown observer {shown(text)}; shipped: {', '.join(names) or 'none'}; a file's name ends in .safetensors"
         )
     return Path(str(files("observers").joinpath("maps", f"{names[text]}.safetensors")))

@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from observers.checks import is_finite
+from observers.checks import check_dt, is_finite, noise_levels, real_array, shown
+
+_LARGEST = 1e30  # of limits and levels; their squares are within the range of floats
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ class Limits:
     duration: float
 
     def __post_init__(self) -> None:
+        for name in ("levels", "mean", "low", "high"):
+            object.__setattr__(self, name, real_array(f"the limits' {name}", getattr(self, name)))
         shape = self.mean.shape
         if len(shape) != 2 or not shape[0] or not shape == self.low.shape == self.high.shape:
             raise ValueError(f"limits must be (levels, ny), got {shape}, {self.low.shape}, {self.high.shape}")
@@ -58,11 +62,12 @@ class Limits:
             raise ValueError(f"levels must rise from 0, got {self.levels}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
-        if not all(np.isfinite(limit).all() for limit in (self.levels, self.mean, self.high)):
-            raise ValueError("limits and their levels must be finite")
+        if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
+            raise ValueError(f"limits and their levels must be finite, and not beyond {_LARGEST:g}")
         for name in ("window", "warm_up", "false_alarms", "duration"):
             if not is_finite(getattr(self, name)):
-                raise ValueError(f"the limits' {name} must be a finite number, got {getattr(self, name)!r}")
+                raise ValueError(f"the limits' {name} must be a finite number, got {shown(getattr(self, name))}")
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not (self.window > 0 and 0 <= self.warm_up < self.duration and 0 < self.false_alarms < 1):
             raise ValueError(
                 "limits need window > 0, 0 <= warm_up < duration and 0 < false_alarms < 1, got "
@@ -88,9 +93,10 @@ class Limits:
         Raises
         ------
         ValueError
-            If the level is beyond the last one.
+            If the level is no number, negative or beyond the last one.
         """
         ny = self.mean.shape[1]
+        level = noise_levels("the noise level", level, ny)
         levels = np.broadcast_to(self.levels.reshape(len(self.levels), -1), self.mean.shape)
         own, last = np.broadcast_to(level, (ny,)), levels[-1]
         if (own > last).any():
@@ -123,13 +129,16 @@ class Monitor:
     Raises
     ------
     ValueError
-        If there are no limits for the level.
+        If there are no limits for the level, or dt is not positive and finite.
     """
 
     def __init__(self, limits: Limits, level: float | tuple[float, ...], dt: float) -> None:
+        if not isinstance(limits, Limits):
+            raise ValueError(f"limits must be observers.Limits, got {shown(limits)}")
+        dt = check_dt(dt)
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
-        self._silent = round(limits.warm_up / dt)
+        self._silent = np.round(limits.warm_up / dt)
         self._sound = np.maximum(np.square(level), self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:

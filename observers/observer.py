@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
-from observers.checks import noise_level, noise_levels, real_array
+from observers.checks import bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.monitor import Monitor
 
 _LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
@@ -56,14 +56,18 @@ class KKLObserver:
         process_noise: float | None = None,
         monitor: bool = False,
     ) -> None:
-        if monitor and artifact.limits is None:
+        if not isinstance(artifact, Artifact):
+            raise ValueError(
+                f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names"
+            )
+        if flag("monitor", monitor) and artifact.limits is None:
             found = "them" if artifact.knows_output else "them, and the output h(x), which this artifact lacks as well"
             raise ValueError(
                 f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
                 f"system) finds {found}, and returns an artifact that does"
             )
         self.artifact = artifact
-        self._monitored = monitor
+        self._monitored = bool(monitor)
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._process_noise = self._level(process_noise)
@@ -213,8 +217,8 @@ class KKLObserver:
         RuntimeError
             Before :meth:`reset`.
         """
-        rows = np.asarray(rows)
-        z = self._rows(rows)
+        z = self.z
+        rows = bool_array("rows", rows, z.shape[:-1])
         y0 = real_array("y", y0)
         self._check_output(y0, (int(rows.sum()),), first=True)
         z[rows], age = self._start(y0, x0)
@@ -276,6 +280,8 @@ class KKLObserver:
         if self._z is None:
             raise RuntimeError("call reset(y0) before step(y)")
         batch = self._z.shape[:-1]
+        if rows is not None:
+            rows = bool_array("rows", rows, batch)
         u = self._input(u, batch)
         gaps, missing = None, y is None
         if y is None:
@@ -289,8 +295,7 @@ class KKLObserver:
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
         else:
-            rows = np.asarray(rows)
-            kept = self._rows(rows)
+            kept = self._z.copy()
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
@@ -326,18 +331,11 @@ class KKLObserver:
             raise RuntimeError("call reset(y0) before the observer is used")
         z, age = self._z, self._age
         if rows is not None:
-            rows = np.asarray(rows)
-            z, age = self._rows(rows)[rows], np.broadcast_to(age, rows.shape)[rows]
+            rows = bool_array("rows", rows, z.shape[:-1])
+            z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
         return self._invert(z, age * self.artifact.filter.dt)
-
-    def _rows(self, rows: np.ndarray) -> np.ndarray:
-        """A copy of z of which ``rows`` may be indexed."""
-        z = self.z
-        if rows.dtype != np.bool_ or rows.shape != z.shape[:-1]:
-            raise ValueError(f"rows must be boolean with shape {z.shape[:-1]}, got {rows.dtype} {rows.shape}")
-        return z
 
     def _filled(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, *, z: np.ndarray, before: np.ndarray, age: Any
@@ -383,7 +381,7 @@ class KKLObserver:
         """
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
-            raise ValueError(f"a record must have shape (steps, ..., {self.artifact.ny}), got {y.shape}")
+            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
         gaps = self._check_output(y, y.shape[:-1])
         if gaps is not None:
             self._check_output(y[0], y.shape[1:-1], first=True)
@@ -463,6 +461,8 @@ class KKLObserver:
             return np.zeros((*batch, nu))
         u = real_array("u", u)
         if nu == 0:
+            if u.shape[:-1] != batch:
+                raise ValueError(f"u must have a row of inputs for each of the batch, {batch}, got shape {u.shape}")
             if u.any():
                 raise ValueError(
                     f"this map for {self.artifact.system} knows no inputs, but u = {u}; take one that does, "

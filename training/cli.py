@@ -5,11 +5,17 @@ command is called.
 """
 
 import ast
+import io
+import os
+import re
+import signal
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
 from importlib.resources import files
-from typing import Any
+from typing import Any, NoReturn
 
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
@@ -25,12 +31,16 @@ COMMANDS = {
     "speed": ("speed", "Speed"),
 }
 
+
 # What an interruption may be followed by, by the first words of the command.
 AFTER_INTERRUPTION = {
     ("train",): "--resume goes on from the last checkpoint",
     ("benchmark",): "the same command goes on",
+    ("agent", "train"): "--resume goes on from the last checkpoint",
     ("agent", "compare"): "the same command goes on",
 }
+
+MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
 # Modules that an extra of the package brings.
 EXTRAS = {
@@ -51,20 +61,47 @@ def main(arguments: list[str] | None = None) -> None:
     Raises
     ------
     SystemExit
-        After help, and with one line that says what is wrong where something is.
+        After help, with one line that says what is wrong where something is, and with 130 after an interruption.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    with _noticing_interruptions() as interrupted:
+        try:
+            _run(arguments)
+        except BaseException as error:
+            if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
+                hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
+                _end("; ".join(["interrupted", *hints]), INTERRUPTED)
+            if isinstance(error, ModuleNotFoundError):
+                module = (error.name or "").partition(".")[0]
+                extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
+                sys.exit(": ".join(["kkl-gym", str(error), *extras]))
+            if isinstance(
+                error, BrokenPipeError
+            ):  # whoever read what is printed, as in a pipe to head, has seen enough
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                sys.exit(1)
+            if isinstance(error, ValueError | OSError | FloatingPointError):
+                sys.exit(f"kkl-gym: {_message(error)}")
+            raise
+
+
+@contextmanager
+def _noticing_interruptions() -> Iterator[list[int]]:
+    """Give a list that is empty until there is an interruption."""
+    noticed: list[int] = []
+
+    def handler(number: int, frame: object) -> None:
+        noticed.append(number)
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():  # which alone has handlers of signals
+        yield noticed
+        return
+    before = signal.signal(signal.SIGINT, handler)
     try:
-        _run(arguments)
-    except ModuleNotFoundError as error:
-        module = (error.name or "").partition(".")[0]
-        hints = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
-        sys.exit(": ".join(["kkl-gym", str(error), *hints]))
-    except (ValueError, OSError, FloatingPointError) as error:
-        sys.exit(f"kkl-gym: {_message(error)}")
-    except KeyboardInterrupt:
-        hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
-        sys.exit("; ".join(["kkl-gym: interrupted", *hints]))
+        yield noticed
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _run(arguments: list[str]) -> None:
@@ -75,13 +112,34 @@ def _run(arguments: list[str]) -> None:
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
         called = list(COMMANDS)
     commands = {name: (_load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
-    command: Any = tyro.extras.subcommand_cli_from_dict(
-        commands,
-        prog="kkl-gym",
-        description="Learned KKL observers for Gymnasium environments.",
-        args=arguments,
-    )
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            command: Any = tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="kkl-gym",
+                description="Learned KKL observers for Gymnasium environments.",
+                args=arguments,
+                config=(tyro.conf.DisallowNone,),
+            )
+    except SystemExit as end:
+        if end.code != MISUSED:
+            raise
+        _end(_without_box(said.getvalue()), MISUSED)
     command.run(Console())
+
+
+def _end(message: str, code: int) -> NoReturn:
+    print(f"kkl-gym: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _without_box(text: str) -> str:
+    """What tyro says of options that it cannot read, in one line: without frame, colours, title, help and reasons."""
+    plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╮╰╯ ") for line in text.splitlines()]
+    parts = "\n".join(plain[1:]).split("─" * 10)
+    kept = [" ".join(part.strip("─").split()).partition(" Got errors:")[0] for part in parts]
+    return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 
 def _load(module: str, name: str) -> Callable[..., Any]:
@@ -104,6 +162,8 @@ def _message(error: Exception) -> str:
     """What is wrong; of a configuration, a line for each setting: ``name = value: what it should be``."""
     from pydantic import ValidationError
 
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: {error.strerror}"
     if not isinstance(error, ValidationError):
         return str(error)
     lines = []

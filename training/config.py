@@ -114,8 +114,15 @@ class Config:
     """Weight nu of the PDE residual in the forward map's risk (spinn)."""
     inputs: bool = True
     """Whether the filter of an input-aware map takes in the system's inputs; else it is fitted to free motion only."""
+    policy: str | None = None
+    """What acts on the system while motions are simulated for an input-aware map: "controller" for the system's own
+    (a linear-quadratic regulator at the target by default), or a function of yours, as script.py:function or
+    module:function, that turns states (n, nx) into actions (n, nu) in [-1, 1]. It acts on states with an error and
+    explores; a quarter of the trajectories are its own. There are no free motions then, and no second inverse for
+    them. For plants that no random input would hold within their bounds."""
     free_inverse: bool = True
-    """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted."""
+    """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted. Never under a
+    policy."""
     lead_in_input: NotNegative = 0.0
     """Some free trajectories start where inputs have led from X. Positive: constant inputs up to this multiple of
     their bounds, for 20 s. Zero: random inputs within their bounds, for 10 s."""
@@ -133,8 +140,8 @@ class Config:
     truncation: Positive = 1e-6
     """Part epsilon of the filter's start that may be left where the forward map's data begins (paper, sec. 5.2)."""
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
-    """Trajectories of a controller that acts on the estimate, on which the inverse of an input-aware map is fitted a
-    second time beside the others; 0 for no second time."""
+    """Trajectories of a controller, or the policy, that acts on the estimate, on which the inverse of an input-aware
+    map is fitted a second time beside the others; 0 for no second time."""
     cpu_seconds: Positive | None = None
     """CPU seconds after which the training of all networks together ends, steps done or not."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -149,6 +156,11 @@ class Config:
         for modes in (self.eigenvalues, self.pairs):
             if len(set(modes)) < len(modes):
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
+        if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):
+            raise ValueError(
+                f"policy = {self.policy!r} needs the pipeline 'input-aware' with inputs; got {self.pipeline!r}, "
+                f"inputs = {self.inputs}"
+            )
         closed_loop = self.closed_loop_trajectories
         if closed_loop and (closed_loop < 10 or self.pipeline != "input-aware" or not self.inputs):
             raise ValueError(

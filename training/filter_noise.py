@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+import scipy
 
 from observers import LinearFilter
 
@@ -55,7 +55,7 @@ def stationary_covariance(linear: LinearFilter) -> np.ndarray:
     out = []
     for early, late, _ in _columns(linear):
         drive = phi @ late + early
-        out.append(solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
+        out.append(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
     return np.array(out)
 
 

@@ -26,6 +26,7 @@ LARGE: dict[str, Any] = {
 }
 NOISE_RANGE = 2.0  # largest measurement noise that maps are trained for, over the system's default
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt: a faster mode holds no more than the last samples
+FASTEST_OF_STEPS = 3.0  # the same in discrete time, where a step may change everything and the last samples say most
 CLOSED_LOOP = 2000  # trajectories of ``kkl-gym train --closed-loop``
 
 
@@ -126,7 +127,7 @@ def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     chosen = profile(system).eigenvalues
     if chosen is not None:
         return _rounded(chosen)
-    fastest = min(1.5 * system.typical_rate, FASTEST_MODE / dt)
+    fastest = min(1.5 * system.typical_rate, (FASTEST_OF_STEPS if system.discrete else FASTEST_MODE) / dt)
     spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)
     return tuple(float(f"{value:.6g}") for value in spaced)
 

@@ -23,13 +23,17 @@ AGENT_EVALUATION_SEED = 10**9
 AGENT_EVALUATION_EPISODES = 10_000  # at most
 
 
-def agent_training_seed(seed: int) -> int:
-    """Seed of the first episode on which an agent learns.
+def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
+    """Seed of the first episode on which an agent learns; those that begin beside it follow one by one.
 
     Parameters
     ----------
     seed : int
         The agent's own.
+    resumed : int, default 0
+        How many times the training has gone on from a checkpoint. It then begins other episodes.
+    rows : int, default 1
+        Number of episodes that begin at a time, fewer than 10,000.
 
     Returns
     -------
@@ -44,7 +48,7 @@ def agent_training_seed(seed: int) -> int:
     most = AGENT_EVALUATION_SEED // AGENT_TRAINING_SEED - 2
     if not 0 <= seed <= most:
         raise ValueError(f"an agent's seed must lie between 0 and {most}, got {seed}")
-    return AGENT_TRAINING_SEED * (seed + 1)
+    return AGENT_TRAINING_SEED * (seed + 1) + resumed * rows % (AGENT_TRAINING_SEED - rows)
 
 
 def agent_evaluation_seed(seed: int, episodes: int) -> int:

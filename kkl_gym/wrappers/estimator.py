@@ -10,6 +10,7 @@ import numpy as np
 from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
 from observers import KKLObserver, load, shipped
+from observers.checks import choice, flag
 
 
 class Estimator(Protocol):
@@ -143,8 +144,10 @@ class KKLEstimator:
         monitor: bool,
         known_start: bool,
     ) -> None:
-        if estimate not in ("x", "z"):
-            raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
+        choice("estimate", estimate, ("x", "z"))
+        self._ignore_input = flag("ignore_input", ignore_input)
+        self._known_start = flag("known_start", known_start)
+        self._monitor = flag("monitor", monitor)
         system = plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
@@ -154,14 +157,11 @@ class KKLEstimator:
             process_noise=plant.process_noise,
             monitor=monitor,
         )
-        self._monitor = monitor
         self.observer.artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
         if known_start:
             self.observer.artifact.require_forward()  # an error now, not at the first reset
-        self._known_start = known_start
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
-        self._ignore_input = ignore_input
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:

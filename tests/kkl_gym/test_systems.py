@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, elementary, get_system
+from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
 
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 VARIANTS = {
@@ -254,7 +254,7 @@ def test_nonsense_names_raise_with_the_name(nonsense):
 
 @pytest.mark.parametrize("nonsense", [None, 3, int, object()])
 def test_nonsense_objects_raise(nonsense):
-    with pytest.raises(ValueError, match="expected a system"):
+    with pytest.raises(ValueError, match="system must be"):
         get_system(nonsense)
 
 
@@ -272,111 +272,16 @@ def test_script_that_fails_is_not_half_loaded(tmp_path):
     path = tmp_path / "failing.py"
     path.write_text("raise RuntimeError('mine')")
     for _ in range(2):
-        with pytest.raises(RuntimeError, match="mine"):
+        with pytest.raises(
+            ValueError, match=r"cannot load the system '.*failing\.py:Class': .*failing\.py, line 1 "
+        ) as raised:
             get_system(f"{path}:Class")
-
-
-GOOD = {"name": "mine", "X": ((-1, 1), (-1, 1)), "bounds": ((-2, 2), (-2, 2)), "u_max": (1.0,), "G": ((0.0,), (1.0,))}
-
-
-def test_good_class_variables_are_taken():
-    cls = type("Mine", (System,), dict(GOOD))
-    assert cls.state_names == ("x1", "x2")
-    assert cls.scale == (1.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"name": None}, "must set the class variables"),
-        ({"X": None}, "must set the class variables"),
-        ({"bounds": None}, "must set the class variables"),
-        ({"bounds": ((-2, 2),)}, "X has 2 states and bounds has 1"),
-        ({"bounds": ((-2, 2), (-2, 0.5))}, "must lie within finite bounds"),
-        ({"bounds": ((-2, 2), (-2, math.inf))}, "must lie within finite bounds"),
-        ({"X": ((1, -1), (-1, 1))}, "must lie within finite bounds"),
-        ({"X": ((1, 1), (-1, 1))}, "must lie within finite bounds"),
-        ({"X": ((math.nan, 1), (-1, 1))}, "must lie within finite bounds"),
-        ({"u_max": (0.0,)}, "must be positive"),
-        ({"u_max": (math.inf,)}, "must be positive"),
-        ({"u_max": (1.0, 1.0)}, "2 rows of 2"),
-        ({"G": ((1.0,),)}, "2 rows of 1"),
-        ({"G": ()}, "override g"),
-        ({"portrait": (0, 2)}, "portrait = .* must be two indices"),
-    ],
-)
-def test_wrong_class_variables_raise(wrong, match):
-    variables = {key: value for key, value in {**GOOD, **wrong}.items() if value is not None}
-    with pytest.raises(TypeError, match=match):
-        type("Mine", (System,), variables)
+        assert "(`raise RuntimeError('mine')`): RuntimeError: mine" in str(raised.value)
 
 
 def test_missing_methods_are_named():
-    mine = type("Mine", (System,), dict(GOOD))()
+    mine = type("Mine", (System,), {"name": "mine", "X": ((-1, 1),) * 2, "bounds": ((-9, 9),) * 2})()
     with pytest.raises(NotImplementedError, match="Mine does not define f"):
         mine.f((0.0, 0.0))
     with pytest.raises(NotImplementedError, match="Mine does not define h"):
         mine.h((0.0, 0.0))
-
-
-FUNCTIONS = ("sin", "cos", "tan", "exp", "tanh", "sqrt")
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-@settings(deadline=None, max_examples=30, derandomize=True)
-@given(x=st.floats(0.01, 3.0))
-def test_elementary_functions_agree(name, x):
-    function = getattr(elementary, name)
-    expected = getattr(math, name)(x)
-    assert function(x) == expected
-    assert function(np.array([x, x])) == pytest.approx([expected] * 2, rel=1e-13)
-    assert function(np.float32(x)) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_symbols(name):
-    sympy = pytest.importorskip("sympy")
-    symbol = sympy.Symbol("x")
-    assert getattr(elementary, name)(symbol) == getattr(sympy, name)(symbol)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_of_tensors(name):
-    torch = pytest.importorskip("torch")
-    x = torch.linspace(0.01, 3.0, 30, dtype=torch.float64)
-    expected = [getattr(math, name)(value) for value in x.tolist()]
-    assert getattr(elementary, name)(x).tolist() == pytest.approx(expected, rel=1e-13)
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_elementary_functions_refuse_the_rest(name):
-    assert getattr(elementary, name)(1) == getattr(math, name)(1.0)
-    for wrong in ("1", None, [1.0]):
-        with pytest.raises(TypeError, match=name):
-            getattr(elementary, name)(wrong)
-
-
-def test_elementary_functions_outside_their_domain_are_nan():
-    assert math.isnan(elementary.sin(math.inf))
-    assert math.isnan(elementary.sqrt(-1.0))
-
-
-def test_elementary_gradient():
-    torch = pytest.importorskip("torch")
-    x = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    (slope,) = torch.autograd.grad(elementary.sin(x), x)
-    assert float(slope) == pytest.approx(math.cos(0.3))
-
-
-@pytest.mark.parametrize(
-    ("f", "h", "message"),
-    [
-        (lambda self, x: (x[1], -x[0]), lambda self, x: x[0], r"h\(x\) of slip must return its components"),
-        (lambda self, x: x[0], lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
-        (lambda self, x: (x[1], -x[0], 0.0), lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
-    ],
-)
-def test_equations_that_return_no_components_are_named(f, h, message):
-    slip = type("Slip", (System,), {"name": "slip", "X": ((-1, 1),) * 2, "bounds": ((-9, 9),) * 2, "f": f, "h": h})
-    with pytest.raises(ValueError, match=message):
-        get_system(slip)

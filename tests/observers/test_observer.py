@@ -240,6 +240,8 @@ NO_NUMBERS = {
     "a complex array": np.array([1.0 + 0.0j]),
     "structured": np.zeros(1, [("y", float)]),
     "masked": np.ma.masked_array([1.0], [True]),
+    "a bool array": np.array([True]),
+    "a bool": [True],
     "objects": np.array([1.0], dtype=object),
     "decimal": [Decimal(1)],
     "nothing": [None],
@@ -285,7 +287,7 @@ def test_every_kind_of_real_array_is_taken(same, make_artifact):
     assert np.array_equal(observer.reset(same), plain.reset(np.array([0.5])))
     assert np.array_equal(observer.step(same, same), plain.step(np.array([0.5]), np.array([0.5])))
     assert type(observer._y) is np.ndarray
-    assert np.array_equal(observer.step([1], [True]), plain.step([1.0], [1.0]))
+    assert np.array_equal(observer.step([1], np.uint8([1])), plain.step([1.0], [1.0]))
 
 
 def test_reset_is_required(make_artifact):

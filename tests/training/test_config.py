@@ -33,6 +33,7 @@ from training import preset
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
         ({"closed_loop_trajectories": 5}, "closed_loop"),
+        ({"policy": "controller", "inputs": False}, "policy"),
     ],
 )
 def test_impossible_configurations(change, message):
@@ -44,6 +45,8 @@ def test_settings_that_do_not_go_with_the_pipeline():
     for wrong in ({"box_factor": 0.5}, {"random_features": -1}, {"random_features": 10}, {"collocation": "ball"}):
         with pytest.raises(ValueError, match=r"features|box_factor|collocation"):
             replace(preset(Oscillator(), "spinn", "fast"), **wrong)
+    with pytest.raises(ValueError, match="policy = 'controller' needs"):
+        replace(preset(Oscillator(), "spinn", "fast"), policy="controller")
     with pytest.raises(ValueError, match="does not go with"):
         replace(preset(Oscillator(), "input-aware", "fast"), random_features=10)
     with pytest.raises(ValueError, match=r"box_factor = 2.0, adaptive = True: settings of the pipeline 'spinn'"):

@@ -21,6 +21,15 @@ def test_seeds_that_would_meet_others_are_refused(seed):
         generator(Stream.TRAINING, *seed)
 
 
+@pytest.mark.parametrize("rows", [1, 16, 256, 9_999])
+def test_no_resumed_agent_learns_from_episodes_of_another(rows):
+    assert agent_training_seed(3, 0, rows) == agent_training_seed(3) == 40_000
+    firsts = [agent_training_seed(3, resumed, rows) for resumed in range(200)]
+    assert all(40_000 <= first <= 50_000 - rows for first in firsts)
+    if rows == 256:
+        assert len(set(firsts)) == 200
+
+
 def test_no_agent_learns_from_episodes_of_the_evaluation():
     last = agent_training_seed(99_998)
     assert last < agent_evaluation_seed(0, 1)

@@ -3,13 +3,13 @@
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from kkl_gym import get_system
+from kkl_gym import SYSTEMS, System, get_system
 from observers import MLP, storage
 from observers.artifact import ArtifactError, resolve, shipped
 from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, STACKED, Features, Information, make
@@ -50,7 +50,7 @@ class Agent:
     Raises
     ------
     AgentError
-        If ``squashed`` is no bool or ``information`` is unknown.
+        If ``squashed`` is no bool, ``information`` is unknown, a name is no string, or the seed no whole number.
     """
 
     network: MLP
@@ -67,6 +67,21 @@ class Agent:
             raise AgentError(f"squashed must be a bool, got {self.squashed!r}")
         if self.information not in INFORMATION:
             raise AgentError(f"an agent knows one of {', '.join(INFORMATION)}, got {self.information!r}")
+        if not isinstance(self.task.system, str):
+            raise AgentError(f"the task's system must be a name, got {self.task.system!r}")
+        for name in ("observer", "fingerprint"):
+            if not isinstance(getattr(self, name), str | None):
+                raise AgentError(f"{name} must be a string, got {getattr(self, name)!r}")
+        for name in ("rules", "training"):
+            if not isinstance(getattr(self, name), Mapping):
+                raise AgentError(f"{name} must be a mapping, got {getattr(self, name)!r}")
+        if type(self.seed) is not int:  # it becomes part of the names of files
+            raise AgentError(f"the seed must be a whole number, got {self.seed!r}")
+
+    @property
+    def seed(self) -> int:
+        """Seed of the training; 0 if nobody said."""
+        return self.training.get("seed", 0)
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Act.
@@ -85,8 +100,17 @@ class Agent:
         bounded: np.ndarray = np.tanh(action) if self.squashed else np.clip(action, -1.0, 1.0)
         return bounded
 
-    def make(self, num_envs: int, autoreset_mode: str | AutoresetMode = AutoresetMode.DISABLED) -> Features:
+    def make(
+        self,
+        num_envs: int,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.DISABLED,
+        *,
+        system: str | System | type[System] | None = None,
+    ) -> Features:
         """Make the environment that the agent was trained in.
+
+        An agent may come from a stranger's file, and to make a system of a name imports the module or the script that
+        it names. So the name of a system that does not ship does nothing unless the caller says it too.
 
         Parameters
         ----------
@@ -94,6 +118,8 @@ class Agent:
             Number of episodes at a time.
         autoreset_mode : str or AutoresetMode, default DISABLED
             What happens at the end of an episode, as for :class:`gymnasium.vector.VectorEnv`.
+        system : str, System or type of System, optional
+            The agent's system: itself, its class, or the name that the agent has for it. Needed if it does not ship.
 
         Returns
         -------
@@ -103,18 +129,26 @@ class Agent:
         Raises
         ------
         AgentError
-            If its observer, the system's equations or what its observations are made of have changed, or the policy
-            does not fit the environment.
+            If its system does not ship and is not given; if its observer, the system's equations or what its
+            observations are made of have changed; or if the policy does not fit the environment.
         """
+        task = self.task
+        if not isinstance(system, str | None):
+            task = replace(task, system=get_system(system))
+        elif system not in (None, task.system) or (system is None and task.system not in SYSTEMS):
+            raise AgentError(
+                f"the agent's system is {task.system!r}, and system={system!r}: give system={task.system!r} if you "
+                "trust the agent's file with what that imports, or give the class"
+            )
         if self.information in ("x_hat", "z") and self.observer is None:
             raise AgentError(f"an agent that knows {self.information} must name its observer")
         if self.observer is not None and fingerprint(self.observer) != self.fingerprint:
             raise AgentError(f"the agent was trained on another version of the observer {self.observer!r}")
-        now = rules(self.task)
+        now = rules(task)
         for name in now:
             if self.rules.get(name) != now[name]:
                 raise AgentError(f"the agent was trained with {name} = {self.rules.get(name)}; it is {now[name]} now")
-        env = make(self.task, self.information, num_envs, autoreset_mode=autoreset_mode, observer=self.observer)
+        env = make(task, self.information, num_envs, autoreset_mode=autoreset_mode, observer=self.observer)
         sizes = (env.single_observation_space.shape[0], env.single_action_space.shape[0])  # type: ignore[index]
         if sizes != (self.network.inputs, self.network.outputs):
             raise AgentError(
@@ -179,6 +213,8 @@ class Agent:
             task = described.pop("task")
             if task["start_box"] is not None:
                 task["start_box"] = tuple(tuple(ends) for ends in task["start_box"])
+            if isinstance(task["measurement_noise"], list):
+                task["measurement_noise"] = tuple(task["measurement_noise"])
             return cls(network=network, task=ControlTask(**task), **described)
 
 

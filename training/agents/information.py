@@ -22,7 +22,7 @@ from training.trajectories.derivatives import linearised
 Information = Literal["state", "x_hat", "z", "y", "stacked", "ekf"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 STACKED = 8  # outputs, each with the action before it
-EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second
+EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second of its pace
 
 Infos = dict[str, Any]
 Feature = Callable[[Mapping[str, np.ndarray]], np.ndarray]
@@ -153,7 +153,7 @@ class KalmanFilters:
     def __init__(self, env: VectorEnv) -> None:
         plant = plant_of(env)
         system = plant.system
-        Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2)
+        Q = np.diag((EKF_PROCESS_NOISE * np.array(system.scale)) ** 2 / system.pace)
         R = measurement_covariance(system, plant.measurement_noise)
         self._filters = ExtendedKalmanFilter(system, plant.dt, Q=Q, R=R)
         self.space = plant.state_space

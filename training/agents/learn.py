@@ -1,6 +1,9 @@
 """Train an agent with stable-baselines3 on a control task."""
 
+import hashlib
+import json
 from collections.abc import Callable
+from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -19,12 +22,15 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
-from kkl_gym.wrappers.vector import VectorEnv, VectorWrapper
 from observers import MLP
+from observers.storage import naming
 from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
+from training.agents.checkpoint import CURVE, Checkpoint
+from training.agents.cost import Cost
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
+from training.checkpoints import SUFFIX
 from training.seeds import agent_training_seed
 from training.systems import ControlTask, profile
 
@@ -41,9 +47,13 @@ def learn(
     timesteps: int | None = None,
     observer: str | None = None,
     algorithm: str | None = None,
+    resume: bool = False,
     progress: Progress | None = None,
 ) -> Agent:
-    """Train one agent.
+    """Train one agent, with checkpoints.
+
+    A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
+    stopped; ``Agent.training`` then says how many times it was resumed.
 
     Parameters
     ----------
@@ -52,7 +62,7 @@ def learn(
     information : {"state", "x_hat", "z", "y", "stacked", "ekf"}
         What it knows, as for :func:`training.agents.information.make`.
     folder : Path
-        Receives agent.safetensors and the learning curve, progress.csv.
+        Receives agent.safetensors, the learning curve, progress.csv, and agent.checkpoint.pt.
     seed : int
         Seed of networks, exploration and episodes.
     timesteps : int, optional
@@ -62,6 +72,8 @@ def learn(
         :func:`training.agents.information.observer_of` the system.
     algorithm : {"ppo", "sac"}, optional
         By default that of the system's profile.
+    resume : bool
+        Whether to go on from the checkpoint in ``folder``, if there is one. Without it, that checkpoint is removed.
     progress : rich.progress.Progress, optional
         Where a bar is shown.
 
@@ -73,7 +85,8 @@ def learn(
     Raises
     ------
     ValueError
-        On an unknown algorithm or a number of timesteps that makes no sense, or if no observer ships for the system.
+        On an unknown algorithm or a number of timesteps that makes no sense, if no observer ships for the system, or if
+        the checkpoint to go on from is damaged or of another training.
     """
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
@@ -82,7 +95,18 @@ def learn(
     name, settings = hyperparameters(task, algorithm)
     named = versioned(observer or observer_of(get_system(task.system))) if information in ("x_hat", "z") else None
     env = make(task, information, settings["n_envs"], observer=named)
-    timesteps = settings["n_timesteps"] if timesteps is None else timesteps
+    timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
+    seen: dict[str, Any] = {
+        "information": information,
+        "observer": named,
+        "fingerprint": None if named is None else fingerprint(named),
+        "rules": rules(task),
+    }
+    how = {"algorithm": name, **settings, "seed": seed}
+    identity = json.dumps([asdict(task), seen, how, timesteps], sort_keys=True)
+    checkpoint = Checkpoint(folder / f"agent{SUFFIX}", hashlib.sha256(identity.encode()).hexdigest())
+    if not resume:
+        checkpoint.path.unlink(missing_ok=True)
     model = _fit(
         name,
         settings,
@@ -91,18 +115,17 @@ def learn(
         timesteps=timesteps,
         seed=seed,
         folder=folder,
+        checkpoint=checkpoint,
         progress=progress,
-        description=f"{task.system} {information}",
+        description=f"{get_system(task.system).name} {information}",
     )
+    resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     agent = Agent(
         network=_policy(model),
         squashed=name == "sac",
         task=task,
-        information=information,
-        observer=named,
-        fingerprint=None if named is None else fingerprint(named),
-        rules=rules(task),
-        training={"algorithm": name, **settings, "seed": seed, "timesteps": model.num_timesteps},
+        training={**how, "timesteps": model.num_timesteps, **resumed},
+        **seen,
     )
     agent.save(folder / "agent.safetensors")
     return agent
@@ -146,7 +169,7 @@ def learn_recurrent(
     """
     name, settings = hyperparameters(task, "ppo_lstm")
     env = make(task, of, settings["n_envs"], with_action=True)
-    timesteps = settings["n_timesteps"] if timesteps is None else timesteps
+    timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
     model = _fit(
         name,
         settings,
@@ -156,7 +179,7 @@ def learn_recurrent(
         seed=seed,
         folder=folder,
         progress=progress,
-        description=f"{task.system} recurrent {of}",
+        description=f"{get_system(task.system).name} recurrent {of}",
     )
 
     def policy() -> Policy:
@@ -175,6 +198,12 @@ def learn_recurrent(
     return policy
 
 
+def _positive(timesteps: int) -> int:
+    if timesteps < 1:
+        raise ValueError(f"timesteps must be positive, got {timesteps}")
+    return timesteps
+
+
 def _fit(
     algorithm: str,
     settings: dict[str, Any],
@@ -184,27 +213,36 @@ def _fit(
     timesteps: int,
     seed: int,
     folder: Path,
+    checkpoint: Checkpoint | None = None,
     progress: Progress | None,
     description: str,
 ) -> BaseAlgorithm:
-    """Train on minus the cost, with the learning curve in FOLDER/progress.csv."""
-    if timesteps < 1:
-        raise ValueError(f"timesteps must be positive, got {timesteps}")
+    """Train on minus the cost, with the learning curve in FOLDER/progress.csv; goes on from the checkpoint's file."""
     settings = {key: value for key, value in settings.items() if key not in ("n_envs", "n_timesteps")}
     vec_env = VecMonitor(SB3VecEnv(Cost(env, task)))
     rate = settings.pop("learning_rate")
     if isinstance(rate, str):
         rate = _linear(float(rate.removeprefix("lin_")))
-    first = agent_training_seed(seed)
+    first, callbacks = (
+        agent_training_seed(seed),
+        list[BaseCallback]([_Bar(progress, f"{description} {seed}", timesteps)]),
+    )
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
-    model.set_logger(configure(str(folder), ["csv"]))
-    vec_env.seed(first)  # only now: the model has just seeded it with ``seed``
-    try:
-        model.learn(timesteps, callback=_Bar(progress, f"{description} {seed}", timesteps))
-    finally:
-        model.logger.close()
-        vec_env.close()
+    with naming(folder / CURVE):  # which alone is written without its name in errors
+        model.set_logger(configure(str(folder), ["csv"]))
+        try:
+            if checkpoint is not None:
+                callbacks.append(checkpoint)
+                checkpoint.restore(model, timesteps)
+                if checkpoint.resumed:
+                    first = agent_training_seed(seed, checkpoint.resumed, env.num_envs)
+                    model.set_random_seed(first)
+            vec_env.seed(first)  # only now: the model has seeded it with ``seed``
+            model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
+        finally:
+            model.logger.close()
+            vec_env.close()
     return model
 
 
@@ -244,51 +282,6 @@ def _read(name: str) -> dict[str, Any]:
     return dict(yaml.safe_load(text))
 
 
-WORST = 10.0  # of the cost, three scales off in every state; beyond it, networks would learn little else
-
-
-class Cost(VectorWrapper):
-    """Rewards minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
-
-    The environment's reward is flat far from the target, where c still tells an agent which way to go. A state that
-    escapes is taken to stay where it left for the rest of the episode, so that escaping never pays.
-
-    Parameters
-    ----------
-    env : VectorEnv
-        Whose rewards are replaced; it resets in the same step.
-    task : ControlTask
-        What made it.
-    """
-
-    def __init__(self, env: VectorEnv, task: ControlTask) -> None:
-        super().__init__(env)
-        self._task = task
-
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Step, and replace the rewards.
-
-        Parameters
-        ----------
-        actions : ndarray, shape (n, nu)
-            As the environment takes them.
-
-        Returns
-        -------
-        obs, reward, terminated, truncated, info
-            What the environment returns, but for the rewards.
-        """
-        obs, total, terminated, truncated, info = self.env.step(actions)
-        samples = np.full(self.num_envs, self._task.repeat)
-        remaining = np.zeros(self.num_envs)
-        if terminated.any():
-            age = info["final_info"]["sample"]
-            samples = np.where(terminated, (age - 1) % self._task.repeat + 1, samples)
-            remaining = np.where(terminated, self._task.steps - np.ceil(age / self._task.repeat), 0.0)
-        cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
-        return obs, -cost * (1.0 + remaining), terminated, truncated, info
-
-
 def _linear(start: float) -> Callable[[float], float]:
     return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
 
@@ -314,10 +307,14 @@ class _Bar(BaseCallback):
 
     def __init__(self, progress: Progress | None, name: str, total: int) -> None:
         super().__init__()
-        self._progress = progress
-        self._bar = None if progress is None else progress.add_task(name, total=total)
+        self._progress, self._name, self._total = progress, name, total
+
+    def _on_training_start(self) -> None:
+        if self._progress is not None:
+            done = self.model.num_timesteps  # more than none where a training goes on
+            self._bar = self._progress.add_task(self._name, total=self._total, completed=done)
 
     def _on_step(self) -> bool:
-        if self._progress is not None and self._bar is not None:
-            self._progress.update(self._bar, completed=self.num_timesteps)
+        if self._progress is not None:  # the last rollout ends past the last step
+            self._progress.update(self._bar, completed=min(self.num_timesteps, self._total))
         return True

@@ -8,7 +8,9 @@ from PIL import Image
 
 from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
+from observers.storage import replacing
 from training.agents.play import Episodes
+from training.evaluation.levels import show_level
 from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
@@ -49,8 +51,9 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
     for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
         axes[i, 0].set_ylabel(name)
     axes[0, 0].legend(loc="upper right", fontsize="x-small")
-    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {task.measurement_noise:g}")
-    figure.savefig(path, dpi=110)
+    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
 
 
 def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
@@ -76,4 +79,5 @@ def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
         for k in range(1, len(x), every)
     ]
     duration = round(1000 * SECONDS / len(frames))
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=duration, loop=0)
+    with replacing(path) as temporary:
+        frames[0].save(temporary, save_all=True, append_images=frames[1:], duration=duration, loop=0)

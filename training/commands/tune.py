@@ -1,32 +1,26 @@
 """``kkl-gym tune``: a spectrum for a system and a noise level, and what others would have given."""
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-import pandas as pd
-import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from observers.storage import replacing, write
+from training.commands.options import Parameters, SystemName
 from training.config import Pipeline
 from training.presets import preset
 from training.progress import progress_bars
 from training.spectrum import Spectrum, papers_spectrum
-from training.tuning.check import rank_correlation, settings, trained_error
-from training.tuning.intervals import judge
 from training.tuning.probe import Choice, Probe
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from training.tuning.found import Found
 
-EXTENDED = "default's real ones and more"
 CUTOFFS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])  # of Bessel filters, in multiples of the frequency of most of y's power
 
 
@@ -40,8 +34,7 @@ class Tune:
     intervals.csv instead. docs/tuning.md says what the prediction rests on.
     """
 
-    system: tyro.conf.Positional[str]
-    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    system: SystemName
     pipeline: Pipeline = "input-aware"
     """What is to be trained with the spectrum, as for `kkl-gym train`."""
     measurement_noise: float = 0.5
@@ -53,11 +46,10 @@ class Tune:
     """Sampling interval in seconds."""
     duration: float = 50.0
     """Length of a run in seconds: how much transients count."""
-    parameters: dict[str, float] = field(default_factory=dict)
-    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
+    parameters: Parameters = field(default_factory=dict)
     seed: int = 0
     """Seed of the motions' starts."""
-    check: float | None = None
+    check: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: no training)")] = None
     """Also train an observer for some of the spectra, for this many CPU seconds each, and compare what they leave with
     what was predicted: check.csv."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/tuning/NAME-NOISE)")] = None
@@ -108,9 +100,16 @@ class Tune:
 
     def _intervals(self, system: System, console: Console, *, folder: Path, again: str) -> Choice:
         """Judge intervals for a physics-informed map, print and write."""
-        with console.status(f"following motions of {system.name}"):
+        from training.tuning.intervals import judge  # pandas takes half a second to import
+
+        with progress_bars(console) as progress, progress.phase(f"judging intervals for {system.name}", 100) as report:
             found = judge(
-                system, self.dt, duration=self.duration, measurement_noise=self.measurement_noise, seed=self.seed
+                system,
+                self.dt,
+                duration=self.duration,
+                measurement_noise=self.measurement_noise,
+                seed=self.seed,
+                report=lambda share: report(100 * share),
             )
         console.print(found.table(f"{system.name}, measurement noise {self.measurement_noise:g}"))
         found.save(folder, self.dt)
@@ -122,26 +121,32 @@ class Tune:
         console.print(f"wrote config.json and intervals.csv in {folder}; to train an observer with it:\n{again}")
         return found.best
 
-    def _compare(self, system: System, console: Console) -> "_Found":
+    def _compare(self, system: System, console: Console) -> "Found":
         """Spectra chosen for some levels of noise, others for the one asked for, and the best."""
+        from training.tuning.found import EXTENDED, Found
+
         start = Spectrum(preset(system, "input-aware", "fast").eigenvalues)
-        with console.status(f"following motions of {system.name}"):
-            probe = Probe(system, self.dt, self.duration, seed=self.seed, start=start)
         noise = self.measurement_noise
         levels = sorted({0.0, noise, noise / 5 if noise else 0.1, 2 * noise if noise else 0.5})
-        fronts = {}
-        for level in levels:
-            with console.status(f"choosing modes for noise {level:g}"):
+        with (
+            progress_bars(console) as progress,
+            progress.phase(f"choosing modes for {system.name}", 3 + len(levels)) as report,
+        ):
+            probe = Probe(system, self.dt, self.duration, seed=self.seed, start=start)
+            fronts = {}
+            for done, level in enumerate(levels, 1):
+                report(done)
                 fronts[level] = probe.choose(level, self.modes, anew=True)
-        with console.status("comparing others"):
+            report(1 + len(levels))
             others = self._others(probe)
-        if start.modes <= self.modes:
-            best = replace(probe.choose(noise, self.modes)[-1], kind=EXTENDED)
-            others.insert(0, best)
-        else:
-            small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
-            best = min(small, key=lambda choice: choice.error)
-        return _Found(system, noise, fronts, others, best, least=probe.least(noise) if noise else None)
+            report(2 + len(levels))
+            if start.modes <= self.modes:
+                best = replace(probe.choose(noise, self.modes)[-1], kind=EXTENDED)
+                others.insert(0, best)
+            else:
+                small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
+                best = min(small, key=lambda choice: choice.error)
+        return Found(system, noise, fronts, others, best, least=probe.least(noise) if noise else None)
 
     def _others(self, probe: Probe) -> list[Choice]:
         """The package's default and the paper's, whatever their size, and Bessel filters of few enough modes."""
@@ -154,8 +159,13 @@ class Tune:
             return found
         return found + probe.bessel(noise, orders, CUTOFFS * np.median(probe.frequencies))
 
-    def _check(self, console: Console, found: "_Found", folder: Path) -> None:
+    def _check(self, console: Console, found: "Found", folder: Path) -> None:
         """Train observers for some of the spectra, and compare what they leave with what was predicted."""
+        import torch
+
+        from training.tuning.check import rank_correlation, trained_error
+        from training.tuning.found import write_csv
+
         assert self.check is not None
         torch.set_num_threads(1)
         front = found.fronts[found.noise]
@@ -181,95 +191,4 @@ class Tune:
             (choice.kind, choice.spectrum.modes, choice.error, left)
             for choice, left in zip(choices, measured, strict=True)
         ]
-        _write_csv(folder / "check.csv", ["kind", "modes", "predicted", "trained"], rows)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What tuning found for a system.
-
-    Parameters
-    ----------
-    system : System
-        That is to be observed.
-    noise : float
-        Standard deviation of the measurement noise to tune for.
-    fronts : dict of float to list of Choice
-        Spectra of more and more modes by level of noise.
-    others : list of Choice
-        To compare with, at ``noise``.
-    best : Choice
-        One of them.
-    least : float or None
-        Error in percent of whoever knows the equations; None without noise.
-    """
-
-    system: System
-    noise: float
-    fronts: dict[float, list[Choice]]
-    others: list[Choice]
-    best: Choice
-    least: float | None
-
-    def table(self) -> Table:
-        """For people."""
-        table = Table(
-            "modes", "predicted error in %", "", title=f"{self.system.name}, measurement noise {self.noise:g}"
-        )
-        for choice in [*self.fronts[self.noise], *self.others]:
-            mark = "[green]written[/green]" if choice is self.best else ""
-            table.add_row(str(choice.spectrum.modes), f"{choice.error:.3g}", f"{choice.kind} {mark}")
-        if self.least is not None:
-            table.add_row("–", f"{self.least:.3g}", "who knows the equations and all of y")
-        return table
-
-    def save(self, folder: Path, beside: dict[str, Any]) -> None:
-        """Write config.json, with some settings beside those that were found, front.csv and front.png."""
-        config = {**settings(self.best.spectrum, self.noise), **beside}
-        write(folder / "config.json", json.dumps(config, indent=2) + "\n")
-        rows = [
-            (level, choice.kind, choice.spectrum.modes, choice.error)
-            for level, choices in [*self.fronts.items(), (self.noise, self.others)]
-            for choice in choices
-        ]
-        _write_csv(folder / "front.csv", ["noise", "kind", "modes", "error"], rows)
-        with replacing(folder / "front.png") as temporary:
-            self.figure().savefig(temporary, dpi=110)
-
-    def figure(self) -> "Figure":
-        """Predicted errors against numbers of modes, and the eigenvalues that are written."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(11, 4), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        color = f"C{list(self.fronts).index(self.noise)}"
-        for i, (level, choices) in enumerate(self.fronts.items()):
-            width = 2 if level == self.noise else 1
-            left.semilogy(*_points(choices), "o-", color=f"C{i}", ms=3, lw=width, label=f"noise {level:g}")
-        for kind, marker in ((EXTENDED, "*"), ("default", "s"), ("paper's", "^"), ("Bessel", "x")):
-            same = [choice for choice in self.others if choice.kind == kind]
-            if same:
-                label = f"{kind}, noise {self.noise:g}"
-                left.semilogy(*_points(same), marker, color=color, ms=7, mfc="none", label=label)
-        title = self.system.name.replace("_", " ")
-        left.set(xlabel="modes for each output", ylabel="predicted error in %", title=title)
-        left.set_ylim(top=10 * left.get_ylim()[1])  # room for the legend
-        left.legend(fontsize="small", ncols=2)
-        for choice in self.others:
-            if choice.kind == "default":
-                poles = choice.spectrum.poles
-                right.plot(poles.real, poles.imag, "s", mfc="none", label="default")
-        poles = self.best.spectrum.poles
-        right.plot(poles.real, poles.imag, "x", color=color, label=f"written: {self.best.kind}")
-        right.set(xscale="symlog", xlabel="Re λ in 1/s", ylabel="Im λ in rad/s")
-        right.set_title(f"eigenvalues of A, noise {self.noise:g}")
-        right.legend(fontsize="small")
-        return figure
-
-
-def _points(choices: list[Choice]) -> np.ndarray:
-    return np.array([[choice.spectrum.modes, choice.error] for choice in choices]).T
-
-
-def _write_csv(path: Path, columns: list[str], rows: list[tuple[Any, ...]]) -> None:
-    write(path, pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.6g"))
+        write_csv(folder / "check.csv", ["kind", "modes", "predicted", "trained"], rows)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from scipy.signal import lfilter
@@ -10,8 +11,10 @@ from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, Limits
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
@@ -19,6 +22,7 @@ LARGEST = 2.0  # for maps that are not told the noise, in multiples of the usual
 WINDOW, WARM_UP = 0.5, 5.0  # seconds at the pace of the shipped systems
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
+PARTS = 1 + len(LEVELS)  # of the work: simulating, and each level
 
 
 def calibrate(
@@ -29,6 +33,8 @@ def calibrate(
     duration: float | None = None,
     false_alarms: float = 0.01,
     seed: int = 0,
+    policy: Controller | None = None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> Artifact:
     """Find limits for an observer's monitor.
 
@@ -50,6 +56,11 @@ def calibrate(
         Probability that a sound trajectory of this length exceeds a limit.
     seed : int
         Seed of starts, inputs and noise.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one; half of the trajectories then are its own, and in the
+        others it explores.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -76,12 +87,15 @@ def calibrate(
     if trajectories is not None and trajectories < least:
         raise ValueError(f"{trajectories} trajectories are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng, policy=policy)
     largest = np.asarray(artifact.inverse.measurement_noise_max)
     if not np.isfinite(largest).all():
         largest = LARGEST * np.asarray(artifact.measurement_noise)
     levels = np.multiply.outer(LEVELS, largest)
-    rows = [_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng) for level in levels]
+    rows = []
+    for done, level in enumerate(levels, 1):
+        report(done)
+        rows.append(_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng))
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
         artifact, limits=Limits(levels, mean, low, high, window, warm_up, false_alarms, duration)
@@ -89,7 +103,13 @@ def calibrate(
 
 
 def sound_trajectories(
-    artifact: Artifact, system: System, *, n: int, duration: float, rng: np.random.Generator
+    artifact: Artifact,
+    system: System,
+    *,
+    n: int,
+    duration: float,
+    rng: np.random.Generator,
+    policy: Controller | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories with process noise, every other one under random inputs if the map knows inputs.
 
@@ -107,6 +127,8 @@ def sound_trajectories(
         Length of each in seconds.
     rng : numpy.random.Generator
         From which starts, inputs and process noise are drawn.
+    policy : callable, optional
+        Acts on the system in place of random inputs; every other trajectory is its own, without errors and exploration.
 
     Returns
     -------
@@ -126,10 +148,15 @@ def sound_trajectories(
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
         u = np.zeros((steps, missing, system.nu))
-        if artifact.nu:
+        if artifact.nu and not policy:
             u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng)
         w = draw_process_noise(system, system.process_noise, n=missing, steps=steps, rng=rng)
-        x = simulate(system, system.draw_starts(rng, missing), steps, dt, u=u, w=w)
+        x0 = system.draw_starts(rng, missing)
+        if policy:
+            own = np.arange(missing) % 2 == 1
+            x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
+        else:
+            x = simulate(system, x0, steps, dt, u=u, w=w)
         inside = np.isfinite(x[-1]).all(-1)
         kept.append((x[:, inside], u[:, inside]))
         if len(kept) == TRIES:

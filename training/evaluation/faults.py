@@ -1,5 +1,6 @@
 """Faulty sensors, and how soon an observer's monitor notices them."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
@@ -10,10 +11,12 @@ from observers import Artifact, KKLObserver
 from training.evaluation.calibration import sound_trajectories
 from training.seeds import Stream, generator
 from training.systems import profile
+from training.trajectories.controllers import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
+PARTS = 1 + len(FAULTS)  # of the work: simulating, and each fault
 
 
 def deadline(system: System, duration: float) -> float:
@@ -29,6 +32,8 @@ def simulate_faults(
     duration: float,
     measurement_noise: float | tuple[float, ...],
     seed: int,
+    policy: Controller | None = None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -46,6 +51,10 @@ def simulate_faults(
         Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of starts, inputs and noise.
+    policy : callable, optional
+        Acts on the system, as for :func:`training.evaluation.calibration.calibrate`.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -66,15 +75,16 @@ def simulate_faults(
             f"a fault in the middle of {duration} s leaves less than the {allowed:g} s within which it is to be noticed"
         )
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng)
+    x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng, policy=policy)
     clean = system.output(x)
     y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
-    undriven = clean[len(clean) // 2 :, ~u.any((0, 2))]
-    width = np.ptp(undriven, axis=(0, 1))
+    counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it
+    width = np.ptp(clean[len(clean) // 2 :, counted], axis=(0, 1))
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
-    for fault in FAULTS:
+    for done, fault in enumerate(FAULTS, 1):
+        report(done)
         seen = y.copy()
         if fault == "bias":
             seen[at:] += BIAS * width

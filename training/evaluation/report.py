@@ -1,6 +1,5 @@
 """A training run in one picture."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,20 @@ from observers import Artifact, KKLObserver
 from observers.storage import replacing
 from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
+from training.evaluation.levels import show_level
 from training.maps.smooth import residual
 from training.pipeline import Result
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import noisy_output
 
 
-def write_report(path: Path, result: Result, system: System, seed: int = 1_000_000) -> None:
+def write_report(
+    path: Path, result: Result, system: System, *, policy: Controller | None = None, seed: int = 1_000_000
+) -> None:
     """Draw the errors in training, the PDE residual over the domain, and estimates against the truth.
 
     Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
-    unseen, without process noise and input, and not those that ``kkl-gym evaluate`` takes.
+    unseen, without process noise and input but a policy's, and not those that ``kkl-gym evaluate`` takes.
 
     Parameters
     ----------
@@ -30,6 +33,8 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
         What the training made.
     system : System
         What it was made for.
+    policy : callable, optional
+        Acts on the system, with errors and exploration.
     seed : int
         Seed of the trajectories and their noise.
     """
@@ -37,7 +42,9 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
 
     artifact = result.artifact
     seconds = min(20.0 * system.pace, artifact.training["duration"])
-    trajectories = unseen_trajectories(system, artifact.filter.dt, n=20, duration=seconds, seed=seed)
+    trajectories = unseen_trajectories(
+        system, artifact.filter.dt, n=20, duration=seconds, seed=seed, driven=policy is not None, policy=policy
+    )
     figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
     grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
     losses = figure.add_subplot(grid[0, 0])
@@ -52,18 +59,19 @@ def write_report(path: Path, result: Result, system: System, seed: int = 1_000_0
         draw_residual(right, artifact, system)
 
     x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
+    u = trajectories.u[:, :1] if policy else None
     rng = np.random.default_rng(seed)
     t = np.arange(len(x)) * artifact.filter.dt
     for column, level in enumerate((0.0, artifact.measurement_noise)):
         y = noisy_output(system, x, measurement_noise=level, rng=rng)
-        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y)
+        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y, u)
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])
             ax.plot(t, x[..., i], "k", lw=1.2, label="true")
             ax.plot(t, x_hat[..., i], "m--", lw=1.2, label="estimated")
             ax.set_ylabel(system.state_names[i])
             if i == 0:
-                ax.set_title(f"measurement noise {_shown(level)}")
+                ax.set_title(f"measurement noise {show_level(level)}")
                 ax.legend(loc="upper right")
         ax.set_xlabel("t in s")
     with replacing(path) as temporary:
@@ -81,13 +89,8 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: Un
         np.median(errors(artifact, system, trajectories, measurement_noise=level, seed=seed).late) for level in levels
     ]
     ax.plot(range(len(levels)), medians, "o-")
-    ax.set_xticks(range(len(levels)), [_shown(level, digits=2) for level in levels])
+    ax.set_xticks(range(len(levels)), ["\n".join(f"{each:.2g}" for each in np.atleast_1d(level)) for level in levels])
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
-
-
-def _shown(level: float | Sequence[float], digits: int = 6) -> str:
-    """A level of noise as text, one for each output where they differ, in lines of their own."""
-    return "\n".join(f"{each:.{digits}g}" for each in np.atleast_1d(level))
 
 
 def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 150) -> None:

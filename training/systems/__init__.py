@@ -3,11 +3,15 @@
 docs/adding_a_system.md says how to add one.
 """
 
+import numpy as np
+
+from kkl_gym.loading import load_function
 from kkl_gym.system import System
 from training.systems import lorenz, reverse_duffing, rossler, van_der_pol
 from training.systems.profile import Profile
 from training.systems.task import ControlTask
 from training.trajectories.controllers import Controller
+from training.trajectories.policy import checked_policy
 
 PROFILES: dict[str, Profile] = {
     "reverse_duffing": reverse_duffing.PROFILE,
@@ -60,4 +64,37 @@ def controller(system: System) -> Controller:
     return profile(system).controller(system)
 
 
-__all__ = ["PROFILES", "ControlTask", "Profile", "controller", "profile"]
+def named_policy(system: System, name: str) -> Controller:
+    """A policy under which motions of a system are simulated.
+
+    Parameters
+    ----------
+    system : System
+        A system with inputs.
+    name : str
+        "controller" for what :func:`controller` returns, or where a function of the user's is written, as
+        ``"module:function"`` or ``"script.py:function"``: states, of shape (n, nx), in; actions in [-1, 1], of shape
+        (n, nu), out.
+
+    Returns
+    -------
+    callable
+        The policy, tried on some states.
+
+    Raises
+    ------
+    ValueError
+        If it cannot be found or is none, or if the system has no inputs or its linearisation cannot be stabilised.
+    """
+    if name != "controller":
+        return checked_policy(load_function(name), system, name)
+    try:
+        return checked_policy(controller(system), system, name)
+    except np.linalg.LinAlgError as error:
+        raise ValueError(
+            f"no linear-quadratic regulator holds {system.name} at its target {system.target} ({error}): set the "
+            "target, or give a policy of your own as script.py:function"
+        ) from error
+
+
+__all__ = ["PROFILES", "ControlTask", "Profile", "controller", "named_policy", "profile"]

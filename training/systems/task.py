@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from gymnasium.vector import AutoresetMode
 
 from kkl_gym import KKLVectorEnv, VectorActionRepeat
-from kkl_gym.system import Box
+from kkl_gym.system import Box, System
 from kkl_gym.wrappers.vector import VectorEnv
+from observers.checks import is_finite
+
+MOST_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
 
 
 @dataclass(frozen=True)
@@ -16,14 +19,14 @@ class ControlTask:
 
     Parameters
     ----------
-    system : str
-        A shipped name, "module:Class" or "script.py:Class".
+    system : str or System
+        A shipped name, "module:Class" or "script.py:Class", or the system itself. Agents can be saved with a name only.
     measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     period : float
         Seconds for which an action is held; the observer sees every sample within.
     duration : float
-        Length of an episode in seconds.
+        Length of an episode in seconds, at most 100,000 sampling intervals.
     start_box : tuple of (float, float), optional
         Low and high end of each state, where episodes start; by default the training box.
     tolerance : float
@@ -37,7 +40,7 @@ class ControlTask:
         If a number makes no sense, or a time is no whole multiple of the next shorter one.
     """
 
-    system: str
+    system: str | System
     measurement_noise: float | tuple[float, ...] = 0.5
     period: float = 0.05
     duration: float = 20.0
@@ -46,8 +49,15 @@ class ControlTask:
     dt: float = 0.01
 
     def __post_init__(self) -> None:
+        for name in ("period", "duration", "tolerance", "dt"):
+            if not is_finite(getattr(self, name)):
+                raise ValueError(f"a task's {name} must be a finite number, got {getattr(self, name)!r}")
         if not self.tolerance > 0 or not 0 < self.dt <= self.period <= self.duration:
             raise ValueError(f"a task needs tolerance > 0 and 0 < dt <= period <= duration, got {self}")
+        if self.duration / self.dt > MOST_SAMPLES:
+            raise ValueError(
+                f"an episode has at most {MOST_SAMPLES} samples, got {self.duration} s at dt = {self.dt} s"
+            )
         for name, time, unit in (("period", self.period, self.dt), ("duration", self.duration, self.period)):
             if abs(time / unit - round(time / unit)) > 1e-6:
                 raise ValueError(f"{name} = {time} s must be a whole multiple of {unit} s")

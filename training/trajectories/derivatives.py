@@ -1,15 +1,27 @@
 """Derivatives of a system from its own equations."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
+from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
+
+# Functions in the derivatives that sympy does not print for NumPy, or prints for arrays of one shape only.
+_IN_NUMPY = {
+    "Max": lambda *values: functools.reduce(np.maximum, values),
+    "Min": lambda *values: functools.reduce(np.minimum, values),
+    "Heaviside": np.heaviside,
+}
 
 
 def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of f or h from its own equations.
+
+    At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of those on both sides; at a jump it is that
+    beside it.
 
     Parameters
     ----------
@@ -25,23 +37,43 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
     Raises
     ------
-    ValueError
+    EquationError
         If the equations do not take sympy symbols.
+    ValueError
+        If sympy cannot differentiate them.
     """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
     x = sympy.symbols(f"x:{nx}", real=True)
     rows = []
-    try:
-        values = [sympy.sympify(value) for value in equations(list(x))]
-    except TypeError as error:
-        raise ValueError(f"derivatives need equations that take symbols, from kkl_gym.elementary: {error}") from error
-    for value in values:
+    for i, value in enumerate(components(equations, list(x))):
+        value = _differentiable(sympy.sympify(value))
         derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
-        rows.append({j: sympy.lambdify(x, d, "numpy", cse=True) for j, d in derivatives.items() if d != 0})
+        if any(derivative.has(sympy.Derivative) for derivative in derivatives.values()):
+            raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative that sympy knows: {value}")
+        rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in derivatives.items() if d != 0})
     return rows
 
 
+def _differentiable(value: Any) -> Any:
+    """An expression in which functions with kinks and jumps are written so that sympy knows their derivatives."""
+    import sympy
+
+    def flat(name: str) -> Any:
+        return type(name, (sympy.Function,), {"fdiff": lambda self, argindex=1: sympy.Integer(0)})
+
+    floor = flat("floor")
+    for function, real in (
+        (sympy.Mod, lambda a, b: a - b * floor(a / b)),
+        (sympy.floor, floor),
+        (sympy.sign, flat("sign")),
+        (sympy.Abs, lambda u: sympy.Max(u, -u)),
+    ):
+        value = value.replace(function, real)
+    return value
+
+
+@np.errstate(all="ignore")  # where(x > 0, log(x), 0) is evaluated on both sides of zero
 def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np.ndarray:
     """Evaluate what :func:`jacobian` returned at states (..., nx), as (..., rows, nx)."""
     out = np.zeros((*x.shape[:-1], len(rows), x.shape[-1]))
@@ -52,14 +84,32 @@ def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linearise a system at a state x: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx)."""
-    g = np.array(system.g(x), dtype=float).reshape(system.nx, system.nu)
-    at = np.array(x, dtype=float)
-    return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
+    """Linearise a system at a state x without input: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx).
+
+    In discrete time the first two are the derivatives of the step.
+    """
+    at, nx = np.array(x, dtype=float), system.nx
+    C = evaluate(jacobian(system.h, nx), at)
+    if system.discrete:
+        both = evaluate(_of_step(system), np.concatenate([at, np.zeros(system.nu)]))
+        return both[:, :nx], both[:, nx:], C
+    g = np.array(input_matrix(system, x), dtype=float).reshape(nx, system.nu)
+    return evaluate(jacobian(system.f, nx), at), g, C
+
+
+def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of a step in discrete time, by state and then by input."""
+
+    def step(both: Components) -> Components:
+        return components(system.step, both[: system.nx], both[system.nx :])
+
+    return jacobian(step, system.nx + system.nu)
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
-    """Put a system beside its variational equation, x' = f(x) + G u and Phi' = df/dx Phi.
+    """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
+
+    In discrete time the next Phi is that of the step, d step/dx Phi.
 
     Parameters
     ----------
@@ -76,34 +126,71 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
     Raises
     ------
     ValueError
-        If it is driven through an input matrix that depends on the state, or f does not take sympy symbols.
+        If the equations do not take sympy symbols.
     """
-    nx, rows = system.nx, jacobian(system.f, system.nx)
-    nu = system.nu if driven else 0
-    if nu and type(system).g is not System.g:
-        raise ValueError(
-            f"{system.name} has an input matrix that depends on the state, which the variational equation would need"
-        )
+    nx, nu = system.nx, system.nu if driven else 0
+    box: Box = (*system.X, *((0.0, 1.0),) * nx**2)
+    limits: Box = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+    inputs = system.u_max if driven else ()
+    joint = f"{system.name}-sensitivity"
+    if system.discrete:
+        moves = _of_step(system)
+
+        class Stepping(System):
+            name = joint
+            X: ClassVar[Box] = box
+            bounds: ClassVar[Box] = limits
+            u_max: ClassVar[tuple[float, ...]] = inputs
+            dt = system.dt
+
+            def step(self, x: Components, u: Components) -> Components:
+                acting = u if nu else (0.0,) * system.nu
+                return [*system.step(x[:nx], acting), *_times(moves, (*x[:nx], *acting), x[nx:])]
+
+        return Stepping()
+    rows = jacobian(system.f, nx)
+    steered = bool(nu) and type(system).g is not System.g
+    columns = [_of_column(system, j) for j in range(nu)] if steered else []
 
     class Sensitivity(System):
-        name = f"{system.name}-sensitivity"
-        X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
-        bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
-        u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu else ()
+        name = joint
+        X: ClassVar[Box] = box
+        bounds: ClassVar[Box] = limits
+        u_max: ClassVar[tuple[float, ...]] = inputs
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not steered else ()
 
         def f(self, x: Components) -> Components:
-            state, Phi = x[:nx], x[nx:]
-            out = list(system.f(state))
-            for row in rows:
-                at = {k: derivative(*state) for k, derivative in row.items()}
-                out += [sum(value * Phi[k * nx + j] for k, value in at.items()) for j in range(nx)]
-            return out
+            state = x[:nx]
+            return [*system.f(state), *_times(rows, state, x[nx:])]
+
+        if steered:
+
+            def g(self, x: Components) -> Sequence[Components]:
+                state = x[:nx]
+                return [*system.g(state), *zip(*(_times(column, state, x[nx:]) for column in columns), strict=True)]
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])
 
     return Sensitivity()
+
+
+def _of_column(system: System, j: int) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of a column of the input matrix, by state."""
+
+    def g(x: Components) -> Components:
+        return [row[j] for row in input_matrix(system, x)]
+
+    return jacobian(g, system.nx)
+
+
+def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: Components) -> list[Any]:
+    """Derivatives by the state, of as many components as it has, times Phi, row by row."""
+    nx, out = len(rows), []
+    for row in rows:
+        values = {k: derivative(*at) for k, derivative in row.items() if k < nx}
+        out += [sum(value * Phi[k * nx + j] for k, value in values.items()) for j in range(nx)]
+    return out
 
 
 def output_matrix(system: System) -> np.ndarray | None:

@@ -9,7 +9,9 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import LinearFilter
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
+from training.trajectories.policy import under_policy
 from training.trajectories.signals import DRIVEN, KINDS, random_inputs
 
 CHUNK = 500  # trajectories simulated at once
@@ -17,6 +19,7 @@ FIRST = 100  # trajectories tried before all others
 FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
+POLICYS_OWN = 4  # every fourth trajectory under a policy is its own, the others are also explored
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 
@@ -59,6 +62,8 @@ class Motions:
         Share of the trajectories with process noise, at any level up to the system's own, high ones more often.
     box_factor : float, default 1
         If larger, most trajectories start in this multiple of X.
+    policy : callable, optional
+        Acts on all trajectories in place of random inputs, see :func:`training.trajectories.policy.under_policy`.
     """
 
     kinds: tuple[str, ...] = ()
@@ -66,6 +71,7 @@ class Motions:
     lead_in_input: float = 0.0
     process_noise_share: float = 0.0
     box_factor: float = 1.0
+    policy: Controller | None = None
 
 
 def recording_ages(steps: int, n: int) -> np.ndarray:
@@ -133,7 +139,7 @@ def record(
     """
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
-        motions = dataclasses.replace(motions, kinds=())
+        motions = dataclasses.replace(motions, kinds=(), policy=None)
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
     levels: list[np.ndarray] = []
@@ -228,7 +234,7 @@ def _simulated(
         end = _lead_in(system, x0[led], dt=dt, rng=rng, constant=motions.lead_in_input)
         x0[led] = np.where(np.isfinite(end).all(-1)[:, None], end, x0[led])
     u = np.zeros((steps, count, 0))
-    if motions.kinds:
+    if motions.kinds and not motions.policy:
         kinds = tuple(motions.kinds[i % len(motions.kinds)] for i, _ in rows)
         u = random_inputs(system, count, steps, dt=dt, rng=rng, kinds=kinds)
     w, level = None, np.zeros(count)
@@ -236,7 +242,11 @@ def _simulated(
         some = rng.random(count) < motions.process_noise_share
         level = system.process_noise * np.where(some, np.sqrt(rng.random(count)), 0.0)
         w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
-    x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
+    if motions.policy:
+        own = np.array([i % POLICYS_OWN == 0 for i, _ in rows])
+        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
+    else:
+        x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
     return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))
 
 
@@ -245,7 +255,7 @@ def _check_share(system: System, stayed: int, tried: int, seconds: float) -> Non
     if stayed < FEWEST_INSIDE * tried:
         raise ValueError(
             f"of {tried} trajectories of {seconds:g} s only {stayed} stayed within bounds = {system.bounds}; widen the "
-            "bounds, shrink X or shorten the trajectories"
+            "bounds, shrink X or shorten the trajectories, or give a policy that holds the system (--policy)"
         )
 
 

@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import periodogram
+import scipy
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance
+from training.kalman import unknown_start
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, bessel_spectrum
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
@@ -23,6 +25,7 @@ SIGNIFICANT = 1e-13  # what rounding leaves of a matrix of unit diagonal
 FARTHEST = 1e5  # that an error in the start may grow; what is known of it is a matrix of squares
 SHORTEST = 10  # samples that must be followed
 SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no longer taken relative to it
+MIXED = 10.0  # largest half-width of X, in the smallest, beyond which states are taken to have different units
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,9 @@ class Probe:
 
     R is the noise's exact covariance at each time since reset, and RESOLUTION^2 of the signal's for the network.
 
+    Where X's half-widths differ by more than MIXED, states are taken in units of them. |x| is the distance from
+    ``system.X_centre``.
+
     Parameters
     ----------
     system : System
@@ -83,7 +89,6 @@ class Probe:
     motions: int = 40
     seed: int = 0
     start: Spectrum = field(default_factory=Spectrum)
-    _of_library: tuple[np.ndarray, np.ndarray, np.ndarray] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         if not 0 < self.dt < self.duration < np.inf or self.motions < 2:
@@ -92,17 +97,20 @@ class Probe:
                 "least 2"
             )
         system, nx = self.system, self.system.nx
-        low, high = system.box()
-        x0 = generator(Stream.TUNING, self.seed).uniform(low, high, (2 * self.motions, nx))
+        x0 = system.draw_starts(generator(Stream.TUNING, self.seed), 2 * self.motions)
         steps = round(self.duration / self.dt)
         inside = np.isfinite(simulate(system, x0, steps, self.dt)[-1]).all(-1)
         if 2 * inside.sum() < self.motions:
             raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
         x0 = x0[inside][: self.motions]
+        low, high = system.box()
+        half = (high - low) / 2
+        self._unit = half if half.max() > MIXED * half.min() else np.ones(nx)
         identity = np.tile(np.eye(nx).ravel(), (len(x0), 1))
         joint = simulate(with_sensitivity(system, driven=False), np.hstack([x0, identity]), steps, self.dt)
         # Where motions part, later times depend on the start beyond what double precision can tell.
-        useful = np.isfinite(joint).all((1, 2)) & (np.abs(joint[..., nx:]).max((1, 2)) < FARTHEST)
+        growth = np.abs(joint[..., nx:]) * np.divide.outer(self._unit, self._unit).T.ravel()
+        useful = np.isfinite(joint).all((1, 2)) & (growth.max((1, 2)) < FARTHEST)
         end = len(joint) if useful.all() else int(useful.argmin())
         if end < SHORTEST:
             raise ValueError(
@@ -112,14 +120,17 @@ class Probe:
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
         self.y = system.output(self.x)
         self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
-        self._known = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
+        self._known = np.linalg.inv(unknown_start(system)[1])
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
         self.ages = np.unique(np.concatenate([early, late])).astype(int)
         self.share = np.gradient(self.ages.astype(float))
         second_half = np.where(self.ages > end / 2, self.share, 0.0)  # what comes later is like it
         self.share += second_half / second_half.sum() * max(0, steps - (end - 1))
         self.share /= self.share.sum()
-        self._of_library = self.response(self.start + self.library)
+
+    @cached_property
+    def _of_library(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.response(self.start + self.library)
 
     @cached_property
     def library(self) -> Spectrum:
@@ -135,7 +146,7 @@ class Probe:
         moving = self.y[..., self.y.std((0, 1)) > 0]
         if not moving.size:
             return np.empty(0)
-        frequency, power = periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
+        frequency, power = scipy.signal.periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
         share = np.cumsum((power.mean(1) / power.sum(0).mean(0)).mean(-1))
         at = 2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)
         return np.unique([_rounded(w) for w in at if w > 0])
@@ -164,15 +175,15 @@ class Probe:
         Z = linear.run(signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
         return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages).sum(1)
 
-    def error(self, spectrum: Spectrum, measurement_noise: float) -> float:
+    def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
         """Predict the error of the best decoder.
 
         Parameters
         ----------
         spectrum : Spectrum
             Modes for each output.
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or sequence of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
 
         Returns
         -------
@@ -184,15 +195,15 @@ class Probe:
         FloatingPointError
             If it is no number.
         """
-        return self._error(*self.response(spectrum), measurement_noise)
+        return self._relative(self._information(*self.response(spectrum), measurement_noise))
 
-    def least(self, measurement_noise: float) -> float:
+    def least(self, measurement_noise: Level) -> float:
         """Predict the error of whoever knows the equations and remembers every sample of y.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or sequence of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
 
         Returns
         -------
@@ -202,36 +213,97 @@ class Probe:
         Raises
         ------
         ValueError
+            If an output is without noise.
+        """
+        return self._relative(self._all_information(measurement_noise))
+
+    def error_of_states(self, spectrum: Spectrum | None, measurement_noise: Level) -> np.ndarray:
+        """Predict the error of the best decoder, or the least possible, for each state.
+
+        Parameters
+        ----------
+        spectrum : Spectrum or None
+            Modes for each output. None is for whoever knows the equations and remembers every sample of y.
+        measurement_noise : float or sequence of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
+
+        Returns
+        -------
+        ndarray, shape (nx,)
+            Root mean square errors in the units of the states, mean over runs and time.
+
+        Raises
+        ------
+        ValueError
+            With neither spectrum nor noise.
+        """
+        if spectrum is None:
+            information = self._all_information(measurement_noise)
+        else:
+            information = self._information(*self.response(spectrum), measurement_noise)
+        return np.asarray(self.share @ np.linalg.norm(self._left(information), axis=-1).mean(1))
+
+    def unknown_of_starts(self, measurement_noise: Level) -> np.ndarray:
+        """Predict what all of y leaves unknown of where a run started.
+
+        Parameters
+        ----------
+        measurement_noise : float or sequence of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
+
+        Returns
+        -------
+        ndarray, shape (nx, nx)
+            Covariance, mean over runs, in units in which that of a start uniform in X is the identity. A direction in
+            which it is 1 cannot be told from y.
+
+        Raises
+        ------
+        ValueError
             Without noise.
         """
-        if not measurement_noise > 0:
-            raise ValueError("without noise, all of y tells the state exactly")
-        square = np.einsum("tnij,tnik->tnjk", self.signal, self.signal).cumsum(0)
-        return self._relative(square[self.ages] / measurement_noise**2)
+        known = np.linalg.cholesky(self._known).T
+        root = known @ _inverse_root(self._all_information(measurement_noise)[-1] + self._known)
+        return np.asarray((root @ root.mT).mean(0))
 
-    def _error(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: float) -> float:
+    def _information(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: Level) -> np.ndarray:
+        """What z tells of the start, (ages, motions, nx, nx), from what :meth:`response` returns."""
         spread = np.cov(z.reshape(-1, z.shape[-1]).T).reshape(z.shape[-1], -1)
-        R = measurement_noise**2 * P + RESOLUTION**2 * spread
+        levels = np.broadcast_to(np.asarray(measurement_noise, dtype=float), (self.system.ny,))
+        levels = np.repeat(levels, z.shape[-1] // self.system.ny)
+        R = np.multiply.outer(levels, levels) * P + RESOLUTION**2 * spread
         seen = Z @ _inverse_root(R)[:, None]
-        return self._relative(seen @ seen.mT)
+        return np.asarray(seen @ seen.mT)
+
+    def _all_information(self, measurement_noise: Level) -> np.ndarray:
+        """What all of y tells of the start, (ages, motions, nx, nx)."""
+        levels = np.broadcast_to(np.asarray(measurement_noise, dtype=float), (self.system.ny,))
+        if not (levels > 0).all():
+            raise ValueError("without noise, all of y tells the state exactly")
+        signal = self.signal / levels[:, None]
+        return np.asarray(np.einsum("tnij,tnik->tnjk", signal, signal).cumsum(0)[self.ages])
+
+    def _left(self, information: np.ndarray) -> np.ndarray:
+        """Roots of the states' covariances, (ages, motions, nx, nx), from what is known of the start beside X."""
+        return np.asarray(self.Phi[self.ages] @ _inverse_root(information + self._known))
 
     def _relative(self, information: np.ndarray) -> float:
-        """The mean error in percent, from what is known of the start beside X: (ages, motions, nx, nx)."""
-        left = self.Phi[self.ages] @ _inverse_root(information + np.diag(self._known))
-        size = np.linalg.norm(self.x[self.ages], axis=-1)
+        """The mean error in percent."""
+        left = self._left(information) / self._unit[:, None]
+        size = np.linalg.norm((self.x[self.ages] - self.system.X_centre) / self._unit, axis=-1)
         relative = np.linalg.norm(left, axis=(-2, -1)) / np.maximum(size, SMALLEST * size.max())
         found = float(100.0 * self.share @ np.minimum(relative, 2.0).mean(1))
         if not np.isfinite(found):
             raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
         return found
 
-    def choose(self, measurement_noise: float, most: int = 21, anew: bool = False) -> list[Choice]:
+    def choose(self, measurement_noise: Level, most: int = 21, anew: bool = False) -> list[Choice]:
         """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         most : int
             Modes for each output at which it ends. It also ends where none lowers the error by LEAST_GAIN.
         anew : bool
@@ -252,7 +324,9 @@ class Probe:
 
         def error_of(columns: list[int]) -> float:
             taken = np.add.outer(size * np.arange(ny), columns).ravel()
-            return self._error(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
+            return self._relative(
+                self._information(z[..., taken], Z[..., taken], P[:, taken[:, None], taken], measurement_noise)
+            )
 
         chosen, columns, found = Spectrum(), list[int](), list[Choice]()
         before = self._relative(np.zeros(self.Phi[self.ages].shape))
@@ -276,13 +350,13 @@ class Probe:
             chosen, columns, before = chosen + spectrum, columns + own, error
             found.append(Choice(chosen, error))
 
-    def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
+    def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
         """Find Bessel filters to compare with.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         orders : sequence of int
             Of the filters: their numbers of modes.
         cutoffs : iterable of float

@@ -7,9 +7,11 @@ import re
 import shutil
 from dataclasses import replace
 
+import linear_system
 import numpy as np
 import pytest
 import torch
+from linear_system import Oscillator
 from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import save as serialise
@@ -17,13 +19,15 @@ from safetensors.numpy import save_file
 from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
+from observers import MLP
 from observers.artifact import resolve
 from training.agents import SB3VecEnv
 from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
+from training.agents.cost import WORST, Cost
 from training.agents.information import observer_of
-from training.agents.learn import WORST, Cost, hyperparameters, learn, learn_recurrent
+from training.agents.learn import hyperparameters, learn, learn_recurrent
 from training.agents.play import play
-from training.agents.tasks import TASKS, ControlTask, scores
+from training.agents.tasks import TASKS, ControlTask, get_task, scores
 from training.cli import main
 from training.commands.agent import find
 from training.seeds import AGENT_EVALUATION_SEED
@@ -83,6 +87,15 @@ def test_a_task_with_starts_of_its_own_survives_saving(learned, tmp_path):
     assert Agent.read(tmp_path / "a.safetensors").task == TASKS["van_der_pol"]
 
 
+def test_levels_of_noise_of_each_output_survive_saving(learned, tmp_path):
+    agent, _ = learned
+    task = get_task(f"{linear_system.__file__}:TwoOutputs")
+    assert task.measurement_noise == (0.1, 0.3)
+    other = get_task(f"{linear_system.__file__}:TwoOutputs", (0.2, 0.4))
+    replace(agent, task=other, information="state", observer=None, rules=rules(other)).save(tmp_path / "a.safetensors")
+    assert Agent.read(tmp_path / "a.safetensors").task == replace(task, measurement_noise=(0.2, 0.4))
+
+
 def test_mismatches_are_errors(learned, saved, tmp_path):
     agent, _ = learned
     path = tmp_path / "map.safetensors"
@@ -131,16 +144,6 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         find("nothing")
 
 
-def test_random_flipped_bits_are_all_noticed(tmp_path):
-    path, whole, rng = tmp_path / "agent.safetensors", find("lorenz").read_bytes(), np.random.default_rng(0)
-    for place in rng.integers(8 * len(whole), size=100):
-        flipped = bytearray(whole)
-        flipped[place // 8] ^= 1 << place % 8
-        path.write_bytes(flipped)
-        with pytest.raises(AgentError, match=re.escape(str(path))):
-            Agent.read(path)
-
-
 @pytest.mark.parametrize("name", ["van_der_pol-closed-loop-v1", "lorenz-v1"])
 def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
     """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
@@ -175,6 +178,17 @@ def parts():
     lambda t, d: d.update(information=["x_hat"]),
     lambda t, d: d.update(format="1"),
     lambda t, d: d.pop("activation"),
+    lambda t, d: d["task"].update(system=3),
+    lambda t, d: d["task"].update(duration=float("inf")),
+    lambda t, d: d.update(observer=3),
+    lambda t, d: d.update(observer=["lorenz-v1"]),
+    lambda t, d: d.update(fingerprint=3),
+    lambda t, d: d.update(rules=[]),
+    lambda t, d: d.update(training="sac"),
+    lambda t, d: d["training"].update(seed="x/../../out"),
+    lambda t, d: d["training"].update(seed=1.0),
+    lambda t, d: d["training"].update(seed=True),
+    lambda t, d: d["training"].update(seed=None),
 ])  # fmt: skip
 def test_contents_that_make_no_agent(change, parts, tmp_path):
     tensors, described = parts
@@ -183,6 +197,60 @@ def test_contents_that_make_no_agent(change, parts, tmp_path):
     save_file(tensors, path, metadata={"kkl-gym-agent": json.dumps(described)})
     with pytest.raises(AgentError, match=re.escape(str(path))):
         Agent.read(path)
+
+
+def test_a_pipe_for_an_observer_is_not_waited_for(learned, tmp_path):
+    agent, _ = learned
+    os.mkfifo(tmp_path / "map.safetensors")
+    stranger = replace(agent, observer=str(tmp_path / "map.safetensors"))
+    with pytest.raises(
+        AgentError, match=r"observer cannot be read: .*map\.safetensors is a folder, a pipe or a device"
+    ):
+        stranger.make(1)
+
+
+@pytest.fixture(scope="module")
+def own():
+    """An agent for a system that does not ship."""
+    task = replace(TASK, system=f"{linear_system.__file__}:Oscillator")
+    network = MLP([np.zeros((1, 2))], [np.zeros(1)], "tanh")
+    return Agent(network=network, squashed=False, task=task, information="state", rules=rules(task))
+
+
+def test_a_system_that_does_not_ship_is_imported_only_if_the_caller_names_it(own, tmp_path):
+    evil = tmp_path / "evil.py"
+    evil.write_text("open('ran', 'w')\nclass Evil: pass\n")
+    named = f"{evil}:Evil"
+    stranger = replace(own, task=replace(own.task, system=named))
+    for trusted in (None, own.task.system, "van_der_pol", "evil.py:Evil"):
+        with pytest.raises(
+            AgentError, match=re.escape(f"the agent's system is {named!r}, and system={trusted!r}: give")
+        ):
+            stranger.make(1, system=trusted)
+    assert os.listdir(tmp_path) == ["evil.py"]
+    for trusted in (Oscillator, Oscillator()):  # what the file names is not asked
+        env = stranger.make(1, system=trusted)
+        assert env.unwrapped.system == Oscillator()
+    assert os.listdir(tmp_path) == ["evil.py"]
+
+
+def test_a_system_may_be_given_by_name_as_a_class_or_itself(own, tmp_path):
+    own.save(tmp_path / "own.safetensors")
+    agent = Agent.read(tmp_path / "own.safetensors")
+    for trusted in (agent.task.system, linear_system.Oscillator, linear_system.Oscillator()):
+        assert play(agent.make(2, system=trusted), agent, steps=2, seed=0).x.shape == (3, 2, 2)
+    with pytest.raises(AgentError, match="trained with equations = "):
+        agent.make(1, system=get_system("van_der_pol"))
+    with pytest.raises(ValueError, match="expected a system or the name of one, got 3"):
+        agent.make(1, system=3)
+
+
+def test_shipped_systems_need_no_trust_but_a_wrong_name_is_an_error(learned):
+    agent, _ = learned
+    for system in (None, "van_der_pol", get_system("van_der_pol")):
+        assert agent.make(1, system=system)
+    with pytest.raises(AgentError, match="the agent's system is 'van_der_pol', and system='lorenz'"):
+        agent.make(1, system="lorenz")
 
 
 def test_metadata_nested_without_end(tmp_path):

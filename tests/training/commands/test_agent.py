@@ -58,6 +58,6 @@ def test_an_agent_for_a_system_of_ones_own(tmp_path, saved, script, monkeypatch)
     with pytest.raises(SystemExit, match="if you trust that, give --system"):
         main(["agent", "evaluate", str(path), "--episodes", "2"])
     main(["agent", "evaluate", str(path), "--episodes", "2", "--system", OWN])
-    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.5-0.gif").exists()
+    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.1-0.gif").exists()
     with pytest.raises(SystemExit, match="Pendulum has no inputs"):
         main(["agent", "train", f"{script}:Pendulum", "--information", "y"])

@@ -1,7 +1,10 @@
 """The command line as a whole: help, errors and interruptions."""
 
+import errno
+import signal
 import subprocess
 import sys
+import threading
 import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -39,7 +42,7 @@ def test_every_command_has_help_of_its_own(name, capsys):
     assert not end.value.code
     shown = capsys.readouterr().out
     assert f"usage: kkl-gym {name}" in shown
-    assert "{None}|" not in shown or name in ("train", "benchmark", "tune", "speed")
+    assert "None" not in shown
 
 
 def test_wrong_settings_are_said_in_a_line_each():
@@ -104,18 +107,60 @@ def test_a_module_of_ones_own_that_is_missing_gets_no_hint(monkeypatch):
         (["train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint"),
         (["benchmark"], "kkl-gym: interrupted; the same command goes on"),
         (["agent", "compare"], "kkl-gym: interrupted; the same command goes on"),
+        (["agent", "train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint"),
         (["agent", "evaluate", "lorenz"], "kkl-gym: interrupted"),
         (["maps"], "kkl-gym: interrupted"),
     ],
 )
-def test_interruptions_while_modules_are_imported(arguments, said, monkeypatch):
+def test_interruptions_while_modules_are_imported(arguments, said, monkeypatch, capsys):
     def interrupted(name):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(training.cli, "import_module", interrupted)
     with pytest.raises(SystemExit) as end:
         main(arguments)
-    assert end.value.code == said
+    assert end.value.code == 130
+    assert capsys.readouterr().err == f"{said}\n"
+
+
+@pytest.mark.parametrize(
+    "becomes", [RecursionError, ImportError, ModuleNotFoundError, SystemError, ValueError, SystemExit]
+)
+def test_what_modules_make_of_an_interruption(becomes, monkeypatch, capsys):
+    """SciPy makes a RecursionError of it, if it comes while its parts are imported."""
+    handler = signal.getsignal(signal.SIGINT)
+
+    def interrupted(name):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise becomes("something else") from None
+
+    monkeypatch.setattr(training.cli, "import_module", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(["maps"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "kkl-gym: interrupted\n"
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_commands_run_in_threads_too(capsys):
+    thread = threading.Thread(target=main, args=(["maps"],))
+    thread.start()
+    thread.join()
+    assert "van_der_pol" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space left on device", "run/config.json"),
+                                   PermissionError(errno.EACCES, "Permission denied", "run/config.json")])  # fmt: skip
+def test_files_that_cannot_be_written_are_named_in_one_line(error, monkeypatch):
+    def fail(name):
+        raise error
+
+    monkeypatch.setattr(training.cli, "import_module", fail)
+    with pytest.raises(SystemExit) as end:
+        main(["maps"])
+    assert end.value.code == f"kkl-gym: run/config.json: {error.strerror}"
 
 
 def test_the_package_says_what_it_lacks():

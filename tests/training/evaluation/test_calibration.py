@@ -138,11 +138,11 @@ def test_limits_of_an_output_that_is_not_linear():
 
 def test_limits_of_outputs_with_levels_of_their_own():
     class Quiet(TwoOutputs):
-        name = "two_outputs"
+        name = "two-outputs"
         process_noise = 0.0
         measurement_noise = (0.1, 1.0)
 
-    artifact = exact_observer(system=Quiet(), C=TwoOutputs.C)
+    artifact = exact_observer(C=np.eye(2), name=Quiet.name)
     calibrated = calibrate(dataclasses.replace(artifact, measurement_noise=(0.1, 1.0)), Quiet(), duration=20.0)
     limits = calibrated.limits
     np.testing.assert_allclose(limits.levels[-1], [0.2, 2.0])

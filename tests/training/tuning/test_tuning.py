@@ -323,3 +323,59 @@ def test_a_file_of_settings(tmp_path):
     assert read_changes(tmp_path / "c.json") == {
         "eigenvalues": (-1, -2.5), "pairs": ((-1, 2),), "cpu_seconds": None, "samples": 20,
     }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class InOtherUnits(Oscillator):
+    """The oscillator with x2 in thousandths, about another point."""
+
+    name = "in-other-units"
+    X = ((4.0, 6.0), (6000.0, 8000.0))
+    bounds = ((-25.0, 35.0), (-23000.0, 37000.0))
+
+    def f(self, x):
+        return 1e-3 * x[1] - 7.0, -1e3 * (x[0] - 5.0)
+
+    def h(self, x):
+        return (x[0],)
+
+
+def test_predictions_do_not_depend_on_the_units_of_states(probe):
+    other = Probe(InOtherUnits(), duration=6.0, motions=8)
+    assert other.error(SPECTRUM, 0.3) == pytest.approx(probe.error(SPECTRUM, 0.3), rel=1e-6)
+    assert other.least(0.3) == pytest.approx(probe.least(0.3), rel=1e-6)
+    in_units = probe.error_of_states(SPECTRUM, 0.3) * [1.0, 1000.0]
+    np.testing.assert_allclose(other.error_of_states(SPECTRUM, 0.3), in_units, rtol=1e-6)
+
+
+def test_errors_of_states_are_those_of_a_kalman_filter(probe):
+    start, noise = np.diag(1 / probe._known), 0.3
+    expected = []
+    for age in probe.ages:
+        flow = np.array([expm(k * 0.01 * F) for k in range(age + 1)])
+        known = np.linalg.inv(start) + sum(np.outer(row, row) for row in flow[:, 0]) / noise**2
+        expected.append(np.sqrt(np.diag(flow[-1] @ np.linalg.inv(known) @ flow[-1].T)))
+    np.testing.assert_allclose(probe.error_of_states(None, noise), probe.share @ np.array(expected), rtol=1e-6)
+    assert (probe.error_of_states(SPECTRUM, noise) > probe.error_of_states(None, noise)).all()
+    unknown = probe.unknown_of_starts(noise)  # of the start, in its own standard deviations
+    np.testing.assert_allclose(unknown, np.linalg.inv(known) * np.sqrt(np.outer(probe._known, probe._known)), rtol=1e-6)
+
+
+def test_outputs_may_be_noisy_to_different_degrees():
+    probe, one = (Probe(system, duration=6.0, motions=4) for system in (Seen(), Oscillator()))
+    assert probe.error(SPECTRUM, (0.3, 0.3)) == probe.error(SPECTRUM, 0.3)
+    assert probe.least((0.3, 1e6)) == pytest.approx(one.least(0.3), rel=1e-6)
+    assert probe.error(SPECTRUM, (0.3, 1e6)) == pytest.approx(one.error(SPECTRUM, 0.3), rel=1e-4)
+
+
+def test_starts_are_drawn_as_the_system_says():
+    @dataclass(frozen=True)
+    class OnACircle(Oscillator):
+        name = "on-a-circle"
+
+        def draw_starts(self, rng, n, factor=1.0):
+            angle = rng.uniform(0, 2 * np.pi, n)
+            return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    probe = Probe(OnACircle(), duration=2.0, motions=4)
+    np.testing.assert_allclose(np.linalg.norm(probe.x, axis=-1), 1.0, rtol=1e-6)

@@ -30,7 +30,7 @@ def envelope(linear: LinearFilter, ages: np.ndarray, *, start: float, disturbanc
     start : float
         Bound of |z - T(x)| at the reset.
     disturbance : float, default 0
-        Bound of |y - h(x)| at all times, l_h psi + sqrt(ny) v in the paper.
+        Bound of |y - h(x)| at all times, l_h psi + sqrt(ny) v in the paper, whose v is the same for all outputs.
 
     Returns
     -------

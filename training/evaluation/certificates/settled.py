@@ -8,11 +8,14 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact
+from training.evaluation.levels import Level
 from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
+from training.trajectories.policy import under_policy
 
 SETTLED = 1e-4  # part of the filter's start that is left where recording begins
-RECORDED = 30.0  # seconds of each trajectory
+RECORDED = 30.0  # seconds of each trajectory, at the pace of the shipped systems
 EVERY = 10  # samples between recorded ones
 TRUNCATED = 3.0  # standard deviations at which Gaussian noise is cut, for theorems about bounded noise
 
@@ -60,10 +63,11 @@ def record_settled(
     artifact: Artifact,
     system: System,
     *,
-    measurement_noise: float,
+    measurement_noise: Level,
     process_noise: float,
     trajectories: int,
     seed: int,
+    policy: Controller | None = None,
 ) -> SettledTrajectories:
     """Simulate trajectories from starts uniform in X, and record them once the filter has forgotten its start.
 
@@ -73,14 +77,16 @@ def record_settled(
         The observer.
     system : System
         What it was made for.
-    measurement_noise : float
-        Standard deviation of v, which is cut at three of these.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of v, of all outputs or each, which is cut at three of these.
     process_noise : float
         Bound of w in multiples of the system's scale per second.
     trajectories : int
         How many to simulate.
     seed : int
         Of starts and noise.
+    policy : callable, optional
+        Acts on the system, errs and explores, alike with process noise and without; by default there is no input.
 
     Returns
     -------
@@ -97,35 +103,40 @@ def record_settled(
     dt = linear.dt
     settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
     first = math.ceil(settled / dt)
-    steps = first + round(RECORDED / dt)
+    steps = first + round(RECORDED * system.pace / dt)
     ages = np.arange(first, steps + 1, EVERY)
     x0 = system.draw_starts(rng, trajectories)
-    x = noisy_x = simulate(system, x0, steps, dt)
+
+    def moved(w: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        if policy is None:
+            return simulate(system, x0, steps, dt, w=w), np.zeros((steps, trajectories, linear.nu))
+        exploring, own = generator(Stream.CERTIFICATE, seed, 3), np.zeros(trajectories, dtype=bool)
+        return under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w)
+
+    x, u = noisy_x, noisy_u = moved()
     if process_noise:
-        w = draw_process_noise(system, process_noise, n=trajectories, steps=steps, rng=rng)
-        noisy_x = simulate(system, x0, steps, dt, w=w)
+        noisy_x, noisy_u = moved(draw_process_noise(system, process_noise, n=trajectories, steps=steps, rng=rng))
     inside = np.isfinite(x[-1]).all(-1) & np.isfinite(noisy_x[-1]).all(-1)
     if 2 * inside.sum() < trajectories:
         raise ValueError(
             f"only {inside.sum()} of {trajectories} trajectories of {steps * dt:g} s stayed within bounds = "
             f"{system.bounds}; widen the bounds, shrink X or lower process_noise = {process_noise:g}"
         )
-    x, noisy_x = x[:, inside], noisy_x[:, inside]
+    x, noisy_x, u, noisy_u = x[:, inside], noisy_x[:, inside], u[:, inside], noisy_u[:, inside]
     white = rng.standard_normal((*x.shape[:2], system.ny))
-    v = measurement_noise * np.clip(white, -TRUNCATED, TRUNCATED)
-    no_input = np.zeros((steps, x.shape[1], linear.nu))
+    v = np.asarray(measurement_noise) * np.clip(white, -TRUNCATED, TRUNCATED)
 
     def one_by_one(values: np.ndarray) -> np.ndarray:
         return np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1])
 
-    def filtered(y: np.ndarray) -> np.ndarray:
-        return one_by_one(linear.run(y, no_input, ages))
+    def filtered(y: np.ndarray, u: np.ndarray) -> np.ndarray:
+        return one_by_one(linear.run(y, u, ages))
 
     return SettledTrajectories(
         x=one_by_one(x[ages]),
-        z=filtered(system.output(x)),
+        z=filtered(system.output(x), u),
         noisy_x=one_by_one(noisy_x[ages]),
-        noisy_z=filtered(system.output(noisy_x) + v),
-        noise=filtered(v),
+        noisy_z=filtered(system.output(noisy_x) + v, noisy_u),
+        noise=filtered(v, np.zeros_like(u)),
         trajectories=x.shape[1],
     )

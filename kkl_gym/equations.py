@@ -1,0 +1,307 @@
+"""Equations that a user wrote, called with a look at what they return.
+
+They are evaluated in many places, on floats, arrays, tensors and symbols. Where time does not matter they are called
+through :func:`components`, :func:`input_matrix` and :func:`rate_at`. Where it does, a loop catches what is raised and
+asks :func:`blame`.
+"""
+
+import math
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.equation_errors import (
+    EquationError,
+    Equations,
+    code_of,
+    failed,
+    held,
+    is_of,
+    name_of,
+    returned,
+    shown,
+    signature,
+)
+from kkl_gym.user_lines import steps_within, user_line
+
+_POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt, or of abs(x)"
+
+
+def components(equations: Equations, *args: Any) -> Any:
+    """Call a system's f, h or step, and check what comes back.
+
+    Parameters
+    ----------
+    equations : callable
+        A system's ``f``, ``h`` or ``step``, or another function of the state's components.
+    *args : sequence of length nx, and for ``step`` one of length nu
+        Components of the state, and of the input: floats, arrays, tensors or symbols.
+
+    Returns
+    -------
+    sequence
+        The components, untouched.
+
+    Raises
+    ------
+    EquationError
+        If it fails, or if what it returns is no sequence of numbers of the kind that the state holds, nx of them from f
+        and step.
+    """
+    values, x = _called(equations, *args), args[0]
+    if name_of(equations) in ("f", "step"):
+        n, wanted = len(x), f"{len(x)} components, one for each state"
+    else:
+        n, wanted = None, "its components in a sequence, as in (x[0],)"
+    _check_components(equations, values, n, like=x[0], wanted=wanted)
+    return values
+
+
+def input_matrix(system: Any, x: Any) -> Any:
+    """Call a system's g, and check what comes back.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : sequence of length nx
+        As for :func:`components`.
+
+    Returns
+    -------
+    sequence of sequences, shape (nx, nu)
+        Its rows, untouched.
+
+    Raises
+    ------
+    EquationError
+        As :func:`components`, and if the shape is wrong.
+    """
+    rows, nx, nu = _called(system.g, x), len(x), system.nu
+    wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
+    if not _is_sequence(rows) or len(rows) != nx:
+        raise returned(system.g, wanted, shown(rows))
+    for row in rows:
+        _check_components(system.g, row, nu, like=x[0], wanted=wanted)
+    return rows
+
+
+def rate_at(system: Any, x: Any) -> Any:
+    """Call a system's rate, and check what comes back.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : sequence of length nx
+        As for :func:`components`.
+
+    Returns
+    -------
+    float, array, tensor or symbol
+        The rate in 1/s, untouched.
+
+    Raises
+    ------
+    EquationError
+        As :func:`components`.
+    """
+    value = _called(system.rate, x)
+    if not _fits(value, x[0]):
+        raise returned(system.rate, "one number in 1/s for each state x", _misfit(value, x[0]))
+    return value
+
+
+def check_equations(system: Any) -> None:
+    """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays.
+
+    Parameters
+    ----------
+    system : System
+        A user's system.
+
+    Raises
+    ------
+    EquationError
+        If f or h is missing, an equation fails, returns something wrong or not finite, or mixes the states of a batch.
+    """
+    names = ("step", "h", "rate") if system.discrete else ("f", "h", "g", "rate")
+    for name in names[:2]:
+        if _is_default(getattr(system, name)):
+            raise EquationError(f"{type(system).__name__} defines no {signature(getattr(system, name), 'self, ')}")
+    starts = _checked_starts(system)
+    for name in names:
+        equations, n = getattr(system, name), len(starts)
+        alone = np.array([_values(system, name, x) for x in map(tuple, starts.tolist())], dtype=float)
+        wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
+        if wrong.any():
+            at = int(wrong.argmax())
+            wanted = "finite numbers within X" + (", not below zero" if name == "rate" else "")
+            raise returned(equations, wanted, f"{alone[at].tolist()}; {held(starts[at])}")
+        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, starts.T)]).reshape(-1, n).T
+        rounding = 1e-6 * np.abs(alone).max(initial=0.0)
+        if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
+            wanted = "for each state of a batch what it returns for that state alone, and always the same"
+            found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
+            raise returned(equations, wanted, f"{found}: sum, max and norm mix states, use arithmetic on components")
+    _check_target(system)
+
+
+def _values(system: Any, name: str, x: Any) -> list[Any]:
+    """All numbers that an equation returns, checked, without input."""
+    if name == "g":
+        return [value for row in input_matrix(system, x) for value in row]
+    if name == "rate":
+        return [rate_at(system, x)]
+    inputs = ([0.0 * x[0]] * system.nu,) if name == "step" else ()
+    return [*components(getattr(system, name), x, *inputs)]
+
+
+def _checked_starts(system: Any) -> np.ndarray:
+    """A few starts, (n, nx)."""
+    n, low, high = 5, *np.array(system.bounds, dtype=float).T
+    try:
+        starts = np.asarray(system.draw_starts(np.random.default_rng(0), n))
+    except Exception as error:  # whatever a user's code raises
+        raise _unfinished(f"draw_starts(rng, n) of {system.name!r}", error) from error
+    if starts.shape != (n, system.nx) or starts.dtype.kind not in "iuf":
+        wanted = f"an array of numbers of shape (n, {system.nx})"
+        raise EquationError(f"draw_starts(rng, {n}) of {system.name!r} must return {wanted}, got {shown(starts)}")
+    if not ((starts >= low) & (starts <= high)).all():
+        raise EquationError(f"draw_starts of {system.name!r} must stay within {system.bounds}, got {starts.tolist()}")
+    return starts.astype(float)
+
+
+def _check_target(system: Any) -> None:
+    found, nx = f"target of {system.name!r}", system.nx
+    try:
+        target = system.target
+    except ValueError:  # there is none at these parameters; whoever needs one will say so
+        return
+    except Exception as error:  # whatever a user's code raises
+        raise _unfinished(found, error) from error
+    if callable(target):
+        raise EquationError(f"{found} is a method: write @property above its def")
+    if not _is_sequence(target) or len(target) != nx or not all(_fits(t, 0.0) and math.isfinite(t) for t in target):
+        raise EquationError(f"{found} must be {nx} finite numbers, one for each state, got {shown(target)}")
+
+
+def _unfinished(what: str, error: Exception) -> EquationError:
+    line = user_line(error)
+    return EquationError(f"{what} failed{f' in {line}' if line else ''}: {type(error).__name__}: {error}")
+
+
+def blame(error: Exception, system: Any, *args: Any) -> None:
+    """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise.
+
+    Parameters
+    ----------
+    error : Exception
+        What was raised where they are evaluated in a loop.
+    system : System
+        The system.
+    *args : sequences of length nx and nu
+        Components of a state and of an input, of the kind that the loop evaluates them on.
+
+    Raises
+    ------
+    EquationError
+        From the exception, or because the equations do not return what they must.
+    """
+    if isinstance(error, EquationError | NotImplementedError):
+        return
+    for equations in (system.step, system.f, system.g, system.rate):
+        if not _is_default(equations) and steps_within(error, code_of(equations)):
+            raise failed(error, equations, *args) from error
+    with np.errstate(all="ignore"):  # what they return then did not go through
+        if system.discrete:
+            components(system.step, *args)
+        else:
+            components(system.f, args[0])
+            input_matrix(system, args[0])
+            rate_at(system, args[0])
+    if isinstance(error, TypeError) and "complex" in str(error):  # numbers that cannot be compared
+        raise complex_motion(system, args[0]) from error
+
+
+def complex_motion(system: Any, x: Any) -> EquationError:
+    """Say that a motion left the real numbers, as ``x ** 0.5`` does for floats below zero.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+    x : sequence of float, length nx
+        The state from which the step was taken.
+
+    Returns
+    -------
+    EquationError
+        To be raised.
+    """
+    found = f"complex ones on the way from {held(x)}: {_POWERS}"
+    return returned(system.step if system.discrete else system.f, "real numbers", found)
+
+
+def _called(equations: Equations, *args: Any) -> Any:
+    try:
+        return equations(*args)
+    except NotImplementedError:  # says by itself what is missing
+        raise
+    except Exception as error:  # whatever a user's code raises
+        raise failed(error, equations, *args) from error
+
+
+def _is_default(equations: Equations) -> bool:
+    return getattr(equations, "__module__", None) == "kkl_gym.system"
+
+
+def _check_components(equations: Any, values: Any, n: int | None, *, like: Any, wanted: str) -> None:
+    if not _is_sequence(values):
+        raise returned(equations, wanted, shown(values))
+    if len(values) != n if n is not None else len(values) == 0:
+        raise returned(equations, wanted, f"{len(values)} of them: {shown(values)}")
+    for i, value in enumerate(values):
+        if not _fits(value, like):
+            raise returned(equations, wanted, f"{shown(values)}, of which [{i}] is {_misfit(value, like)}")
+
+
+def _is_sequence(values: Any) -> bool:
+    # An array of shape () has no length.
+    return (isinstance(values, Sequence) and not isinstance(values, str | bytes)) or (
+        (isinstance(values, np.ndarray) or is_of("torch", "Tensor", values)) and values.ndim > 0
+    )
+
+
+def _fits(value: Any, like: Any) -> bool:
+    """Whether a value is a number, or of the kind of a component of the state."""
+    if isinstance(value, Real | np.bool_):
+        return True
+    if is_of("torch", "Tensor", like):
+        return is_of("torch", "Tensor", value) and not value.is_complex() and _broadcasts(value, like)
+    if is_of("sympy", "Basic", like):
+        return is_of("sympy", "Expr", value)
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and _broadcasts(value, like)
+
+
+def _broadcasts(value: Any, like: Any) -> bool:
+    shape = tuple(np.shape(like))
+    try:
+        return np.broadcast_shapes(tuple(value.shape), shape) == shape
+    except ValueError:
+        return False
+
+
+def _misfit(value: Any, like: Any) -> str:
+    dtype = getattr(value, "dtype", None)
+    if isinstance(value, complex | np.complexfloating) or "complex" in str(dtype):
+        return f"{shown(value)}, which is complex: {_POWERS}"
+    if is_of("sympy", "Basic", value):
+        return f"{value}, which is no number: use kkl_gym.elementary.where({value}, 1.0, 0.0)"
+    if dtype is not None and np.shape(like) != np.shape(value):
+        return f"of shape {tuple(np.shape(value))}, where the components of x have shape {tuple(np.shape(like))}"
+    return f"{shown(value)}, of type {type(value).__name__}" + (
+        ": equations of symbols take kkl_gym.elementary in place of NumPy" if is_of("sympy", "Basic", like) else ""
+    )

@@ -1,0 +1,105 @@
+"""Where in a user's code an exception comes from."""
+
+import ast
+import builtins
+import itertools
+import linecache
+import sysconfig
+from pathlib import Path
+from types import CodeType, TracebackType
+from typing import Any
+
+_ROOT = Path(__file__).resolve().parents[1]
+_LIBRARIES = (
+    *(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")),
+    *(str(_ROOT / package) for package in ("kkl_gym", "observers", "training")),
+    "<",  # frozen modules, and functions that a library wrote
+)
+
+
+def user_line(error: BaseException) -> str | None:
+    """The last line outside of libraries that an exception went through.
+
+    Parameters
+    ----------
+    error : BaseException
+        Any.
+
+    Returns
+    -------
+    str or None
+        Its file, number and text; None if there is no such line.
+    """
+    outside = [step for step in _steps(error) if not _of_library(step)]
+    return line_of(outside[-1]) if outside else None
+
+
+def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackType]:
+    """The steps of an exception's way through a function and what a user's code called there.
+
+    Parameters
+    ----------
+    error : BaseException
+        Any.
+    code : code or None
+        The function's.
+
+    Returns
+    -------
+    list of traceback
+        That of the function itself first; none if the exception was raised elsewhere.
+    """
+    steps = _steps(error)
+    at = [i for i, step in enumerate(steps) if step.tb_frame.f_code is code]
+    return [steps[at[-1]], *(step for step in steps[at[-1] + 1 :] if not _of_library(step))] if at else []
+
+
+def line_of(step: TracebackType) -> str:
+    """File, number and text of the line of a step."""
+    code = step.tb_frame.f_code
+    text = linecache.getline(code.co_filename, step.tb_lineno).strip()
+    return f"{path_of(code)}, line {step.tb_lineno}" + (f" (`{text}`)" if text else "")
+
+
+def path_of(code: CodeType) -> str:
+    """The file that some code comes from, as a user would write it."""
+    path = Path(code.co_filename)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)
+
+
+def called_function(step: TracebackType) -> str:
+    """Name of the function that was being called at a step; empty where it was no call, or there is no source."""
+    code = step.tb_frame.f_code
+    line, end_line, column, end_column = next(itertools.islice(code.co_positions(), step.tb_lasti // 2, None))
+    if line is None or end_line is None:
+        return ""
+    source = [linecache.getline(code.co_filename, n).encode() for n in range(line, end_line + 1)]
+    source[-1] = source[-1][:end_column]
+    source[0] = source[0][column:]
+    try:
+        expression = ast.parse(b"(" + b"".join(source) + b")", mode="eval").body
+    except (SyntaxError, ValueError):  # a statement
+        return ""
+    function = _value(expression.func, step) if isinstance(expression, ast.Call) else None
+    return getattr(function, "__name__", "")
+
+
+def _value(node: ast.expr, step: TracebackType) -> Any:
+    """What a dotted name stood for at a step."""
+    if isinstance(node, ast.Attribute):
+        return getattr(_value(node.value, step), node.attr, None)
+    frame = step.tb_frame
+    names = {**vars(builtins), **frame.f_globals, **frame.f_locals}
+    return names.get(node.id) if isinstance(node, ast.Name) else None
+
+
+def _steps(error: BaseException) -> list[TracebackType]:
+    steps, step = [], error.__traceback__
+    while step is not None:
+        steps.append(step)
+        step = step.tb_next
+    return steps
+
+
+def _of_library(step: TracebackType) -> bool:
+    return step.tb_frame.f_code.co_filename.startswith(_LIBRARIES)

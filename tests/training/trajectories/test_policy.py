@@ -1,0 +1,114 @@
+"""Motions under a policy."""
+
+import numpy as np
+import pytest
+from linear_system import Autonomous
+from small_runs import toy
+from unstable_system import Falling
+
+from kkl_gym.simulate import simulate
+from training import train
+from training.systems import controller, named_policy
+from training.trajectories.policy import under_policy
+from training.trajectories.record import POLICYS_OWN, Motions, trajectories
+
+SYSTEM = Falling()
+
+
+def exact(x):
+    """What the policy does on the true states."""
+    return controller(SYSTEM)(x[:-1].reshape(-1, 2)).reshape(len(x) - 1, -1, 1) * SYSTEM.u_max
+
+
+def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
+    rng, own = np.random.default_rng(0), np.arange(40) % 3 == 1
+    x0 = SYSTEM.draw_starts(rng, 40)
+    x, u = under_policy(SYSTEM, controller(SYSTEM), x0, steps=300, dt=SYSTEM.dt, rng=rng, own=own)
+    apart = np.abs(u - exact(x)).max((0, 2))
+    np.testing.assert_array_equal(apart == 0, own)
+    assert np.median(apart[~own]) > 0.2
+    assert np.abs(u).max() <= SYSTEM.u_max[0]
+    np.testing.assert_array_equal(x, simulate(SYSTEM, x0, 300, SYSTEM.dt, u=u))
+
+
+def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
+    def letting_go(x):
+        assert np.isfinite(x).all()
+        return np.zeros((len(x), 1))
+
+    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
+    x, _ = under_policy(SYSTEM, letting_go, np.full((4, 2), 0.3), steps=300, dt=SYSTEM.dt, rng=rng, own=own)
+    assert np.isnan(x[-1]).any()
+
+
+def test_an_unstable_plant_is_held_by_a_policy_alone():
+    sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
+    with pytest.raises(ValueError, match="--policy"):
+        list(trajectories(SYSTEM, **{**sizes, "n": 120}, rng=np.random.default_rng(0), motions=Motions(("steps",))))
+    motions = Motions(("steps",), process_noise_share=0.5, policy=controller(SYSTEM))
+    found = list(trajectories(SYSTEM, **sizes, rng=np.random.default_rng(0), motions=motions))
+    assert sum(x.shape[1] for x, _, _ in found) == 30
+    (x, u, level), *_ = found
+    np.testing.assert_array_equal((u == exact(x)).all((0, 2)), np.arange(x.shape[1]) % POLICYS_OWN == 0)
+    assert level.any()
+
+
+def test_an_observer_is_trained_under_a_policy_and_says_so(tmp_path):
+    config = toy(SYSTEM, policy="controller", inverse_steps=20)
+    result = train(SYSTEM, config, tmp_path)
+    assert list(result.losses) == ["inverse"]
+    assert result.artifact.free_inverse is None
+    assert result.artifact.training["policy"] == "controller"
+
+
+def test_a_run_is_not_resumed_under_a_changed_policy(tmp_path):
+    script = tmp_path / "mine.py"
+    text = "import numpy as np\ndef hold(x):\n    return np.clip(-{} * x[:, :1] - 0.5 * x[:, 1:], -1, 1)\n"
+    script.write_text(text.format(2.0))
+    config = toy(SYSTEM, policy=f"{script}:hold", inverse_steps=20)
+    train(SYSTEM, config, tmp_path / "run")
+    script = tmp_path / "other" / "mine.py"
+    script.parent.mkdir()
+    script.write_text(text.format(3.0))
+    with pytest.raises(ValueError, match="policy_actions"):
+        train(SYSTEM, toy(SYSTEM, policy=f"{script}:hold", inverse_steps=20), tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("return x", r"shape \(20, 1\)"),
+        ("return 3.0 * (x[:, :1] > 0)", r"\[-1, 1\]"),
+        ("return x[:, :1] * float('nan')", r"\[-1, 1\]"),
+        ("return x.nothing", "AttributeError"),
+    ],
+)
+def test_functions_that_are_no_policy(tmp_path, body, message):
+    (tmp_path / "bad.py").write_text(f"def act(x):\n    {body}\n")
+    with pytest.raises(ValueError, match=message):
+        named_policy(SYSTEM, f"{tmp_path / 'bad.py'}:act")
+
+
+@pytest.mark.parametrize("name", ["nothing", "numpy:nothing", "nowhere.py:act", "math:pi"])
+def test_names_of_no_policy(name):
+    with pytest.raises(ValueError, match=name.rpartition(":")[2]):
+        named_policy(SYSTEM, name)
+
+
+def test_systems_that_no_policy_can_hold():
+    with pytest.raises(ValueError, match="no inputs"):
+        named_policy(Autonomous(), "controller")
+    with pytest.raises(ValueError, match="no inputs"):
+        named_policy(Autonomous(), "numpy:zeros_like")
+
+    class Uncontrolled(Falling):
+        name = "uncontrolled"
+        X = ((-0.3, 0.3), (-0.5, 0.5), (-1, 1))
+        bounds = ((-2, 2), (-5, 5), (-3, 3))
+        G = ((0.0,), (1.0,), (0.0,))
+
+        def f(self, x):
+            return *super().f(x[:2]), x[2]
+
+    with pytest.raises(ValueError, match="policy of your own"):
+        named_policy(Uncontrolled(), "controller")

@@ -1,0 +1,130 @@
+"""Motions under a policy: how plants are excited that no random input would hold within their bounds."""
+
+import hashlib
+import json
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.trajectories.controllers import Controller
+from training.trajectories.signals import random_signals
+
+ERROR = (0.02, 0.5)  # of the states that a policy acts on, in multiples of the system's scale
+EXPLORATION = 0.5  # largest amplitude of what is added to a policy's action, in input bounds
+SIGNALS = ("steps", "sine")
+
+
+def under_policy(
+    system: System,
+    policy: Controller,
+    x0: np.ndarray,
+    *,
+    steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    own: np.ndarray,
+    w: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Simulate trajectories under a policy that errs about the state and explores.
+
+    A policy that acts on the true state would tell the observer, which filters the input, what it is to find out by
+    itself. So each trajectory has an error of its own, which is added to the state before the policy sees it, and
+    something of its own is added to the action. Both are held or swing, at random sizes and rates.
+
+    Parameters
+    ----------
+    system : System
+        What is simulated.
+    policy : callable
+        States (n, nx) to actions (n, nu) in [-1, 1].
+    x0 : ndarray, shape (n, nx)
+        Starts.
+    steps : int
+        Number of sampling intervals.
+    dt : float
+        Their length in seconds; actions are held over each.
+    rng : Generator
+        Of errors and exploration.
+    own : ndarray of bool, shape (n,)
+        Which of the trajectories are the policy's own, without either.
+    w : ndarray, shape (steps, n, nx), optional
+        Process noise, held over each interval.
+
+    Returns
+    -------
+    x : ndarray, shape (steps + 1, n, nx)
+        States, NaN from where a trajectory has left the system's bounds.
+    u : ndarray, shape (steps, n, nu)
+        Inputs in their own units.
+    """
+    n, u_max = len(x0), np.array(system.u_max)
+    error = random_signals(system.scale, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=SIGNALS)
+    error *= np.exp(rng.uniform(np.log(ERROR[0]), np.log(ERROR[1]), n))[:, None]
+    exploration = random_signals((1.0,) * system.nu, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=SIGNALS)
+    exploration *= EXPLORATION * rng.random(n)[:, None]
+    error[:, own] = exploration[:, own] = 0.0
+    u = np.zeros((steps, n, system.nu))
+
+    def act(k: int, x: np.ndarray) -> np.ndarray:
+        seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # what has escaped may do anything
+        u[k] = np.clip(policy(seen) + exploration[k], -1.0, 1.0) * u_max
+        return u[k]
+
+    return simulate(system, x0, steps, dt, u=act, w=w), u
+
+
+def checked_policy(policy: Controller, system: System, name: str) -> Controller:
+    """Raise an error unless a policy does on some states what a policy should.
+
+    Parameters
+    ----------
+    policy : callable
+        States (n, nx) to actions (n, nu) in [-1, 1].
+    system : System
+        What it is to act on.
+    name : str
+        For messages.
+
+    Returns
+    -------
+    callable
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If the system has no inputs, or the policy fails on states, or returns something else.
+    """
+    if not system.nu:
+        raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
+    x = _states(system)
+    try:
+        actions = np.asarray(policy(x), dtype=float)
+    except Exception as error:  # whatever a user's function does wrong
+        raise ValueError(
+            f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}"
+        ) from error
+    if actions.shape != (len(x), system.nu):
+        raise ValueError(
+            f"the policy {name!r} must turn states of shape {x.shape} into actions of shape {(len(x), system.nu)}, got "
+            f"{actions.shape}"
+        )
+    wrong = ~(np.abs(actions) <= 1.0).all(-1)
+    if wrong.any():
+        at = int(wrong.argmax())
+        raise ValueError(
+            f"the policy {name!r} must give actions in [-1, 1], which stand for inputs up to u_max = {system.u_max}; "
+            f"at x = {x[at].tolist()} it gives {actions[at].tolist()}"
+        )
+    return policy
+
+
+def policy_fingerprint(policy: Controller, system: System) -> str:
+    """What identifies a policy: a hash of its actions on some states."""
+    actions = np.round(np.asarray(policy(_states(system)), dtype=float), 6)  # the same on every machine
+    return hashlib.sha256(json.dumps(actions.tolist()).encode()).hexdigest()[:16]
+
+
+def _states(system: System) -> np.ndarray:
+    return system.draw_starts(np.random.default_rng(0), 20)
