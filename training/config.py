@@ -240,7 +240,8 @@ def read_changes(path: Path) -> dict[str, Any]:
     except ValueError as error:  # that of JSON, or of a text in another encoding
         raise ValueError(f"{path} is no JSON: {error}") from None
     types = setting_types()
-    del types["pipeline"], types["closed_loop_trajectories"]
+    # A file of settings must not name code to run: a policy is given on the command line.
+    del types["pipeline"], types["closed_loop_trajectories"], types["policy"]
     found = current_names(found) if isinstance(found, dict) else found
     if not isinstance(found, dict) or not set(found) <= set(types):
         unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__
