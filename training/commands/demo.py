@@ -4,11 +4,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -16,8 +15,8 @@ import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
-from training.commands.options import OneObserver, OneSystem, Shown, shown
-from training.evaluation.levels import show_level
+from training.commands.options import Duration, NoiseLevel, OneObserver, OneSystem, Shown, shown
+from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
 
@@ -35,14 +34,9 @@ class Demo:
     observer: OneObserver = None
     out: Path = Path("runs/demo")
     """Folder for the figure: estimates.png, of one system alone estimates-NAME.png."""
-    measurement_noise: Annotated[
-        float | None,
-        tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: the system's, 0.5 for those that ship)"),
-    ] = None
+    measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
-    duration: Annotated[
-        float | None, tyro.conf.arg(help_behavior_hint="(default: the system's, 50 for those that ship)")
-    ] = None
+    duration: Duration = None
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
@@ -133,7 +127,7 @@ class Episode:
 def play(
     environment: Shown,
     steps: int,
-    measurement_noise: float | None,
+    measurement_noise: Level | None,
     *,
     seed: int,
     report: Callable[[int], object] = lambda done: None,
@@ -146,7 +140,7 @@ def play(
         What is shown.
     steps : int
         Length in sampling intervals.
-    measurement_noise : float or None
+    measurement_noise : float, tuple of float or None
         Standard deviation of the noise on each sample of y; None for the system's own.
     seed : int
         Seed of start and noise.
