@@ -1,7 +1,7 @@
 """The results of a benchmark's jobs, put together: as CSV files, as a table and as a figure."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -52,10 +52,10 @@ def collect(out: Path) -> None:
     for folder in sorted((path.parent for path in (out / "jobs").glob("*/*/errors.csv")), key=position):
         errors.append(pd.read_csv(folder / "errors.csv"))
         info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
-        for rule in ("budget", "protocol", "search", "validation", "seed", "version"):
-            if rules.setdefault(rule, job[rule]) != job[rule]:
+        for rule, value in _rules(job, folder.parent.name).items():
+            if rules.setdefault(rule, value) != value:
                 raise ValueError(
-                    f"{out} holds jobs of several benchmarks: {rule} = {job[rule]} in {folder}, "
+                    f"{out} holds jobs of several benchmarks: {rule} = {value} in {folder}, "
                     f"{rules[rule]} elsewhere; remove the ones that do not belong there"
                 )
         speed = folder / "speed.json"
@@ -75,6 +75,19 @@ def collect(out: Path) -> None:
         )
     write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
     write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
+
+
+def _rules(job: Mapping[str, Any], system: str) -> dict[str, Any]:
+    """What the jobs of one benchmark agree in. Systems of the user's have sampling intervals and noise of their own."""
+    budget, dt = dict(job["budget"]), job["budget"]["dt"]
+    budget |= {"duration": f"{budget['duration'] / dt:.0f} samples", "dt": None}
+    own = "" if system in SYSTEMS else f" of {system}"
+    rules = {"budget": budget, f"dt{own}": dt}
+    for name in ("protocol", "validation"):
+        described = dict(job[name])
+        rules[f"measurement_noise{own}"] = described.pop("measurement_noise")
+        rules[name] = described | {"duration": f"{described['duration'] / dt:.0f} samples"}
+    return rules | {name: job[name] for name in ("search", "seed", "version")}
 
 
 def report(out: Path) -> str:
