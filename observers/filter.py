@@ -53,7 +53,7 @@ class LinearFilter:
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
         A, B = real_array("A", A), real_array("B", B)
-        if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A) or not B.size:
+        if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
@@ -76,12 +76,6 @@ class LinearFilter:
         def function_of_A(values: np.ndarray) -> np.ndarray:
             return np.real((V * values) @ np.linalg.inv(V))
 
-        with np.errstate(all="ignore"):
-            s = poles * dt
-            hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
-            late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
-        if not (np.isfinite(hold).all() and np.isfinite(late).all()):
-            raise ValueError(f"dt = {dt!r} and the eigenvalues of A, {poles}, lead beyond the range of floats")
         blocks = 1 + nu
 
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:

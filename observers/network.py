@@ -57,7 +57,7 @@ class MLP:
             object.__setattr__(self, name, [_layer(name, values) for values in getattr(self, name)])
         width, layers = None, []
         for weight, bias in zip(self.weights, self.biases, strict=True):
-            if weight.ndim != 2 or not weight.size or bias.shape != weight.shape[:1]:
+            if weight.ndim != 2 or bias.shape != weight.shape[:1]:
                 raise ValueError(
                     f"weights must be (outputs, inputs), biases (outputs,), got {weight.shape} and {bias.shape}"
                 )

@@ -319,8 +319,8 @@ def parts():
     positive, level = means.real(lambda v: 0 < v < np.inf), means.real(lambda v: 0 <= v <= 1)
     known, point = Limits(**LIMITS), np.ones(2)
     yield from constructors(OBSERVERS, (
-        ("LinearFilter(A)", "A", A, square, lambda v: filtered(LinearFilter(v, B, 0.1)), array_value),
-        ("LinearFilter(B)", "B", B, column, lambda v: filtered(LinearFilter(A, v, 0.1)), array_value),
+        ("LinearFilter(A)", "A|nz", A, square, lambda v: filtered(LinearFilter(v, B, 0.1)), array_value),
+        ("LinearFilter(B)", "B|outputs", B, column, lambda v: filtered(LinearFilter(A, v, 0.1)), array_value),
         ("LinearFilter(dt)", "dt", 0.1, positive, lambda v: filtered(LinearFilter(A, B, v))),
         ("LinearFilter(nu)", "nu", 1, means.whole(0, 64), lambda v: filtered(LinearFilter(A, B, 0.1, v))),
         ("MLP(weight)", "weights", WEIGHTS[0], means.array(means.within((4, 2), 1e38)),
