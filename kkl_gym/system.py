@@ -235,7 +235,7 @@ class System:
         """Draw starts; default: uniform in a multiple of the training box.
 
         Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
-        must lie within the bounds.
+        must lie within the bounds. Such a system also sets ``process_noise = 0.0``, which would push states off.
 
         Parameters
         ----------

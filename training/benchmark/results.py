@@ -8,7 +8,7 @@ from typing import Any
 import pandas as pd
 
 from kkl_gym.systems import SYSTEMS
-from observers.storage import write
+from observers.storage import explained, write
 from training.benchmark.tables import draw, write_table
 from training.methods import ABLATION, METHODS
 
@@ -36,7 +36,7 @@ def collect(out: Path) -> None:
     Raises
     ------
     ValueError
-        If they are not all of one benchmark.
+        If they are not all of one benchmark, or a file is damaged.
     """
     errors, costs = [], []
     rules: dict[str, Any] = {}
@@ -50,29 +50,33 @@ def collect(out: Path) -> None:
         return first, system, second, method
 
     for folder in sorted((path.parent for path in (out / "jobs").glob("*/*/errors.csv")), key=position):
-        errors.append(pd.read_csv(folder / "errors.csv"))
-        info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
-        for rule in ("budget", "protocol", "search", "validation", "seed", "version"):
-            if rules.setdefault(rule, job[rule]) != job[rule]:
+        with explained(folder, ValueError):
+            errors.append(pd.read_csv(folder / "errors.csv"))
+            info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
+            its = {rule: job[rule] for rule in ("budget", "protocol", "search", "validation", "seed", "version")}
+            speed = folder / "speed.json"
+            costs.append(
+                {
+                    "system": folder.parent.name,
+                    "method": folder.name,
+                    "label": info["label"],
+                    "budget": job["budget"]["name"],
+                    "configuration": json.dumps(info["configuration"]),
+                    "validation": json.dumps(info["validation"]),
+                    "train_seconds": info["train_seconds"],
+                    **(
+                        json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}
+                    ),
+                    "trajectories": info["trajectories"],
+                    "seed": job["protocol"]["seed"],
+                }
+            )
+        for rule, value in its.items():
+            if rules.setdefault(rule, value) != value:
                 raise ValueError(
-                    f"{out} holds jobs of several benchmarks: {rule} = {job[rule]} in {folder}, "
+                    f"{out} holds jobs of several benchmarks: {rule} = {value} in {folder}, "
                     f"{rules[rule]} elsewhere; remove the ones that do not belong there"
                 )
-        speed = folder / "speed.json"
-        costs.append(
-            {
-                "system": folder.parent.name,
-                "method": folder.name,
-                "label": info["label"],
-                "budget": job["budget"]["name"],
-                "configuration": json.dumps(info["configuration"]),
-                "validation": json.dumps(info["validation"]),
-                "train_seconds": info["train_seconds"],
-                **(json.loads(speed.read_text()) if speed.exists() else {"us_batch_1": None, "us_batch_1000": None}),
-                "trajectories": info["trajectories"],
-                "seed": job["protocol"]["seed"],
-            }
-        )
     write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
     write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
 

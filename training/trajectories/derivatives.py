@@ -100,10 +100,10 @@ def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, n
 def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of a step in discrete time, by state and then by input."""
 
-    def step(both: Components) -> Components:
+    def moved(both: Components) -> Components:
         return components(system.step, both[: system.nx], both[system.nx :])
 
-    return jacobian(step, system.nx + system.nu)
+    return jacobian(moved, system.nx + system.nu)
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
@@ -178,10 +178,10 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
 def _of_column(system: System, j: int) -> list[dict[int, Callable[..., Any]]]:
     """Derivatives of a column of the input matrix, by state."""
 
-    def g(x: Components) -> Components:
+    def column(x: Components) -> Components:
         return [row[j] for row in input_matrix(system, x)]
 
-    return jacobian(g, system.nx)
+    return jacobian(column, system.nx)
 
 
 def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: Components) -> list[Any]:

@@ -241,7 +241,7 @@ def test_a_system_may_be_given_by_name_as_a_class_or_itself(own, tmp_path):
         assert play(agent.make(2, system=trusted), agent, steps=2, seed=0).x.shape == (3, 2, 2)
     with pytest.raises(AgentError, match="trained with equations = "):
         agent.make(1, system=get_system("van_der_pol"))
-    with pytest.raises(ValueError, match="expected a system or the name of one, got 3"):
+    with pytest.raises(ValueError, match="got 3"):
         agent.make(1, system=3)
 
 

@@ -108,7 +108,7 @@ def test_scores_that_are_damaged_are_named(text, tmp_path):
     with claimed_job(case.folder, case.identity, OTHER):
         (case.folder / "scores.json").write_text(text)
     with pytest.raises(ValueError, match=re.escape(str(case.folder / "scores.json"))):
-        collect(tmp_path, case.episodes, case.timesteps)
+        collect(tmp_path, episodes=case.episodes, timesteps=case.timesteps)
 
 
 def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):

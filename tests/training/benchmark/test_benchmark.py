@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -21,6 +22,7 @@ from kkl_gym import get_system
 from training.benchmark import protocol as protocol_module
 from training.benchmark.jobs import OTHER, Job, run_job
 from training.benchmark.protocol import Protocol, measure, run, step_time, validate, with_shared_noise
+from training.benchmark.results import collect
 from training.benchmark.tables import _number, heatmap, summarise
 from training.cli import main
 from training.commands.benchmark import Benchmark
@@ -398,6 +400,17 @@ def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
     ((_, failure, _),) = run_all(run_job, [job], 1)
     assert isinstance(failure, ValueError)
     assert str(job.folder / file) in str(failure)
+
+
+@pytest.mark.parametrize(("file", "text"), [
+    ("errors.csv", ""), ("info.json", "{"), ("info.json", "{}"), ("job.json", "[]"), ("speed.json", "[1]"),
+])  # fmt: skip
+def test_results_that_are_damaged_are_named(file, text, toy, tiny, tmp_path):
+    out = Benchmark(systems=("lorenz",), methods=(toy[0],), out=tmp_path / "out", jobs=1).run(quiet())
+    folder = out / "jobs" / "lorenz" / "constant"
+    (folder / file).write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(folder))):
+        collect(out)
 
 
 def test_a_failure_leaves_the_others(toy, tiny, tmp_path):

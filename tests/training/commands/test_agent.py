@@ -39,7 +39,8 @@ def test_an_agent_is_played_on_the_episodes_of_a_seed(tmp_path, capsys, monkeypa
     told = []
     for seed in ("0", "0", "1"):
         main(["agent", "evaluate", "lorenz", "--episodes", "5", "--seed", seed, "--out", str(tmp_path)])
-        told.append(capsys.readouterr().out)
+        lines = capsys.readouterr().out.splitlines()
+        told.append("\n".join(line for line in lines if " passed" not in line))  # progress, on a slow machine
     assert "[" in told[0]
     assert told[0] == told[1] != told[2]
     with pytest.raises(SystemExit, match="kkl-gym: seed must not be negative"):
