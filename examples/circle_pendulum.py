@@ -57,7 +57,7 @@ class CirclePendulum(kkl_gym.System):
 
 
 def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("runs/circle_pendulum")) -> np.ndarray:
-    """Train, wrap and swing; returns the estimate's rms errors in multiples of X's half-widths.
+    """Train, wrap and swing up; returns the estimate's rms errors in multiples of X's half-widths.
 
     Args:
         inverse_steps: batches of training; the preset has more, and its observer errs less.
@@ -74,7 +74,9 @@ def main(inverse_steps: int = 3000, trajectories: int = 500, out: Path = Path("r
     x_hat, info = env.reset(seed=0)
     errors = []
     for _ in range(1000):
-        x_hat, _, _, _, info = env.step(np.sign(x_hat[2:]))  # with the motion, which swings it higher
+        top = 1.5 * system.gravity / system.length  # potential energy at the top, in units of the moment of inertia
+        missing = top - x_hat[2] ** 2 / 2 - top * x_hat[0]
+        x_hat, _, _, _, info = env.step(np.clip(missing * x_hat[2:], -1.0, 1.0))  # pumps energy until it is enough
         errors.append(x_hat - info["x"])
     print(f"after {len(errors) * env.unwrapped.dt:g} s: x = {info['x'].round(3)}, x_hat = {x_hat.round(3)}")
     late = np.square(errors[len(errors) // 5 :]).mean(0) ** 0.5 / system.scale

@@ -3,7 +3,8 @@
 import gymnasium as gym
 
 from kkl_gym.envs import KKLEnv
-from kkl_gym.equations import EquationError
+from kkl_gym.equation_errors import EquationError
+from kkl_gym.own import OWN_ID
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
@@ -24,8 +25,17 @@ for _name, _id in ENV_IDS.items():
             max_episode_steps=5000,
         )
 
+if OWN_ID not in gym.registry:
+    gym.register(
+        OWN_ID,
+        entry_point="kkl_gym.own:single",
+        vector_entry_point="kkl_gym.own:vector",
+        max_episode_steps=5000,
+    )
+
 __all__ = [
     "ENV_IDS",
+    "OWN_ID",
     "SYSTEMS",
     "ActionRepeat",
     "EquationError",

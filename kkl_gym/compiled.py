@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from kkl_gym.equations import components, input_matrix, rate
+from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
@@ -70,7 +70,8 @@ def batch_step(system: System) -> BatchStep:
     The two agree to rounding. Equations that sympy cannot read, such as those with NumPy functions or ``if``, go on
     with NumPy. So do those with which the two disagree anywhere they are compared. :mod:`kkl_gym.elementary` has
     functions that serve both. The equations must depend on nothing but state, input and parameters. The logger
-    ``kkl_gym`` says at level INFO, once for each system, that NumPy goes on and why.
+    ``kkl_gym`` says at level INFO, once for each system, that NumPy goes on and why. Systems in discrete time are not
+    integrated, and make their steps in NumPy.
 
     Parameters
     ----------
@@ -88,6 +89,8 @@ def batch_step(system: System) -> BatchStep:
 @functools.lru_cache(maxsize=64)
 def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...]) -> BatchStep:
     system = kind(**dict(parameters))
+    if system.discrete:
+        return BatchStep(functools.partial(advance_batch, system), f"{system.name} makes its step itself")
     try:
         return BatchStep(compiled_step(system))
     # Anything may come out of a user's equations on symbols, or of Numba. NumPy then takes the equations as they are,
@@ -123,8 +126,6 @@ def compiled_step(system: System) -> Step:
     import numba
     import sympy
 
-    if system.discrete:
-        raise ValueError(f"{system.name} is not integrated: it makes its step itself")
     compiled = numba.njit(error_model="numpy")  # a division by zero is infinite, not an exception
     nx, nu = system.nx, system.nu
     x, u = (list(sympy.symbols(f"{letter}:{n}", real=True)) for letter, n in (("x", nx), ("u", nu)))
@@ -142,7 +143,7 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    need = sympy.lambdify([(*x,)], sympy.sympify(rate(system, x)), "math", cse=True)
+    need = sympy.lambdify([(*x,)], sympy.sympify(rate_at(system, x)), "math", cse=True)
 
     def tupled(values: list[str]) -> str:
         return "(" + "".join(f"{value}, " for value in values) + ")"

@@ -7,13 +7,15 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.equations import components
+from kkl_gym.equations import complex_motion, components
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
 from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, System
+from observers.checks import integer, mapping, real_array, shown
 
 _INTEGER = np.dtype(np.int64)
+_ACTIONS = (np.dtype(np.float32), np.dtype(np.float64))  # that a step takes as they are
 
 
 class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -132,7 +134,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         seed : int, optional
             Of starts and noise; None goes on with the generator as it is.
         options : dict, optional
-            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``.
+            ``"x0"``, shape (nx,), is the start, which is otherwise uniform in ``start_box``; None is none.
 
         Returns
         -------
@@ -144,17 +146,18 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            If x0 has the wrong shape, is not finite, lies outside the declared bounds, or if ``options`` holds an
-            unknown key.
+            If x0 has the wrong shape, is not finite, lies outside the declared bounds, if ``options`` is no mapping or
+            holds an unknown key, or if the seed is no integer or negative. The environment is then as it was.
         """
-        super().reset(seed=seed)
-        if seed is not None:
-            self._noise.clear()
         start = None
-        for key, value in (options or {}).items():
+        for key, value in mapping("options", options).items():
             if key != "x0":
-                raise ValueError(f'unknown reset option {key!r}; the one there is is "x0"')
-            start = self.plant.start(value)
+                raise ValueError(f'unknown reset option {shown(key)}; the one there is is "x0"')
+            start = None if value is None else self.plant.start(value)
+        if seed is not None:
+            seed = integer("seed", seed, 0)
+            self._noise.clear()
+        super().reset(seed=seed)
         if start is None:
             start = self.plant.draw_start(self.np_random)
         self._x = tuple(start.tolist())
@@ -189,7 +192,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            If the action has the wrong shape or holds NaN.
+            If the action has the wrong shape, or holds NaN or anything but numbers. The environment is then as it was.
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         """
@@ -256,27 +259,31 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
 
     def _input(self, action: np.ndarray) -> list[float]:
-        values = np.asarray(action, dtype=float)
-        if values.shape != (self._nu,):
-            raise ValueError(f"the action must have shape ({self._nu},), got {action!r}")
+        if type(action) is not np.ndarray or action.dtype not in _ACTIONS:
+            action = real_array("the action", action)
+        if action.shape != (self._nu,):
+            raise ValueError(f"the action must have shape ({self._nu},), got {shown(action)}")
         u = []
-        for a, u_max in zip(values.tolist(), self._u_max):
+        for a, u_max in zip(action.tolist(), self._u_max):
             if a != a:
-                raise ValueError(f"the action must be numbers, got {action!r}")
+                raise ValueError(f"the action must be numbers, got {shown(action)}")
             u.append(u_max if a > 1.0 else -u_max if a < -1.0 else a * u_max)
         return u
 
     def _measure(self, v: list[float]) -> list[float]:
         try:
-            return [hi + vi for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
+            return [float(hi + vi) for hi, vi in zip(self.system.h(self._x), v)]  # type: ignore[arg-type]
         except Exception:
             components(self.system.h, self._x)  # says what went wrong
             raise
 
     def _inside(self, x: Any) -> bool:
-        for xi, (low, high) in zip(x, self._bounds):  # noqa: SIM110 - all() takes twice as long
-            if not low <= xi <= high:  # false for NaN too
-                return False
+        try:
+            for xi, (low, high) in zip(x, self._bounds):
+                if not low <= xi <= high:  # false for NaN too
+                    return False
+        except TypeError:  # complex numbers cannot be compared
+            raise complex_motion(self.system, self._x) from None
         return True
 
     def _observation(self) -> np.ndarray:

@@ -98,7 +98,9 @@ def _module(where: str) -> Any:
         if not where or where.startswith("."):
             raise ImportError(f"{where!r} is no absolute module name")
         with _importing_from(Path.cwd()):
-            return importlib.import_module(where)
+            found = importlib.import_module(where)
+        vars(found).setdefault("__kkl_gym_script__", where)  # worker processes look where this one did
+        return found
     path = Path(where).resolve()
     key = f"_kkl_gym_script_{hashlib.sha256(str(path).encode()).hexdigest()[:16]}"
     if key not in sys.modules:

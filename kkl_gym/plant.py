@@ -6,10 +6,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.simulate import check_dt, check_interval
+from kkl_gym.simulate import check_interval
 from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
-from observers.checks import noise_level, noise_levels
+from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
 NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
@@ -80,7 +80,7 @@ class Plant:
         start_box: Box | None,
     ) -> None:
         self.system = get_system(system, parameters)
-        self.dt = float(check_dt(self.system.dt if dt is None else dt))
+        self.dt = check_dt(self.system.dt if dt is None else dt)
         check_interval(self.system, self.dt)
         self.process_noise = noise_level(
             "process_noise", self.system.process_noise if process_noise is None else process_noise
@@ -90,9 +90,7 @@ class Plant:
             self.system.measurement_noise if measurement_noise is None else measurement_noise,
             self.system.ny,
         )
-        if observe not in ("state", "output"):
-            raise ValueError(f'observe must be "state" or "output", got {observe!r}')
-        self.observe = observe
+        self.observe = choice("observe", observe, ("state", "output"))
         self.start_box = _start_box(self.system, start_box)
         self._draws = start_box is None and type(self.system).draw_starts is not System.draw_starts
         self.state_space = _float32_box(*zip(*self.system.bounds, strict=True))
@@ -171,20 +169,22 @@ class Plant:
         ValueError
             If it is no state within the declared bounds.
         """
-        start = np.asarray(x0, dtype=float)
+        start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
         if start.shape != (self.system.nx,) or not ((start >= low) & (start <= high)).all():
-            raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {x0!r}")
+            raise ValueError(f"x0 must be {self.system.nx} numbers within {self.system.bounds}, got {shown(x0)}")
         return start
 
 
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
-    ends = np.array(system.X if box is None else box, dtype=float)  # a copy: it is kept
+    ends = real_array("start_box", system.X if box is None else box).copy()  # it is kept
     low, high = np.array(system.bounds).T
     if ends.shape != (system.nx, 2):
-        raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {box!r}")
+        raise ValueError(f"start_box must be (low, high) for each of {system.nx} states, got {shown(box)}")
     if not ((low <= ends[:, 0]) & (ends[:, 0] <= ends[:, 1]) & (ends[:, 1] <= high)).all():
-        raise ValueError(f"start_box must lie within the declared bounds {system.bounds}, low before high; got {box!r}")
+        raise ValueError(
+            f"start_box must lie within the declared bounds {system.bounds}, low before high, got {shown(box)}"
+        )
     return ends[:, 0], ends[:, 1]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym.system import Box, System
+from observers.checks import shown
 
 STATE, ESTIMATE, TARGET = "0.2", "C3", "C2"
 TRAIL = 1000  # samples that a phase portrait shows
@@ -43,8 +44,8 @@ def check_render_mode(render_mode: str | None) -> None:
         If the mode is unknown.
     """
     modes = render_metadata(1.0)["render_modes"]
-    if render_mode not in (None, *modes):
-        raise ValueError(f"render_mode must be None or one of {modes}, got {render_mode!r}")
+    if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
+        raise ValueError(f"render_mode must be None or one of {modes}, got {shown(render_mode)}")
 
 
 class Trails:
@@ -157,8 +158,8 @@ class Canvas:
         self._canvas.restore_region(self._still)
         for states, artists in zip((trail, estimates), self._lines, strict=True):
             points = np.array(list(states)).reshape(-1, self._nx)[:, self._states]
-            for artist, shown in zip(artists, (points, points[-1:]), strict=True):
-                artist.set_data(*shown.T)
+            for artist, drawn in zip(artists, (points, points[-1:]), strict=True):
+                artist.set_data(*drawn.T)
                 artist.axes.draw_artist(artist)
         shares = np.zeros_like(self._u_max) if u is None else u / self._u_max
         for bar, share in zip(self._bars, shares, strict=True):

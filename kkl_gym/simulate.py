@@ -7,13 +7,13 @@ on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-
 import functools
 import math
 from collections.abc import Callable, Iterable
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from kkl_gym.equations import blame
 from kkl_gym.system import Components, System
+from observers.checks import check_dt
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
 # motion's size from anywhere in twice its training box (tests/kkl_gym/test_simulate.py); it is half of that.
@@ -174,7 +174,7 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
@@ -226,6 +226,9 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
             left -= h
     except ArithmeticError:
         return end
+    except Exception as error:
+        blame(error, system, x, u)
+        raise
     raise SubstepsError(
         f"{system.name} changes at a rate of {rate:.4g}/s at x = {[float(xi) for xi in x]}: {MAX_SUBSTEPS} substeps "
         f"are not enough for dt = {dt:g} s, of which {left:.2g} s are left; take a smaller dt, tighten the bounds, or "
@@ -266,7 +269,7 @@ def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, d
     except SubstepsError:
         raise
     except Exception as error:
-        blame(error, system, x)
+        blame(error, system, x, u)
         raise
 
 
@@ -452,29 +455,6 @@ def check_duration(duration: float, dt: float) -> None:
     """Raise ValueError unless ``duration`` is a finite number of seconds, and not shorter than a sample of ``dt``."""
     if not dt <= duration < math.inf:
         raise ValueError(f"duration must be finite and at least one sample of dt = {dt} s, got {duration!r}")
-
-
-def check_dt(dt: float) -> float:
-    """Raise an error unless ``dt`` is a sampling interval.
-
-    Parameters
-    ----------
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive, finite number.
-    """
-    if isinstance(dt, bool) or not isinstance(dt, Real) or not 0 < dt < math.inf:
-        raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
-    return dt
 
 
 def check_interval(system: System, dt: float) -> None:

@@ -10,13 +10,14 @@ import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
 
-from kkl_gym.equations import components
+from kkl_gym.declarations import complete
+from kkl_gym.equations import components, rate_at
 from kkl_gym.loading import load_class
+from observers.checks import is_finite, mapping, shown
 
 Components = Sequence[Any] | np.ndarray  # one float, array, tensor or symbol for each component
 Box = tuple[tuple[float, float], ...]  # (low, high) of each component
@@ -92,43 +93,15 @@ class System:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if not hasattr(cls, "X") or not hasattr(cls, "bounds") or not hasattr(cls, "name"):
-            raise TypeError(f"{cls.__name__} must set the class variables name, X and bounds")
-        if "name" not in vars(cls) and {"f", "g", "h", "X"} & vars(cls).keys():
-            raise TypeError(f"{cls.__name__} is another system than {cls.name!r} and needs a name of its own")
-        nx, nu = len(cls.X), len(cls.u_max)
-        if len(cls.bounds) != nx:
-            raise TypeError(f"{cls.__name__}: X has {nx} states and bounds has {len(cls.bounds)}")
-        for (low, high), (lower, upper) in zip(cls.X, cls.bounds, strict=True):
-            if not (math.isfinite(lower) and math.isfinite(upper) and lower <= low < high <= upper):
-                raise TypeError(f"{cls.__name__}: X = {cls.X} must lie within finite bounds = {cls.bounds}")
-        if any(not 0 < u < math.inf for u in cls.u_max):
-            raise TypeError(f"{cls.__name__}: u_max = {cls.u_max} must be positive and finite")
-        cls.discrete = cls.step is not System.step
-        if cls.discrete and cls.dt is System.dt:
-            raise TypeError(f"{cls.__name__} defines step and must set dt, the sampling interval in seconds")
-        if not cls.discrete and cls.g is System.g and nu and (len(cls.G) != nx or any(len(row) != nu for row in cls.G)):
-            raise TypeError(f"{cls.__name__}: G = {cls.G} must have {nx} rows of {nu} numbers, or override g(x)")
-        if "X" in vars(cls):  # what is not said anew belongs to the parent's box
-            cls.scale = vars(cls).get("scale") or tuple((high - low) / 2 for low, high in cls.X)
-            cls.state_names = vars(cls).get("state_names") or tuple(f"x{i + 1}" for i in range(nx))
-            cls.X_centre = vars(cls).get("X_centre") or tuple((low + high) / 2 for low, high in cls.X)
-        if len(cls.X_centre) != nx or not all(math.isfinite(centre) for centre in cls.X_centre):
-            raise TypeError(f"{cls.__name__}: X_centre = {cls.X_centre} must be {nx} finite numbers")
-        if len(cls.scale) != nx or any(not 0 < scale < math.inf for scale in cls.scale):
-            raise TypeError(f"{cls.__name__}: scale = {cls.scale} must be {nx} positive numbers")
-        if len(cls.portrait) != 2 or any(not -nx <= i < nx for i in cls.portrait):
-            raise TypeError(f"{cls.__name__}: portrait = {cls.portrait} must be two indices of its {nx} states")
-        if len(cls.state_names) != nx:
-            raise TypeError(f"{cls.__name__}: state_names = {cls.state_names} must name {nx} states")
+        complete(cls, System)
 
     def __post_init__(self) -> None:
         for name, kind in inspect.get_annotations(type(self)).items():
             if name not in self.parameters and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
-            if isinstance(value, bool) or not isinstance(value, Real) or not math.isfinite(value):
-                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {value!r}")
+            if not is_finite(value):
+                raise ValueError(f"parameter {name} of {self.name} must be a finite number, got {shown(value)}")
             object.__setattr__(self, name, float(value))
 
     def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
@@ -262,7 +235,7 @@ class System:
         """Draw starts; default: uniform in a multiple of the training box.
 
         Override it where not every point of X is a state, as with an angle given by its cosine and sine. What it draws
-        must lie within the bounds.
+        must lie within the bounds. Such a system also sets ``process_noise = 0.0``, which would push states off.
 
         Parameters
         ----------
@@ -408,9 +381,10 @@ class System:
             If a name is unknown or a value is not a finite number.
         """
         known = self.parameters
+        parameters = mapping("parameters", parameters)
         for name in parameters:
             if name not in known:
-                raise ValueError(f"{self.name} has no parameter {name!r}; it has {', '.join(known) or 'none'}")
+                raise ValueError(f"{self.name} has no parameter {shown(name)}; it has {', '.join(known) or 'none'}")
         return type(self)(**{**known, **parameters})
 
 
@@ -468,7 +442,7 @@ def typical_rate(system: System, starts: np.ndarray) -> float:
     ValueError
         If the rate is zero or not finite.
     """
-    rate = float(np.median(np.broadcast_to(system.rate(starts.T), len(starts))))
+    rate = float(np.median(np.broadcast_to(rate_at(system, starts.T), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate

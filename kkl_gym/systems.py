@@ -9,8 +9,9 @@ from typing import Any, ClassVar
 
 from kkl_gym.equations import check_equations
 from kkl_gym.loading import load_class
-from kkl_gym.system import Box, Components, System, inner_state
+from kkl_gym.system import Box, Components, System
 from observers import Artifact
+from observers.checks import mapping, shown
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
     ValueError
         If the name is unknown, the class cannot be found, or a parameter is unknown or not finite.
     EquationError
-        If a user's equations fail on floats, or return something else than components.
+        If a user's equations fail, or return something else than components.
     """
     if isinstance(system, str):
         system = _find(system)
@@ -221,14 +222,15 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
             raise ValueError(
                 f"{system.__name__} has no default for {', '.join(missing)}: give one, or pass an instance"
             )
-        system = system()
-    if not isinstance(system, System):
-        raise ValueError(f"expected a system or the name of one, got {system!r}")
-    if parameters is not None and not isinstance(parameters, Mapping):
-        raise ValueError(f"parameters must be a mapping of names to numbers, got {parameters!r}")
-    found = system.replace(parameters or {})
+        try:
+            system = system()
+        except TypeError as error:  # not decorated as a dataclass
+            raise ValueError(str(error)) from error
+    if not isinstance(system, System) or type(system) is System:
+        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
+    found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
-        check_equations(found, inner_state(found))
+        check_equations(found)
     return found
 
 
@@ -237,7 +239,8 @@ def _find(name: str) -> type[System]:
         return SYSTEMS[name]
     if ":" not in name:
         raise ValueError(
-            f"unknown system {name!r}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or 'script.py:Class'"
+            f"unknown system {shown(name)}; shipped: {', '.join(SYSTEMS)}; your own: 'module:Class' or "
+            "'script.py:Class'"
         )
     return load_class(name, System)
 

@@ -1,6 +1,5 @@
 """Many environments at once, simulated as one batch."""
 
-import operator
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -16,9 +15,11 @@ from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
+from observers.checks import bool_array, choice, integer, mapping, real_array, shown
 
 Infos = dict[str, Any]
 ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for the cache
+MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
 
 class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -61,7 +62,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Raises
     ------
     ValueError
-        As :class:`KKLEnv`, and if ``num_envs`` or ``max_episode_steps`` is not a positive integer.
+        As :class:`KKLEnv`, if ``num_envs`` is not an integer from 1 to a million or ``max_episode_steps`` not a
+        positive one, and if the mode is unknown.
 
     Examples
     --------
@@ -91,9 +93,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
-        for name, count in (("num_envs", num_envs), ("max_episode_steps", max_episode_steps)):
-            if count is not None and (not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1):
-                raise ValueError(f"{name} must be a positive integer, got {count!r}")
+        num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
+        if max_episode_steps is not None:
+            max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
         self.plant = Plant(
             system,
             dt,
@@ -103,9 +105,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             parameters=parameters,
             start_box=start_box,
         )
-        self.num_envs = int(num_envs)
+        self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        self.autoreset_mode = autoreset_mode_of(autoreset_mode)
         check_render_mode(render_mode)
         self.render_mode = render_mode
         self.metadata = {**render_metadata(self.plant.dt), "autoreset_mode": self.autoreset_mode}
@@ -166,7 +168,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            On unknown options, wrong shapes, wrong seeds and starts outside the declared bounds.
+            On unknown options, wrong shapes, wrong seeds and starts outside the declared bounds. The environments are
+            then as they were.
         gymnasium.error.ResetNeeded
             If some rows are to be reset before all have been.
         """
@@ -174,14 +177,14 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         x0 = (given or {}).get("x0")
         for key in given or {}:
             if key not in ("x0", "reset_mask"):
-                raise ValueError(f'unknown reset option {key!r}; there are "x0" and "reset_mask"')
+                raise ValueError(f'unknown reset option {shown(key)}; there are "x0" and "reset_mask"')
         if not self._ready and not mask.all():
             raise gym.error.ResetNeeded("reset() all rows before some of them")
         rows = np.flatnonzero(mask).tolist()
         seeds = self._spread(seed)
         starts = None
         if x0 is not None:
-            many = np.asarray(x0, dtype=float)
+            many = real_array("x0", x0)
             if many.ndim > 1 and many.shape != (self.num_envs, self.system.nx):
                 raise ValueError(
                     f"x0 must be {self.system.nx} numbers, or that for each of {self.num_envs} environments; got shape "
@@ -218,7 +221,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            On a wrong shape or NaN.
+            On a wrong shape, NaN and anything but numbers. The environments are then as they were.
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         """
@@ -309,19 +312,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         """A seed for each row."""
-        given: Any = seed
-        try:
-            if given is None or np.ndim(given) == 0:
-                seeds = [None if given is None else operator.index(given) + i for i in range(self.num_envs)]
-            else:
-                seeds = [None if one is None else operator.index(one) for one in given]
-        except TypeError:
-            raise ValueError(f"a seed must be an integer or one (or None) for each row, got {seed!r}") from None
-        if len(seeds) != self.num_envs:
-            raise ValueError(f"there are {self.num_envs} environments and {len(seeds)} seeds")
-        if any(one is not None and one < 0 for one in seeds):
-            raise ValueError(f"seeds must not be negative, got {seed!r}")
-        return seeds
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, np.ndarray):
+            seed = seed[()] if seed.ndim == 0 else list(seed)
+        if isinstance(seed, Sequence) and not isinstance(seed, str | bytes | bytearray | memoryview):
+            if len(seed) != self.num_envs:
+                raise ValueError(f"there are {self.num_envs} environments and {len(seed)} seeds: {shown(seed)}")
+            return [None if one is None else integer(f"seed[{i}]", one, 0) for i, one in enumerate(seed)]
+        first = integer("seed, if it is not a list with one for each row,", seed, 0)
+        return [first + i for i in range(self.num_envs)]
 
     def _rng(self, row: int) -> np.random.Generator:
         rng = self._rngs[row]
@@ -368,7 +368,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return 1.0 / (1.0 + 4.0 * (self.plant.weights @ (deviation * deviation)))
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
-        values = np.asarray(actions, dtype=float)
+        values = real_array("actions", actions)
         if values.shape != (self.num_envs, self.system.nu):
             raise ValueError(f"actions must have shape ({self.num_envs}, {self.system.nu}), got {values.shape}")
         u = np.minimum(np.maximum(values, -1.0), 1.0) * self._u_max
@@ -450,14 +450,22 @@ def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any]
     Raises
     ------
     ValueError
-        If ``options["reset_mask"]`` is no such array, or holds no True.
+        If ``options`` is no mapping, or ``options["reset_mask"]`` no such array or without a True.
     """
-    if options is None or options.get("reset_mask") is None:
-        return None if options is None else dict(options), np.ones(n, dtype=bool)
-    mask = np.asarray(options["reset_mask"])
-    if mask.dtype != np.bool_ or mask.shape != (n,) or not mask.any():
-        raise ValueError(f"reset_mask must be boolean, ({n},), with a True in it; got {mask!r}")
-    return {**options, "reset_mask": mask}, mask
+    given = dict(mapping("options", options))
+    if given.get("reset_mask") is None:
+        return None if options is None else given, np.ones(n, dtype=bool)
+    mask = bool_array("reset_mask", given["reset_mask"], (n,))
+    if not mask.any():
+        raise ValueError(f"reset_mask must be boolean with a True in it, got {shown(mask)}")
+    return {**given, "reset_mask": mask}, mask
+
+
+def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
+    """One of Gymnasium's autoreset modes, or ValueError if ``mode`` is neither one nor the name of one."""
+    if isinstance(mode, AutoresetMode):
+        return mode
+    return AutoresetMode(choice("autoreset_mode", mode, [known.value for known in AutoresetMode]))
 
 
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:

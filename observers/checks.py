@@ -1,6 +1,7 @@
-"""What observers take from outside: real numbers, and nothing that Python or NumPy would quietly turn into one."""
+"""What is taken from outside: real numbers, and nothing that Python or NumPy would quietly turn into one."""
 
 import math
+from collections.abc import Collection, Mapping, Sequence
 from numbers import Real
 from typing import Any
 
@@ -8,12 +9,34 @@ import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
 _FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
+_NO_NUMBERS = (bool, np.timedelta64)  # though Python takes one for an integer, and NumPy the other
+_LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
+
+
+def shown(value: object) -> str:
+    """A value as error messages show it: on one line, and cut where it is long.
+
+    Parameters
+    ----------
+    value : object
+        What somebody passed.
+
+    Returns
+    -------
+    str
+        Its representation, or its type if it has none.
+    """
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # such as of integers of more than 4,300 digits
+        return f"a {type(value).__name__}"
+    return text if len(text) <= 200 else f"{text[:150]} … {text[-40:]}"
 
 
 def is_finite(value: object) -> bool:
-    """Whether a value is a real number, not a bool, that is finite as a float."""
+    """Whether a value is a real number, not a bool or an interval of time, that is finite as a float."""
     try:
-        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+        return isinstance(value, Real) and not isinstance(value, _NO_NUMBERS) and math.isfinite(value)
     except OverflowError:  # an integer beyond every float
         return False
 
@@ -36,11 +59,14 @@ def noise_level(name: str, level: Any) -> float:
     Raises
     ------
     ValueError
-        If the level is no real number, not finite or negative.
+        If the level is no real number, not finite, negative or beyond 1e12.
     """
     if not is_finite(level) or level < 0:
-        raise ValueError(f"{name} must be a finite number, not negative, got {level!r}")
-    return float(level)
+        raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
+    level = float(level)
+    if level > _LARGEST_LEVEL:
+        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {level!r}")
+    return level
 
 
 def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
@@ -63,14 +89,93 @@ def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
     Raises
     ------
     ValueError
-        If there are not ny levels, or one is no real number, not finite or negative.
+        If there are not ny levels, or one is refused by :func:`noise_level`.
     """
     if not isinstance(levels, list | tuple | np.ndarray) or (isinstance(levels, np.ndarray) and levels.ndim == 0):
         return noise_level(name, levels)
     if len(levels) != ny:
-        raise ValueError(f"{name} must be one number, or one for each of {ny} outputs, got {levels!r}")
+        raise ValueError(f"{name} must be one number, or one for each of {ny} outputs, got {shown(levels)}")
     each = tuple(noise_level(f"{name}[{i}]", level) for i, level in enumerate(levels))
     return each[0] if len(set(each)) == 1 else each
+
+
+def check_dt(dt: Any) -> float:
+    """Return a sampling interval as a float.
+
+    Parameters
+    ----------
+    dt : float
+        Sampling interval in seconds.
+
+    Returns
+    -------
+    float
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive, finite number.
+    """
+    if not is_finite(dt) or not float(dt) > 0:
+        raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
+    return float(dt)
+
+
+def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
+    """Return a whole number as an int.
+
+    Parameters
+    ----------
+    name : str
+        What it is, for the message.
+    value : int
+        The number.
+    least : {0, 1}
+        The least that it may be.
+    most : int, optional
+        The most that it may be.
+
+    Returns
+    -------
+    int
+        The number.
+
+    Raises
+    ------
+    ValueError
+        If it is no integer, or out of range.
+    """
+    whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
+    if not whole or value < least or (most is not None and value > most):
+        wanted = "a positive integer" if least == 1 else "an integer, not negative"
+        if most is not None:
+            wanted = f"an integer from {least} to {most:,}"
+        raise ValueError(f"{name} must be {wanted}, got {shown(value)}")
+    return int(value)
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return a bool, or raise ValueError if ``value`` is none: "no" would count as true."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} must be True or False, got {shown(value)}")
+    return bool(value)
+
+
+def choice(name: str, value: Any, options: Collection[str]) -> str:
+    """Return a string that is one of ``options``, or raise ValueError with them if ``value`` is none of them."""
+    if not isinstance(value, str) or value not in options:
+        raise ValueError(f"{name} must be {' or '.join(repr(option) for option in options)}, got {shown(value)}")
+    return value
+
+
+def mapping(name: str, value: Any) -> Mapping[Any, Any]:
+    """Return a mapping, an empty one for None, or raise ValueError if ``value`` is neither."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{name} must be a dict, got {shown(value)}")
+    return value
 
 
 def real_array(name: str, values: Any) -> np.ndarray:
@@ -91,11 +196,69 @@ def real_array(name: str, values: Any) -> np.ndarray:
     Raises
     ------
     ValueError
-        If there is anything but real numbers, or a masked entry.
+        If there is anything but real numbers, such as bools or text, or a masked entry.
     """
-    array = np.asarray(values)
-    if array.dtype.kind not in "fiub":
-        raise ValueError(f"{name} must hold real numbers, got type {array.dtype}: {values!r}")
-    if array is not values and isinstance(values, MaskedArray) and is_masked(values):
-        raise ValueError(f"{name} holds masked entries: {values!r}; give them values")
-    return array if array.dtype is _FLOAT else array.astype(float)
+    if type(values) is np.ndarray:
+        if values.dtype is _FLOAT:
+            return values
+        if values.dtype.kind in "fiu" and values.dtype.itemsize <= 8:
+            return values.astype(float)
+    elif isinstance(values, MaskedArray) and is_masked(values):
+        raise ValueError(f"{name} holds masked entries: {shown(values)}; give them values")
+    try:
+        if _of_numbers(values):
+            array = np.asarray(values)
+            if array.dtype is _FLOAT:
+                return array
+            if array.dtype.kind in "fiu":
+                with np.errstate(over="ignore"):  # what is too large is infinite, which those who ask refuse
+                    return array.astype(float)
+    except Exception as error:  # ragged lists, and whatever an object of a stranger raises when it is to be an array
+        raise ValueError(f"{name} must hold real numbers in the shape of an array, got {shown(values)}") from error
+    raise ValueError(f"{name} must hold real numbers, got {shown(values)}")
+
+
+def _of_numbers(values: Any) -> bool:
+    """Whether all that nested sequences hold are numbers: NumPy takes True for 1 beside floats, and drops masks."""
+    if type(values) is list or isinstance(values, Sequence):
+        if isinstance(values, str | bytes | bytearray | memoryview):
+            return False
+        for value in values:
+            if type(value) is not float and type(value) is not int and not _of_numbers(value):
+                return False
+        return True
+    if isinstance(values, MaskedArray) and is_masked(values):
+        return False
+    return np.asarray(values).dtype.kind in "fiu"
+
+
+def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of bools.
+
+    Parameters
+    ----------
+    name : str
+        What it is, for the message.
+    values : array_like of bool
+        The bools.
+    shape : tuple of int
+        The shape that they must have.
+
+    Returns
+    -------
+    ndarray of bool
+        The bools; ``values`` itself if it is such an array already.
+
+    Raises
+    ------
+    ValueError
+        If there is anything but bools, a masked entry or another shape.
+    """
+    try:
+        array = values if type(values) is np.ndarray else np.asarray(values)
+    except Exception as error:  # as in real_array
+        raise ValueError(f"{name} must be boolean with shape {shape}, got {shown(values)}") from error
+    if array.dtype.kind != "b" or array.shape != shape or (isinstance(values, MaskedArray) and is_masked(values)):
+        masked = ", without masked entries" if isinstance(values, MaskedArray) else ""
+        raise ValueError(f"{name} must be boolean with shape {shape}{masked}, got {shown(values)}")
+    return array

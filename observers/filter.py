@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from observers.checks import is_finite
+from observers.checks import check_dt, integer, real_array
 from observers.sparse import MANY_ROWS, SparseUpdate
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
@@ -52,15 +52,12 @@ class LinearFilter:
     """
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
-        A, B = np.asarray(A, dtype=float), np.asarray(B, dtype=float)
+        A, B = real_array("A", A), real_array("B", B)
         if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
             raise ValueError("A and B must be finite")
-        if not is_finite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive, finite number of seconds, got {dt!r}")
-        if not isinstance(nu, int | np.integer) or isinstance(nu, bool) or not 0 <= nu <= MOST_INPUTS:
-            raise ValueError(f"the number of inputs must be whole, from 0 to {MOST_INPUTS}, got {nu!r}")
+        dt, nu = check_dt(dt), integer("nu, the number of inputs", nu, 0, MOST_INPUTS)
         nz, ny = B.shape
         if not (1 <= nz * (1 + nu) <= MOST_VALUES and 1 <= ny <= MOST_VALUES):
             raise ValueError(
@@ -73,29 +70,33 @@ class LinearFilter:
             poles, V = A.diagonal(), np.eye(len(A))
         if not (poles.real < 0).all():
             raise ValueError(f"A must be Hurwitz, but has eigenvalues {poles[poles.real >= 0]}")
-        if np.linalg.cond(V) > 1e12:
+        if not np.linalg.cond(V) <= 1e12:
             raise ValueError("A must be diagonalisable; separate its repeated eigenvalues")
 
         def function_of_A(values: np.ndarray) -> np.ndarray:
             return np.real((V * values) @ np.linalg.inv(V))
 
-        with np.errstate(all="ignore"):
-            s = poles * dt
-            hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
-            late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
-        if not (np.isfinite(hold).all() and np.isfinite(late).all()):
-            raise ValueError(f"dt = {dt!r} and the eigenvalues of A, {poles}, lead beyond the range of floats")
         blocks = 1 + nu
 
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:
             return np.vstack([matrix, np.zeros((nu * nz, ny))])
 
-        self.A, self.B, self.dt, self.nu = A, B, float(dt), int(nu)
-        self.transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
-        self.early_y = acts_on_z_y(function_of_A(hold - late) @ B)
-        self.late_y = acts_on_z_y(function_of_A(late) @ B)
-        self.held_u = np.kron(np.eye(blocks, nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
-        self.equilibrium = acts_on_z_y(-np.linalg.solve(A, B))
+        self.A, self.B, self.dt, self.nu = A, B, dt, nu
+        with np.errstate(all="ignore"):
+            s = poles * dt
+            hold = np.expm1(s) / poles  # integral of e^{poles (dt - t)} over [0, dt]
+            late = (np.expm1(s) - s) / (poles * s)  # ... of e^{poles (dt - t)} t / dt
+            self.transition = np.kron(np.eye(blocks), function_of_A(np.exp(s)))
+            self.early_y = acts_on_z_y(function_of_A(hold - late) @ B)
+            self.late_y = acts_on_z_y(function_of_A(late) @ B)
+            self.held_u = np.kron(np.eye(blocks, nu, -1), function_of_A(hold) @ B.sum(1, keepdims=True))
+            self.equilibrium = acts_on_z_y(-np.linalg.solve(A, B))
+        matrices = (self.transition, self.early_y, self.late_y, self.held_u, self.equilibrium)
+        if not all(np.isfinite(matrix).all() for matrix in matrices):
+            raise ValueError(
+                f"dt = {dt!r}, B of up to {abs(B).max():g} and the eigenvalues of A, {poles}, lead beyond the range of "
+                "floats"
+            )
         self._drive = np.hstack([self.early_y, self.held_u, self.late_y]).T.copy()
         self._update = np.vstack([self.transition.T, self._drive])
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from observers.checks import choice, real_array, shown
+
 
 def _tanh(h: np.ndarray) -> np.ndarray:
     np.tanh(h, out=h)
@@ -45,18 +47,26 @@ class MLP:
     _layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f"unknown activation {self.activation!r}, expected one of {', '.join(ACTIVATIONS)}")
+        choice("the activation", self.activation, ACTIVATIONS)
+        for name in ("weights", "biases"):
+            if not isinstance(getattr(self, name), Sequence) or isinstance(getattr(self, name), str | bytes):
+                raise ValueError(f"{name} must be a sequence of arrays, got {shown(getattr(self, name))}")
         if not self.weights or len(self.weights) != len(self.biases):
             raise ValueError(f"{len(self.weights)} weights and {len(self.biases)} biases do not make a network")
-        width, layers = np.shape(self.weights[0])[-1], []
+        for name in ("weights", "biases"):
+            object.__setattr__(self, name, [_layer(name, values) for values in getattr(self, name)])
+        width, layers = None, []
         for weight, bias in zip(self.weights, self.biases, strict=True):
-            if weight.ndim != 2 or bias.shape != weight.shape[:1] or weight.shape[1] != width:
-                raise ValueError(f"layer of shape {weight.shape}, bias {bias.shape}, cannot follow {width} values")
+            if weight.ndim != 2 or bias.shape != weight.shape[:1]:
+                raise ValueError(
+                    f"weights must be (outputs, inputs), biases (outputs,), got {weight.shape} and {bias.shape}"
+                )
+            if width not in (None, weight.shape[1]):
+                raise ValueError(f"weights of shape {weight.shape} cannot follow {width} values")
             with np.errstate(over="ignore"):  # what is too large is infinite, and refused
                 layers.append((np.ascontiguousarray(weight.T, dtype=np.float32), np.asarray(bias, dtype=np.float32)))
             if not all(np.isfinite(values).all() for values in layers[-1]):
-                raise ValueError("the network holds weights that are not finite")
+                raise ValueError("the network holds weights or biases that are not finite")
             width = len(bias)
         object.__setattr__(self, "_layers", layers)
 
@@ -95,3 +105,9 @@ class MLP:
         h = np.dot(h, weight)
         h += bias
         return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
+
+
+def _layer(name: str, values: np.ndarray) -> np.ndarray:
+    """The weights or biases of a layer, as they are if they are an array of real numbers."""
+    array = real_array(name, values)
+    return values if type(values) is np.ndarray else array

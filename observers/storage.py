@@ -10,6 +10,7 @@ import json
 import os
 import re
 import secrets
+import time
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,9 +26,34 @@ MOST_BYTES = 256 * 2**20  # of a file; maps of the paper's sizes have one or two
 MOST_HEADER = 2**20  # bytes of its header, which holds the JSON
 DEEPEST = 32  # objects and lists within one another
 UNFINISHED = ".part-"  # what names of temporary files begin with
+ABANDONED = 3600.0  # seconds after which nobody writes to one any more
 
 # All that files hold, as safetensors calls it.
 _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype(np.float64)}
+
+
+@contextmanager
+def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Put the name of what is written into errors that name no file, as that of a full disk.
+
+    Parameters
+    ----------
+    path : Path
+        What is written.
+    temporary : Path, optional
+        What is written in its place; errors that name it will name ``path``.
+
+    Raises
+    ------
+    OSError
+        If the body raises one.
+    """
+    try:
+        yield
+    except OSError as problem:
+        if problem.errno and problem.filename in (None, str(temporary)):
+            raise OSError(problem.errno, problem.strerror, str(path)) from problem
+        raise
 
 
 @contextmanager
@@ -56,17 +82,16 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch(exist_ok=False)
-        yield temporary
-        with temporary.open("rb+") as written:
-            os.fsync(written.fileno())
-        os.replace(temporary, target)
-    except BaseException as problem:
+        with naming(target, temporary):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary.touch(exist_ok=False)
+            yield temporary
+            with temporary.open("rb+") as written:
+                os.fsync(written.fileno())
+            os.replace(temporary, target)
+    except BaseException:
         with suppress(OSError):
             temporary.unlink()
-        if isinstance(problem, OSError) and problem.errno and problem.filename in (None, str(temporary)):
-            raise OSError(problem.errno, problem.strerror, str(target)) from problem  # a full disk names no file
         raise
     with suppress(OSError):  # not every system can open a folder, or put it on disk
         folder = os.open(target.parent, os.O_RDONLY)
@@ -83,15 +108,17 @@ def write(path: str | os.PathLike[str], text: str) -> None:
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove the temporary files that processes which were killed have left in a folder.
+    """Remove temporary files that nobody has written to for an hour: processes that were killed have left them.
 
     Parameters
     ----------
     folder : str or PathLike
-        Where no other process is at work.
+        Where they lie.
     """
     for left in Path(folder).glob(f"{UNFINISHED}*"):
-        left.unlink(missing_ok=True)
+        with suppress(FileNotFoundError):  # another process may clear away, too
+            if time.time() - left.stat().st_mtime > ABANDONED:
+                left.unlink()
 
 
 def save(

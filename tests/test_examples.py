@@ -13,7 +13,10 @@ from training.evaluation import calibration
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
-OWN_SYSTEM = (ROOT / "docs" / "systems.md").read_text().partition("## Your own system")[2]
+OWN_SYSTEM, OTHER_PLANTS = (
+    (ROOT / "docs" / "systems.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
+    for title in ("Your own system", "Unstable plants")
+)
 
 
 def example(name):
@@ -77,6 +80,30 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     assert x_hat.shape == info["x"].shape == (2,)
     assert envs.reset(seed=0)[0].shape == (8, 2)
     assert [make.close() for make in (env, envs)] == [None, None]
+
+
+def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
+    shutil.copytree(EXAMPLES, tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
+    for line in commands.splitlines():
+        _, command, *rest = line.split()
+        extra = ["--no-monitor"] if command == "train" else ["--noise", "0"]
+        main([command, *rest, *SMALL[command].split(), *extra])
+    with pytest.raises(SystemExit, match="--policy"):
+        main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])
+    assert "runs/balance/report.png" in capsys.readouterr().out
+
+
+def test_cart_pole(tmp_path, capsys):
+    errors = example("cart_pole")(inverse_steps=1000, trajectories=200, out=tmp_path)
+    assert (errors < 0.15).all()
+    assert "after 10 s" in capsys.readouterr().out  # and so it has not fallen
+
+
+def test_circle_pendulum(tmp_path):
+    errors = example("circle_pendulum")(inverse_steps=300, trajectories=100, out=tmp_path)
+    assert (errors < 0.3).all()
 
 
 def test_sb3_agent():

@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from training.evaluation.calibration import calibrate
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
-    from training.evaluation.metrics import smape
+    from training.evaluation.metrics import nrmse, smape
     from training.pipeline import Result, train
     from training.presets import preset
 
@@ -19,6 +19,7 @@ __all__ = [
     "calibrate",
     "certify",
     "errors",
+    "nrmse",
     "preset",
     "smape",
     "train",
@@ -32,6 +33,7 @@ _MODULES = {
     "calibrate": "evaluation.calibration",
     "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
+    "nrmse": "evaluation.metrics",
     "preset": "presets",
     "smape": "evaluation.metrics",
     "train": "pipeline",

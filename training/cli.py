@@ -4,15 +4,19 @@ Importing this module imports nothing that takes time or may be missing. The mod
 command is called.
 """
 
+import _thread
 import ast
+import io
+import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
 from importlib.resources import files
-from typing import Any
+from typing import Any, NoReturn
 
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
@@ -29,7 +33,6 @@ COMMANDS = {
     "speed": ("speed", "Speed"),
 }
 
-INTERRUPTED = 130  # exit status, as of any process that an interruption ends: 128 + SIGINT
 
 # What an interruption may be followed by, by the first words of the command.
 AFTER_INTERRUPTION = {
@@ -38,6 +41,8 @@ AFTER_INTERRUPTION = {
     ("agent", "train"): "--resume goes on from the last checkpoint",
     ("agent", "compare"): "the same command goes on",
 }
+
+MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
 # Modules that an extra of the package brings.
 EXTRAS = {
@@ -67,12 +72,16 @@ def main(arguments: list[str] | None = None) -> None:
         except BaseException as error:
             if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
                 hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
-                print("; ".join(["kkl-gym: interrupted", *hints]), file=sys.stderr)
-                sys.exit(INTERRUPTED)
+                _end("; ".join(["interrupted", *hints]), INTERRUPTED)
             if isinstance(error, ModuleNotFoundError):
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
                 sys.exit(": ".join(["kkl-gym", str(error), *extras]))
+            if isinstance(
+                error, BrokenPipeError
+            ):  # whoever read what is printed, as in a pipe to head, has seen enough
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
                 sys.exit(f"kkl-gym: {_message(error)}")
             raise
@@ -87,13 +96,21 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         noticed.append(number)
         raise KeyboardInterrupt
 
+    def unraisable(failed: "sys.UnraisableHookArgs") -> None:
+        if isinstance(failed.exc_value, KeyboardInterrupt):  # lost in a callback, of which imports have many: again
+            threading.Timer(0.05, _thread.interrupt_main).start()
+        else:
+            hook(failed)
+
     if threading.current_thread() is not threading.main_thread():  # which alone has handlers of signals
         yield noticed
         return
-    before = signal.signal(signal.SIGINT, handler)
+    before, hook = signal.signal(signal.SIGINT, handler), sys.unraisablehook
+    sys.unraisablehook = unraisable
     try:
         yield noticed
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGINT, before)
 
 
@@ -105,13 +122,34 @@ def _run(arguments: list[str]) -> None:
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
         called = list(COMMANDS)
     commands = {name: (_load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
-    command: Any = tyro.extras.subcommand_cli_from_dict(
-        commands,
-        prog="kkl-gym",
-        description="Learned KKL observers for Gymnasium environments.",
-        args=arguments,
-    )
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            command: Any = tyro.extras.subcommand_cli_from_dict(
+                commands,
+                prog="kkl-gym",
+                description="Learned KKL observers for Gymnasium environments.",
+                args=arguments,
+                config=(tyro.conf.DisallowNone,),
+            )
+    except SystemExit as end:
+        if end.code != MISUSED:
+            raise
+        _end(_without_box(said.getvalue()), MISUSED)
     command.run(Console())
+
+
+def _end(message: str, code: int) -> NoReturn:
+    print(f"kkl-gym: {message}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _without_box(text: str) -> str:
+    """What tyro says of options that it cannot read, in one line: without frame, colours, title, help and reasons."""
+    plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╮╰╯ ") for line in text.splitlines()]
+    parts = "\n".join(plain[1:]).split("─" * 10)
+    kept = [" ".join(part.strip("─").split()).partition(" Got errors:")[0] for part in parts]
+    return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 
 def _load(module: str, name: str) -> Callable[..., Any]:

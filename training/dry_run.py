@@ -1,6 +1,7 @@
 """What a training run will take, before it is started: ``kkl-gym train --dry-run``."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,6 +14,7 @@ from training.pipeline import Result, shares, train
 from training.trajectories.record import CHUNK, recording_ages
 
 FEW, MORE = 10, 50  # batches of the two short runs whose difference is timed
+RUNS = 2
 # Arrays that exist at once in the largest stage, as counted in training/pipeline.py: those of states in NumPy and in
 # torch, and those of the filter's states.
 STATES, TORCH_STATES, FILTER_STATES, TORCH_FILTER_STATES = 3, 3, 5, 2
@@ -41,7 +43,13 @@ class Estimate:
     seconds: dict[str, float]
 
 
-def estimate(system: System, config: Config, *, device: torch.device | None = None) -> Estimate:
+def estimate(
+    system: System,
+    config: Config,
+    *,
+    device: torch.device | None = None,
+    report: Callable[[int], object] = lambda done: None,
+) -> Estimate:
     """Estimate a run by short ones of the same sizes: a few trajectories and batches.
 
     Parameters
@@ -52,6 +60,8 @@ def estimate(system: System, config: Config, *, device: torch.device | None = No
         Of the run.
     device : torch.device, optional
         As for :func:`training.train`.
+    report : callable, optional
+        Told how many of the ``RUNS`` are done.
 
     Returns
     -------
@@ -63,7 +73,9 @@ def estimate(system: System, config: Config, *, device: torch.device | None = No
     ValueError
         As :func:`training.train`.
     """
-    few, more = (_short_run(system, config, batches=batches, device=device) for batches in (FEW, MORE))
+    few = _short_run(system, config, batches=FEW, device=device)
+    report(1)
+    more = _short_run(system, config, batches=MORE, device=device)
     seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
     if config.random_features:
         seconds["solving"] = more.seconds["solving"]

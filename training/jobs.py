@@ -116,9 +116,14 @@ def describe(system: System) -> dict[str, Any]:
     dict
         To be compared with another after a way through JSON, which makes lists of tuples.
     """
-    x = system.draw_starts(np.random.default_rng(0), 20)
-    matrix = input_matrix(system, x.T)
-    rows = [*components(system.f, x.T), *(entry for row in matrix for entry in row), *system.output(x).T]
+    rng = np.random.default_rng(0)
+    x = system.draw_starts(rng, 20)
+    if system.discrete:
+        u = rng.uniform(-1, 1, (system.nu, 20)) * np.array(system.u_max)[:, None]
+        moved = components(system.step, x.T, u)
+    else:
+        moved = [*components(system.f, x.T), *(entry for row in input_matrix(system, x.T) for entry in row)]
+    rows = [*moved, *system.output(x).T]
     equations = np.round([np.broadcast_to(row, 20) for row in rows], 6)  # the same on every machine
     return {
         "system": system.name,

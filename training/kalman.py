@@ -4,22 +4,26 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
+STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
+LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx) of a batch, or those of one Gaussian, (nx,) and (nx, nx)."""
 
 
 def unknown_start(system: System) -> Gaussian:
-    """Mean (nx,) and covariance (nx, nx) of a start uniform in X."""
+    """Mean (nx,) and covariance (nx, nx) of a start uniform in X, or as the system draws it."""
     low, high = system.box()
-    return (low + high) / 2, np.diag((high - low) ** 2 / 12)
+    if type(system).draw_starts is System.draw_starts:
+        return (low + high) / 2, np.diag((high - low) ** 2 / 12)
+    x = system.draw_starts(np.random.default_rng(0), STARTS)
+    return x.mean(0), np.cov(x.T).reshape(system.nx, -1) + np.diag(LEAST_VARIANCE * (high - low) ** 2)
 
 
 def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
@@ -43,7 +47,7 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
 
 
 class KalmanFilter(ABC):
-    """A batch of continuous-discrete Kalman filters in NumPy.
+    """A batch of Kalman filters in NumPy, in continuous time between samples or in discrete time.
 
     A filter that loses its way, out of the system's declared bounds or to a covariance that is none, starts anew.
 
@@ -58,7 +62,7 @@ class KalmanFilter(ABC):
     R : ndarray, shape (ny, ny)
         Covariance of the measurement noise on each sample.
     start : tuple of ndarray, shapes (nx,) and (nx, nx), optional
-        Mean and covariance of the start; by default those of a start uniform in X.
+        Mean and covariance of the start; by default what :func:`unknown_start` returns.
 
     Attributes
     ----------
@@ -164,8 +168,8 @@ class KalmanFilter(ABC):
 class ExtendedKalmanFilter(KalmanFilter):
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3).
 
-    Mean and sensitivity Phi are integrated together over each sample, P = Phi P Phi^T + Q dt. A filter whose predicted
-    mean leaves the system's declared bounds starts anew. Parameters are those of :class:`KalmanFilter`.
+    Mean and sensitivity Phi are moved together over each sample, P = Phi P Phi^T + Q dt. A filter whose predicted mean
+    leaves the system's declared bounds starts anew. Parameters are those of :class:`KalmanFilter`.
     """
 
     def __init__(
@@ -239,6 +243,8 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     def _sigma_points(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         """Points (2 nx + 1, n, nx); NaN where P is not positive definite."""
+        import torch  # for this alone: whoever needs no such filter need not wait for it
+
         factor, failed = torch.linalg.cholesky_ex(torch.as_tensor(3.0 * P))
         columns = np.where(failed.numpy()[:, None], np.nan, np.moveaxis(factor.numpy(), -1, 0))
         return np.concatenate([x[None], x + columns, x - columns])

@@ -7,7 +7,7 @@ import math
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import Progress
 
 import kkl_gym
 from kkl_gym.system import System
-from observers import Artifact, ForwardMap, InverseMap, LinearFilter
+from observers import Artifact, Expression, ForwardMap, InverseMap, LinearFilter
+from observers.checks import noise_levels
 from training.config import Config
 from training.jobs import claimed_run, describe
 from training.maps.forward import ForwardProblem, transients, truncation_step
@@ -28,15 +28,17 @@ from training.maps.inverse import InverseProblem
 from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
+from training.maps.pde import check_continuous
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
-from training.progress import progress_bars
+from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum
-from training.systems import controller, named_policy
+from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
+from training.trajectories.expression import output_expression
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -74,7 +76,7 @@ def train(
     *,
     resume: bool = False,
     device: torch.device | None = None,
-    console: Console | None = None,
+    console: Console | ProgressBars | None = None,
 ) -> Result:
     """Learn an observer for a system.
 
@@ -106,8 +108,8 @@ def train(
         Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
     device : torch.device, optional
         Where networks are trained; by default on a GPU if there is one.
-    console : rich.console.Console, optional
-        Where progress bars are shown; by default there are none.
+    console : rich.console.Console or ProgressBars, optional
+        Where progress is shown. By default it is shown nowhere, but for log.txt in ``folder``.
 
     Returns
     -------
@@ -126,11 +128,13 @@ def train(
     noise = {"process_noise": float(system.process_noise), "scale": [float(one) for one in system.scale]}
     identity = {**describe(system), **noise, **dataclasses.asdict(config)}
     # Errors now, not in ten minutes.
+    if config.pipeline == "spinn":
+        check_continuous(system)
     policy = None if config.policy is None else named_policy(system, config.policy)
-    feedback = (policy or controller(system)) if config.closed_loop_trajectories else None
+    feedback = (policy or named_policy(system, "controller")) if config.closed_loop_trajectories else None
     if policy:
         identity["policy_actions"] = policy_fingerprint(policy, system)
-    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console) as progress:
+    with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
         run = _Run(system, config, folder, resume, device, progress, log, identity)
         free = run.learn_free_inverse() if "free" in run.shares else None
         trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS, policy=policy))
@@ -161,7 +165,7 @@ class _Run:
     folder: Path
     resume: bool
     device: torch.device
-    progress: Progress
+    progress: ProgressBars
     log: Log | None
     identity: dict[str, Any]
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
@@ -170,6 +174,7 @@ class _Run:
 
     def __post_init__(self) -> None:
         system, config = self.system, self.config
+        noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
         self.started = time.monotonic()
         self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
         torch.manual_seed(config.seed)
@@ -189,7 +194,7 @@ class _Run:
 
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
         """Training trajectories with a filter beside them."""
-        config, report = self.config, self._bar(f"simulating {what}", self.config.trajectories)
+        config, report = self.config, self.progress.bar(f"simulating {what}", self.config.trajectories)
         motions = dataclasses.replace(
             motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
         )
@@ -210,6 +215,7 @@ class _Run:
             measurement_noise_max=config.measurement_noise_max,
             batch=config.batch,
             device=self.device,
+            measurement_noise=self.system.measurement_noise,
             noise_free_share=config.noise_free_share,
             high_noise_emphasis=config.high_noise_emphasis,
             process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
@@ -233,12 +239,13 @@ class _Run:
         """T, trained or solved for."""
         system, config, linear = self.system, self.config, self.linear
         if config.random_features:
-            report = self._bar(f"solving for T with {config.random_features} features", 1)
-            self.samples["forward_samples"] = min(POINTS * config.random_features, len(points))
-            with self.timed("solving"):
-                forward = solve_forward(system, linear, features=config.random_features, points=points, rng=self.rng)
-            report(1)
-            return forward
+            features = config.random_features
+            self.samples["forward_samples"] = min(POINTS * features, len(points))
+            with (
+                self.timed("solving"),
+                self.progress.phase(f"solving for T with {features} features", linear.size) as report,
+            ):
+                return solve_forward(system, linear, features=features, points=points, rng=self.rng, report=report)
         late = self.settled
         self.samples["forward_samples"] = int(late.sum()) * config.trajectories + len(points)
         network = Network(system.nx, linear.size, width=config.width, depth=config.depth, activation=config.activation)
@@ -256,8 +263,8 @@ class _Run:
         )
         self.minimise("forward", problem, config.forward_steps)
         if config.solved_output_layer:
-            with self.timed("forward"):
-                problem.solve_output_layer(self.rng)
+            with self.timed("forward"), self.progress.phase("solving for T's output layer", linear.size) as report:
+                problem.solve_output_layer(self.rng, report)
         return problem.forward_map()
 
     def by_forward_map(
@@ -303,7 +310,7 @@ class _Run:
             noise_free_share=config.noise_free_share,
             high_noise_emphasis=config.high_noise_emphasis,
             process_noise_share=config.process_noise_share,
-            report=self._bar("closing the loop", config.closed_loop_trajectories),
+            report=self.progress.bar("closing the loop", config.closed_loop_trajectories),
         )
         return ClosedLoopSampler(sampler, driven, dt=config.dt, device=self.device)
 
@@ -333,14 +340,17 @@ class _Run:
 
     def artifact(self, inverse: InverseMap, forward: ForwardMap | None, free: InverseMap | None) -> Artifact:
         """The observer, with how it was made."""
+        C = output_matrix(self.system)
         return Artifact(
             filter=self.linear,
             inverse=inverse,
             system=self.system.name,
             parameters=self.system.parameters,
             forward=forward,
-            C=output_matrix(self.system),
+            C=C,
+            h=self.output_expression() if C is None else None,
             free_inverse=free,
+            measurement_noise=self.system.measurement_noise,
             training={
                 **dataclasses.asdict(self.config),
                 **self.samples,
@@ -357,10 +367,12 @@ class _Run:
             },
         )
 
-    def _bar(self, description: str, total: int) -> Callable[[int], None]:
-        """A progress bar; returns what tells it how much is done."""
-        task = self.progress.add_task(description, total=total)
-        return lambda done: self.progress.update(task, completed=done)
+    def output_expression(self) -> Expression | None:
+        """The output h(x) as data, None where the system's equations cannot be told from outside."""
+        try:
+            return output_expression(self.system)
+        except ValueError:  # whoever asks for a monitor will learn why
+            return None
 
 
 def shares(config: Config, nu: int) -> dict[str, float]:

@@ -5,11 +5,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+import scipy
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.maps.coordinates import settling_time
+from training.maps.pde import check_continuous
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, evenly_spaced
 from training.trajectories.record import recording_ages
@@ -89,9 +90,10 @@ def smoothness(
     Raises
     ------
     ValueError
-        If the system does not say how fast f changes, or motions leave its bounds before any of the filters has
-        forgotten its start.
+        If the system is in discrete time or does not say how fast f changes, or motions leave its bounds before any of
+        the filters has forgotten its start.
     """
+    check_continuous(system)
     spectra, rate = list(spectra), system.typical_rate
     step = max(dt, FINEST / rate)
     filters = [spectrum.filter(system.ny, step) for spectrum in spectra]
@@ -124,7 +126,7 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
     x = x / np.maximum(x[known].std(0), least)
     z_scale = z[known].std(0)
     z = z / np.where(z_scale > 0, z_scale, 1.0)
-    distances, rows = cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
+    distances, rows = scipy.spatial.cKDTree(x[:, ASKING:][others]).query(x[:, :ASKING][asking], k=[1, FAR])
     differences = z[:, ASKING:][others][rows] - z[:, :ASKING][asking][:, None]
     near, roughness = np.sqrt((distances[:, 0] ** 2).mean() / system.nx), np.sqrt((differences[:, 0] ** 2).mean(0))
     # By the distance to the far neighbour, so that few states far from all others do not outweigh the rest.

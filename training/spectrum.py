@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.linalg import block_diag
-from scipy.signal import besselap
+import scipy
 
 from kkl_gym.system import System
 from observers import LinearFilter
@@ -43,7 +42,7 @@ class Spectrum:
     @property
     def A(self) -> np.ndarray:
         """A for one output, (modes, modes): real eigenvalues on the diagonal, then a block [[a, w], [-w, a]] a pair."""
-        return np.asarray(block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
+        return np.asarray(scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
 
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
         """The filter with these modes for each output, driven by B = 1.
@@ -107,6 +106,6 @@ def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "
     Spectrum
         The poles: pairs, and a real one if the order is odd.
     """
-    _, poles, _ = besselap(order, norm=norm)
+    _, poles, _ = scipy.signal.besselap(order, norm=norm)
     real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
     return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))

@@ -1,7 +1,7 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import gymnasium as gym
@@ -10,6 +10,7 @@ import numpy as np
 from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
 from observers import KKLObserver, load, shipped
+from observers.checks import choice, flag
 
 
 class Estimator(Protocol):
@@ -105,8 +106,8 @@ class KKLEstimator:
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the plant's system.
     estimate : {"x", "z"}
         Whether the state estimate is shown, or the filter's state.
-    measurement_noise : float or None
-        The noise level that the observer assumes; None takes the plant's.
+    measurement_noise : float, sequence of float or None
+        The noise level that the observer assumes, of all outputs or each; None takes the plant's.
     ignore_input : bool
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
@@ -138,13 +139,15 @@ class KKLEstimator:
         observer: str | os.PathLike[str] | None,
         *,
         estimate: str,
-        measurement_noise: float | None,
+        measurement_noise: float | Sequence[float] | None,
         ignore_input: bool,
         monitor: bool,
         known_start: bool,
     ) -> None:
-        if estimate not in ("x", "z"):
-            raise ValueError(f'estimate must be "x" or "z", got {estimate!r}')
+        choice("estimate", estimate, ("x", "z"))
+        self._ignore_input = flag("ignore_input", ignore_input)
+        self._known_start = flag("known_start", known_start)
+        self._monitor = flag("monitor", monitor)
         system = plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
@@ -154,14 +157,11 @@ class KKLEstimator:
             process_noise=plant.process_noise,
             monitor=monitor,
         )
-        self._monitor = monitor
         self.observer.artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
         if known_start:
             self.observer.artifact.require_forward()  # an error now, not at the first reset
-        self._known_start = known_start
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
-        self._ignore_input = ignore_input
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:

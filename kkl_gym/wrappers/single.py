@@ -2,6 +2,7 @@
 
 import os
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -11,6 +12,7 @@ from gymnasium.utils import RecordConstructorArgs
 from kkl_gym.envs import KKLEnv
 from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, observation
+from observers.checks import integer, shown
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
@@ -34,9 +36,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     estimate : {"x", "z"}
         "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
         within the bounds that bounded outputs and inputs imply.
-    measurement_noise : float, optional
-        The noise level that the observer assumes; None takes the environment's. (Process noise is always taken from
-        the environment, by maps that ask for it.)
+    measurement_noise : float or sequence of float, length ny, optional
+        The noise level that the observer assumes, of all outputs or each; None takes the environment's. (Process noise
+        is always taken from the environment, by maps that ask for it.)
     ignore_input : bool
         Whether to use a map that knows no inputs (the paper's) although the agent acts.
     monitor : bool
@@ -82,28 +84,15 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer: str | os.PathLike[str] | None = None,
         *,
         estimate: Literal["x", "z"] = "x",
-        measurement_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,
     ) -> None:
-        observer = None if observer is None else os.fspath(observer)
-        if isinstance(measurement_noise, np.floating):  # which the specification could not write down
-            measurement_noise = float(measurement_noise)
-        RecordConstructorArgs.__init__(
-            self,
-            observer=observer,
-            estimate=estimate,
-            measurement_noise=measurement_noise,
-            ignore_input=ignore_input,
-            monitor=monitor,
-            known_start=known_start,
-        )
-        gym.Wrapper.__init__(self, env)
-        base = env.unwrapped
+        base = env.unwrapped if isinstance(env, gym.Env) else env
         if not isinstance(base, KKLEnv):
-            raise ValueError(f"KKLObservation needs a kkl_gym environment, got {base}")
-        self._estimator = KKLEstimator(
+            raise ValueError(f"KKLObservation needs a kkl_gym environment, got {shown(base)}")
+        estimator = KKLEstimator(
             base.plant,
             observer,
             estimate=estimate,
@@ -112,6 +101,18 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             monitor=monitor,
             known_start=known_start,
         )
+        # As the specification can write them down, once they are known to be what they should.
+        RecordConstructorArgs.__init__(
+            self,
+            observer=None if observer is None else os.fspath(observer),
+            estimate=estimate,
+            measurement_noise=None if measurement_noise is None else estimator.observer.measurement_noise,
+            ignore_input=bool(ignore_input),
+            monitor=bool(monitor),
+            known_start=bool(known_start),
+        )
+        gym.Wrapper.__init__(self, env)
+        self._estimator = estimator
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
@@ -212,7 +213,7 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
     Raises
     ------
     ValueError
-        Unless ``repeat`` is a positive integer.
+        Unless ``env`` is an environment and ``repeat`` a positive integer.
 
     Examples
     --------
@@ -226,10 +227,11 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], repeat: int) -> None:
+        if not isinstance(env, gym.Env):
+            raise ValueError(f"ActionRepeat needs a gymnasium.Env, got {shown(env)}")
+        repeat = integer("repeat", repeat, 1)
         RecordConstructorArgs.__init__(self, repeat=repeat)
         gym.Wrapper.__init__(self, env)
-        if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
-            raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
         self.repeat = repeat
         frames = env.metadata.get("render_fps", 30)  # a second, as Gymnasium assumes
         self.metadata = {**env.metadata, "render_fps": max(1, round(frames / repeat))}
@@ -260,6 +262,13 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
             if terminated or truncated:
                 break
         return obs, total, terminated, truncated, info
+
+
+def _plain(level: Any) -> Any:
+    """A level of noise, or one for each output, without NumPy's types and in a tuple; the rest is left to others."""
+    if isinstance(level, np.ndarray | np.floating):
+        level = level.tolist()
+    return tuple(map(_plain, level)) if isinstance(level, list | tuple) else level
 
 
 __all__ = ["ActionRepeat", "KKLObservation"]

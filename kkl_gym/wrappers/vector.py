@@ -11,8 +11,9 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import Trails
-from kkl_gym.vector import Infos, KKLVectorEnv, last_of_episodes, with_mask
+from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episodes, with_mask
 from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
+from observers.checks import integer, shown
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
 if TYPE_CHECKING:
@@ -209,8 +210,8 @@ class KKLVectorObservation(VectorEstimate):
         As for :class:`kkl_gym.KKLObservation`.
     estimate : {"x", "z"}
         As for :class:`kkl_gym.KKLObservation`; with "z" the network is not evaluated, unless there is a monitor.
-    measurement_noise : float, optional
-        The noise level that the observer assumes; None takes the environment's.
+    measurement_noise : float or sequence of float, length ny, optional
+        The noise level that the observer assumes, of all outputs or each; None takes the environment's.
     ignore_input : bool
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
@@ -251,7 +252,7 @@ class KKLVectorObservation(VectorEstimate):
         observer: str | os.PathLike[str] | None = None,
         *,
         estimate: Literal["x", "z"] = "x",
-        measurement_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,
@@ -291,7 +292,7 @@ class VectorActionRepeat(VectorWrapper):
     Raises
     ------
     ValueError
-        If ``repeat`` is not a positive integer, or the environment resets by itself.
+        If ``repeat`` is not a positive integer, the mode is unknown, or the environment is another or resets by itself.
 
     Examples
     --------
@@ -307,19 +308,18 @@ class VectorActionRepeat(VectorWrapper):
     def __init__(
         self, env: VectorEnv, repeat: int, autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP
     ) -> None:
-        super().__init__(env)
-        if not isinstance(repeat, int) or isinstance(repeat, bool) or repeat < 1:
-            raise ValueError(f"repeat must be a positive integer, got {repeat!r}")
+        repeat, mode = integer("repeat", repeat, 1), autoreset_mode_of(autoreset_mode)
         inside: VectorEnv = env
         while isinstance(inside, VectorEstimate | VectorActionRepeat):
             inside = inside.env
         if not isinstance(inside, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
             raise ValueError(
                 'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled" and resets rows itself; '
-                "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment"
+                "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment; got "
+                f"{shown(env)}"
             )
-        self.repeat = repeat
-        self.autoreset_mode = AutoresetMode(autoreset_mode)
+        super().__init__(env)
+        self.repeat, self.autoreset_mode = repeat, mode
         frames = max(1, round(env.metadata["render_fps"] / repeat))
         self.metadata = {**env.metadata, "autoreset_mode": self.autoreset_mode, "render_fps": frames}
         self._ended = np.zeros(env.num_envs, dtype=bool)
@@ -446,13 +446,13 @@ def plant_of(env: VectorEnv, *also: str) -> Plant:
     ValueError
         If the rows are not environments of ours, or differ.
     """
-    base: Any = env.unwrapped
+    base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant
     try:
         plants: tuple[Plant, ...] = base.get_attr("plant")
     except AttributeError:
-        raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {base}") from None
+        raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {shown(base)}") from None
     first = plants[0]
     for plant in plants:
         for name in ("system", "dt", "measurement_noise", *also):

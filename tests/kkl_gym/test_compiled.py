@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from kinked_systems import SYSTEMS as KINKED
 
 import kkl_gym
-from kkl_gym import SYSTEMS, System, get_system
+from kkl_gym import SYSTEMS, EquationError, System, get_system
 from kkl_gym.compiled import batch_step, clipped, compiled_step
 from kkl_gym.elementary import cos, sin, tanh
-from kkl_gym.simulate import advance_batch
+from kkl_gym.simulate import advance, advance_batch
 from observers.sparse import MANY_ROWS
 
 DT = 0.01
@@ -28,7 +29,7 @@ def compiler():
 class Unicycle(System):
     """Inputs through a matrix that depends on the state, two outputs, a numerical rate."""
 
-    drift: float = 0.3
+    slip: float = 0.3
 
     name = "unicycle"
     X = ((-1, 1), (-1, 1), (-3, 3))
@@ -36,7 +37,7 @@ class Unicycle(System):
     u_max = (2.0, 3.0)
 
     def f(self, x):
-        return self.drift * tanh(x[1]), -self.drift * x[0] ** 3, 0.0 * x[2]
+        return self.slip * tanh(x[1]), -self.slip * x[0] ** 3, 0.0 * x[2]
 
     def g(self, x):
         return (cos(x[2]), 0.0), (sin(x[2]), 0.0), (0.0, 1.0)
@@ -99,6 +100,21 @@ def test_compiled_is_numpys_step(system, dt):
     assert np.allclose(got, expected, rtol=1e-11, atol=1e-11, equal_nan=True)
 
 
+@compiles
+@pytest.mark.parametrize("system", KINKED, ids=str)
+def test_kinks_and_jumps_are_the_same_on_floats_arrays_and_compiled(system):
+    step = compiled_step(system)
+    x, u, w = batch(system)
+    kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
+    x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of either change
+    for dt in (DT, 0.2):
+        expected = advance_batch(system, x, u, w, dt)
+        single = [advance(system, tuple(xi), list(ui), list(wi), dt) for xi, ui, wi in zip(x.T, u.T, w.T, strict=True)]
+        assert np.isfinite(expected).all()
+        assert np.allclose(np.array(single).T, expected, rtol=1e-12, atol=1e-12)
+        assert np.allclose(step(x, u, w, dt), expected, rtol=1e-12, atol=1e-12)
+
+
 def test_any_memory_layout_and_no_rows():
     system = Unicycle()
     x, u, w = batch(system, 5)
@@ -131,22 +147,22 @@ def test_division_by_zero_and_no_inputs():
 
 def test_parameters_are_the_systems_own():
     x, u, w = batch(Unicycle(), 3)
-    fast, slow = (batch_step(Unicycle(drift))(x, u, w, DT) for drift in (3.0, 0.0))
+    fast, slow = (batch_step(Unicycle(slip))(x, u, w, DT) for slip in (3.0, 0.0))
     assert not np.allclose(fast, slow)
 
 
 @compiles
 def test_numpy_where_equations_cannot_be_compiled(caplog):
     """And somebody who asks is told so, and why."""
-    with pytest.raises(TypeError) as raised:
+    with pytest.raises(EquationError, match=r"use kkl_gym\.elementary\.where") as raised:
         compiled_step(Branching())
     with caplog.at_level(logging.INFO, "kkl_gym"):
-        step = batch_step(Branching(drift=0.31))
-    assert step.obstacle == f"TypeError: {raised.value}"
+        step = batch_step(Branching(slip=0.31))
+    assert step.obstacle == f"EquationError: {raised.value}"
     assert [record.getMessage() for record in caplog.records] == [
         f"branching goes on with NumPy, not compiled: {step.obstacle}"
     ]
-    assert not kkl_gym.KKLVectorEnv(Branching(drift=0.31), 2).compiled
+    assert not kkl_gym.KKLVectorEnv(Branching(slip=0.31), 2).compiled
     assert len(caplog.records) == 1  # once for each system
     x, u, w = batch(Branching(), 3)
     assert (step(x, u, w, DT) == advance_batch(Branching(), x, u, w, DT)).all()
@@ -200,7 +216,8 @@ class Long(Unicycle):
 
 @compiles
 @pytest.mark.parametrize(
-    ("kind", "obstacle"), [(Filled, "symbols"), (Rooted, "symbols"), (Random, "not the same"), (Long, "too long")]
+    ("kind", "obstacle"),
+    [(Filled, "elementary"), (Rooted, "symbols"), (Random, "not the same"), (Long, "too long")],
 )
 def test_equations_better_left_to_numpy(kind, obstacle):
     assert obstacle in batch_step(kind()).obstacle
@@ -270,7 +287,7 @@ def test_clipped(monkeypatch, compiled, dtype):
 
 
 @compiles
-@pytest.mark.parametrize(("missing", "drift"), [("numba", 0.123), ("sympy", 0.124)])
-def test_numpy_where_a_library_is_missing(monkeypatch, missing, drift):
+@pytest.mark.parametrize(("missing", "slip"), [("numba", 0.123), ("sympy", 0.124)])
+def test_numpy_where_a_library_is_missing(monkeypatch, missing, slip):
     monkeypatch.setitem(sys.modules, missing, None)
-    assert missing in batch_step(Unicycle(drift)).obstacle
+    assert missing in batch_step(Unicycle(slip)).obstacle

@@ -254,7 +254,7 @@ def test_nonsense_names_raise_with_the_name(nonsense):
 
 @pytest.mark.parametrize("nonsense", [None, 3, int, object()])
 def test_nonsense_objects_raise(nonsense):
-    with pytest.raises(ValueError, match="expected a system"):
+    with pytest.raises(ValueError, match="system must be"):
         get_system(nonsense)
 
 
@@ -272,62 +272,16 @@ def test_script_that_fails_is_not_half_loaded(tmp_path):
     path = tmp_path / "failing.py"
     path.write_text("raise RuntimeError('mine')")
     for _ in range(2):
-        with pytest.raises(RuntimeError, match="mine"):
+        with pytest.raises(
+            ValueError, match=r"cannot load the system '.*failing\.py:Class': .*failing\.py, line 1 "
+        ) as raised:
             get_system(f"{path}:Class")
-
-
-GOOD = {"name": "mine", "X": ((-1, 1), (-1, 1)), "bounds": ((-2, 2), (-2, 2)), "u_max": (1.0,), "G": ((0.0,), (1.0,))}
-
-
-def test_good_class_variables_are_taken():
-    cls = type("Mine", (System,), dict(GOOD))
-    assert cls.state_names == ("x1", "x2")
-    assert cls.scale == (1.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "match"),
-    [
-        ({"name": None}, "must set the class variables"),
-        ({"X": None}, "must set the class variables"),
-        ({"bounds": None}, "must set the class variables"),
-        ({"bounds": ((-2, 2),)}, "X has 2 states and bounds has 1"),
-        ({"bounds": ((-2, 2), (-2, 0.5))}, "must lie within finite bounds"),
-        ({"bounds": ((-2, 2), (-2, math.inf))}, "must lie within finite bounds"),
-        ({"X": ((1, -1), (-1, 1))}, "must lie within finite bounds"),
-        ({"X": ((1, 1), (-1, 1))}, "must lie within finite bounds"),
-        ({"X": ((math.nan, 1), (-1, 1))}, "must lie within finite bounds"),
-        ({"u_max": (0.0,)}, "must be positive"),
-        ({"u_max": (math.inf,)}, "must be positive"),
-        ({"u_max": (1.0, 1.0)}, "2 rows of 2"),
-        ({"G": ((1.0,),)}, "2 rows of 1"),
-        ({"G": ()}, "override g"),
-        ({"portrait": (0, 2)}, "portrait = .* must be two indices"),
-    ],
-)
-def test_wrong_class_variables_raise(wrong, match):
-    variables = {key: value for key, value in {**GOOD, **wrong}.items() if value is not None}
-    with pytest.raises(TypeError, match=match):
-        type("Mine", (System,), variables)
+        assert "(`raise RuntimeError('mine')`): RuntimeError: mine" in str(raised.value)
 
 
 def test_missing_methods_are_named():
-    mine = type("Mine", (System,), dict(GOOD))()
+    mine = type("Mine", (System,), {"name": "mine", "X": ((-1, 1),) * 2, "bounds": ((-9, 9),) * 2})()
     with pytest.raises(NotImplementedError, match="Mine does not define f"):
         mine.f((0.0, 0.0))
     with pytest.raises(NotImplementedError, match="Mine does not define h"):
         mine.h((0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("f", "h", "message"),
-    [
-        (lambda self, x: (x[1], -x[0]), lambda self, x: x[0], r"h\(x\) of slip must return its components"),
-        (lambda self, x: x[0], lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
-        (lambda self, x: (x[1], -x[0], 0.0), lambda self, x: (x[0],), r"f\(x\) of slip must return 2 components"),
-    ],
-)
-def test_equations_that_return_no_components_are_named(f, h, message):
-    slip = type("Slip", (System,), {"name": "slip", "X": ((-1, 1),) * 2, "bounds": ((-9, 9),) * 2, "f": f, "h": h})
-    with pytest.raises(ValueError, match=message):
-        get_system(slip)

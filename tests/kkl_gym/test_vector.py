@@ -362,8 +362,8 @@ def test_wrong_actions_change_nothing(wrong):
 
 
 @pytest.mark.parametrize(("wrong", "match"), [
-    ({"num_envs": 0}, "num_envs must be a positive integer"),
-    ({"num_envs": 2.0}, "num_envs must be a positive integer"),
+    ({"num_envs": 0}, "num_envs must be an integer from 1 to 1,000,000"),
+    ({"num_envs": 2.0}, "num_envs must be an integer from 1 to 1,000,000"),
     ({"max_episode_steps": 0}, "max_episode_steps must be a positive integer"),
     ({"autoreset_mode": "sometimes"}, "sometimes"),
     ({"dt": 0.0}, "dt must be"),

@@ -24,6 +24,8 @@ KINDS = [
     {"process": True, "free_inverse": True},
     {"free_inverse": True},
     {"free_inverse": True, "noise": False},
+    {"outputs": 2},
+    {"outputs": 3, "process": True, "free_inverse": True},
 ]
 
 
@@ -44,17 +46,6 @@ def file(tmp_path, make_artifact):
     path = tmp_path / "map.safetensors"
     make_artifact(forward=True).save(path)
     return path
-
-
-def test_random_flipped_bits_are_all_noticed(file):
-    """tests/campaign has many more of them, and in files that ship."""
-    whole, rng = file.read_bytes(), np.random.default_rng(0)
-    for place in rng.integers(8 * len(whole), size=100):
-        flipped = bytearray(whole)
-        flipped[place // 8] ^= 1 << place % 8
-        file.write_bytes(flipped)
-        with raises_naming(file):
-            Artifact.read(file)
 
 
 def raises_naming(path):
@@ -239,7 +230,7 @@ def test_the_number_of_inputs_is_a_small_whole_one(file, inputs):
     rewrite(file, lambda tensors, meta: meta.update(inputs=inputs))
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert f"number of inputs must be whole, from 0 to 64, got {inputs!r}" in str(raised.value)
+    assert f"number of inputs must be an integer from 0 to 64, got {inputs!r}" in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +255,7 @@ def test_filters_of_nothing(shape, file):
     rewrite(file, lambda tensors, meta: tensors.update(A=-np.eye(shape[0]), B=np.ones(shape)))
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert f"got nz = {shape[0]}" in str(raised.value)
+    assert "A must be (nz, nz)" in str(raised.value)
 
 
 def test_maps_that_estimate_nothing(file):
@@ -275,7 +266,7 @@ def test_maps_that_estimate_nothing(file):
     rewrite(file, empty)
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert "must estimate one state at least" in str(raised.value)
+    assert "weights must be (outputs, inputs)" in str(raised.value)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, True, "0.01", None, 10**400, np.inf, np.nan, [0.01]])
@@ -368,7 +359,7 @@ def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):
         dataclasses.replace(artifact, free_inverse=dataclasses.replace(artifact.free_inverse, process_noise_max=0.3))
 
 
-@pytest.mark.parametrize("number", [0, 3, "1", None])
+@pytest.mark.parametrize("number", [0, 4, "1", None])
 def test_other_formats(file, number):
     rewrite(file, lambda tensors, meta: meta.update(format=number))
     with raises_naming(file) as raised:
@@ -420,6 +411,17 @@ def test_every_missing_metadata_key_and_tensor(file):
     lambda t, m: t.update({"inverse.whiten": np.zeros((9, 9))}),
     lambda t, m: t.update({"inverse.1.weight": np.zeros((8, 7), np.float32)}),
     lambda t, m: t.update({"inverse.1.bias": np.zeros((8, 1), np.float32)}),
+    lambda t, m: m.update(measurement_noise=-0.1),
+    lambda t, m: m.update(measurement_noise="0.1"),
+    lambda t, m: m.update(measurement_noise=[0.1, 0.2]),
+    lambda t, m: m.update(measurement_noise=None),
+    lambda t, m: m.update(h=[]),
+    lambda t, m: m.update(h=[["x", 0], ["x", 1]]),
+    lambda t, m: m.update(h=[["x", 2]]),
+    lambda t, m: m.update(h=[["__import__", "os"]]),
+    lambda t, m: (m.update(h=[["x", 0]]), t.update(C=np.eye(2)[:1])),
+    lambda t, m: t.update({"inverse.noise_gain": np.zeros((2, 9))}),
+    lambda t, m: m["inverse"].update(noise_max=[1.0]),
 ])  # fmt: skip
 def test_contents_that_do_not_fit(file, change):
     rewrite(file, change)

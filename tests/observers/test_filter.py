@@ -197,7 +197,7 @@ def test_sampling_intervals_beyond_floats(A, dt):
 
 @pytest.mark.parametrize("nu", [-1, 65, 10**9, 1.0, True, "1", None])
 def test_wrong_numbers_of_inputs_raise(nu):
-    with pytest.raises(ValueError, match=f"number of inputs must be whole, from 0 to 64, got {nu!r}"):
+    with pytest.raises(ValueError, match=f"number of inputs must be an integer from 0 to 64, got {nu!r}"):
         LinearFilter(DIAGONAL, np.ones((3, 1)), DT, nu)
     assert LinearFilter(DIAGONAL, np.ones((3, 1)), DT, np.int64(64)).size == 65 * 3
 

@@ -1,12 +1,15 @@
-"""Progress bars, and what stands for them in a log file."""
+"""Progress bars, and the lines that stand for them where none are drawn."""
 
 import io
+import re
+import time
+from contextlib import suppress
 
 import pytest
 from rich.console import Console
 
 import training.progress
-from training.progress import progress_bars
+from training.progress import ProgressBars, progress_bars
 
 
 class Clock:
@@ -18,20 +21,18 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch):
-    clock = Clock()
-    original = training.progress._Progress.__init__
-    monkeypatch.setattr(training.progress._Progress, "__init__", lambda *a, **k: original(*a, get_time=clock, **k))
-    return clock
+    monkeypatch.setattr(ProgressBars, "_beat", lambda self: None)  # which goes by another clock
+    return Clock()
 
 
-def log(terminal):
-    return Console(file=io.StringIO(), force_terminal=terminal, width=60)
+def console_of(terminal):
+    return Console(file=io.StringIO(), force_terminal=terminal, width=80)
 
 
-def work(console, clock, steps=100, seconds=1.0):
-    with progress_bars(console) as progress:
-        task = progress.add_task("simulating [lorenz]", total=steps)
-        for done in range(1, steps + 1):
+def work(progress, clock, *, steps=100, seconds=1.0, completed=0):
+    with progress:
+        task = progress.add_task("simulating [lorenz]", total=steps, completed=completed)
+        for done in range(completed + 1, steps + 1):
             clock.now += seconds
             if done % 2:
                 progress.advance(task)
@@ -39,31 +40,106 @@ def work(console, clock, steps=100, seconds=1.0):
                 progress.update(task, completed=done)
 
 
-def test_a_log_file_has_a_line_now_and_then(clock):
-    console = log(terminal=False)
-    work(console, clock)
-    lines = console.file.getvalue().splitlines()
-    assert lines[:3] == [
-        "simulating [lorenz]: 30 of 100, 0:00:30 passed, 0:01:10 left",
-        "simulating [lorenz]: 60 of 100, 0:01:00 passed, 0:00:40 left",
-        "simulating [lorenz]: 90 of 100, 0:01:30 passed, 0:00:10 left",
+def written(clock, log=None, **how):
+    console = console_of(terminal=False)
+    work(ProgressBars(console, log, get_time=clock), clock, **how)
+    return console.file.getvalue().splitlines()
+
+
+def test_what_is_no_terminal_gets_a_line_now_and_then(clock):
+    assert written(clock, steps=40) == [
+        "simulating [lorenz]: 5 of 40, 0:00:05 passed, 0:00:35 left",
+        "simulating [lorenz]: 20 of 40, 0:00:20 passed, 0:00:20 left",
+        "simulating [lorenz]: 35 of 40, 0:00:35 passed, 0:00:05 left",
+        "simulating [lorenz]: 40 of 40, 0:00:40 passed",
     ]
-    assert len([line for line in lines if "passed" in line]) == 3
+
+
+def test_what_takes_no_time_is_not_worth_a_line(clock):
+    assert written(clock, steps=4) == []
+
+
+def test_hours_fill_no_book(clock):
+    lines = written(clock, steps=8 * 3600)
+    assert 400 < len(lines) < 600
+    passed = [sum(int(part) * unit for part, unit in zip(time, (3600, 60, 1))) for time in clocks(lines)]
+    gaps = [after - before for before, after in zip(passed, passed[1:])]  # noqa: RUF007
+    assert max(gaps) <= 60
+
+
+def clocks(lines):
+    return [re.search(r"(\d+):(\d\d):(\d\d) passed", line).groups() for line in lines]
+
+
+def test_what_went_before_an_interruption_does_not_count_as_speed(clock):
+    lines = written(clock, steps=100, completed=80)
+    assert lines[0] == "simulating [lorenz]: 85 of 100, 0:00:05 passed, 0:00:15 left"
 
 
 def test_jobs_that_take_hours_have_a_time_that_is_left(clock):
-    console = log(terminal=False)
-    work(console, clock, steps=4, seconds=3600.0)
-    assert "2 of 4, 2:00:00 passed, 2:00:00 left" in console.file.getvalue()
+    assert "simulating [lorenz]: 2 of 4, 2:00:00 passed, 2:00:00 left" in written(clock, steps=4, seconds=3600.0)
+
+
+def test_a_phase_that_says_nothing_of_itself_is_not_silent(monkeypatch):
+    monkeypatch.setattr(training.progress, "FIRST_LINE", 0.0)
+    monkeypatch.setattr(training.progress, "BEAT", 0.01)
+    console = console_of(terminal=False)
+    with progress_bars(console) as progress, progress.phase("bounding T_inv"):
+        for _ in range(500):
+            time.sleep(0.01)
+            if console.file.getvalue():
+                break
+        assert console.file.getvalue() == "bounding T_inv: 0 of 1, 0:00:00 passed\n"
+
+
+def test_a_phase_that_fails_is_gone(clock):
+    console = console_of(terminal=False)
+    with ProgressBars(console, get_time=clock) as progress:
+        with pytest.raises(ValueError, match="too few"), progress.phase("finding limits", 7):
+            raise ValueError("too few")
+        clock.now += 60.0
+        with progress.phase("drawing"):
+            clock.now += 60.0
+            progress.tell()
+    assert console.file.getvalue() == "drawing: 0 of 1, 0:01:00 passed\ndrawing: 1 of 1, 0:01:00 passed\n"
+
+
+def test_what_is_refused_leaves_no_log(tmp_path):
+    with suppress(ValueError), progress_bars(None, tmp_path / "run" / "log.txt"):
+        raise ValueError("x")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("console", [None, console_of(terminal=True)])
+def test_a_log_has_lines_whatever_is_drawn(console, clock, tmp_path):
+    log = tmp_path / "run" / "log.txt"
+    work(ProgressBars(console, log, get_time=clock), clock, steps=10)
+    with suppress(ValueError), progress_bars(console, log) as progress:
+        progress.say("wrote [a] file")
+        raise ValueError("x")
+    stamp = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
+    lines = log.read_text().splitlines()
+    assert all(re.match(stamp, line) for line in lines)
+    assert [re.sub(stamp, "", line) for line in lines] == [
+        "simulating [lorenz]: 5 of 10, 0:00:05 passed, 0:00:05 left",
+        "simulating [lorenz]: 10 of 10, 0:00:10 passed",
+        "wrote [a] file",
+        "ended by ValueError: x",
+    ]
 
 
 def test_a_terminal_has_bars_instead(clock):
-    console = log(terminal=True)
-    work(console, clock)
+    console = console_of(terminal=True)
+    work(ProgressBars(console, get_time=clock), clock)
     assert "100/100" in console.file.getvalue()
     assert "passed" not in console.file.getvalue()
 
 
 def test_without_a_console_there_is_nothing(clock, capsys):
-    work(None, clock)
+    work(ProgressBars(None, get_time=clock), clock)
     assert capsys.readouterr() == ("", "")
+
+
+def test_bars_of_a_caller_are_taken():
+    with progress_bars(None) as mine, progress_bars(mine) as theirs:
+        assert theirs is mine

@@ -213,6 +213,8 @@ class Agent:
             task = described.pop("task")
             if task["start_box"] is not None:
                 task["start_box"] = tuple(tuple(ends) for ends in task["start_box"])
+            if isinstance(task["measurement_noise"], list):
+                task["measurement_noise"] = tuple(task["measurement_noise"])
             return cls(network=network, task=ControlTask(**task), **described)
 
 

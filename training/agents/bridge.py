@@ -29,7 +29,8 @@ class SB3VecEnv(VecEnv):
     Raises
     ------
     ValueError
-        If the environment resets otherwise, or stable-baselines3 sets different options for different rows.
+        If the environment resets otherwise or takes no inputs, or stable-baselines3 sets different options for
+        different rows.
     """
 
     def __init__(self, env: gym.vector.VectorEnv[Any, Any, Any], info_keys: Sequence[str] = ()) -> None:
@@ -39,6 +40,8 @@ class SB3VecEnv(VecEnv):
                 f"stable-baselines3 needs environments that reset in the same step, this one has {mode}: make it with "
                 'autoreset_mode="SameStep" (vector_kwargs={"autoreset_mode": "SameStep"} for Sync and Async vectors)'
             )
+        if 0 in (env.single_action_space.shape or ()):
+            raise ValueError("the action space is empty: a system without inputs leaves an agent nothing to decide")
         self.env = env
         self._info_keys = tuple(info_keys)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)

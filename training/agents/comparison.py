@@ -2,34 +2,39 @@
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
-import pandas as pd
-import torch
-from scipy.stats import bootstrap, trim_mean
+import scipy
 
 import kkl_gym
 from kkl_gym import get_system
-from observers.storage import write
+from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules, versioned
 from training.agents.information import make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
+from training.evaluation.levels import Level, as_cell, as_name
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 from training.systems import PROFILES
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 # What agents know: an information set of training.agents.information, or y or the state with a policy that remembers.
 Compared = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"]
 COMPARED: tuple[Compared, ...] = get_args(Compared)
 
 MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if found.second_noise}
+SEEDS = 5
 RECURRENT_SEEDS = 3
 MORE_NOISE_RECURRENT_SEEDS = 1
+Key = TypeVar("Key", bound=Hashable)  # a level, or how a table shows it
+
 MANY = 1000  # seeds, more than anyone trains
 OTHER = "an agent of another comparison"
 PROTOCOL = 1  # changes where results must not be mixed with earlier ones
@@ -42,8 +47,8 @@ class Case:
     Parameters
     ----------
     system : str
-        A shipped system.
-    measurement_noise : float
+        A shipped system, or a class of the user's as "module:Class" or "script.py:Class".
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     information : {"state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"}
         What the agent knows.
@@ -55,20 +60,25 @@ class Case:
         Actions to learn from; None takes what the hyperparameters say.
     folder : Path
         Receives job.json, scores.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
+    observer : str, optional
+        A shipped map or a ``.safetensors`` file, for what agents know of an observer; by default
+        :func:`training.agents.information.observer_of` the system.
     """
 
     system: str
-    measurement_noise: float
+    measurement_noise: Level
     information: Compared
     seed: int
     episodes: int
     timesteps: int | None
     folder: Path
+    observer: str | None = None
 
     @property
     def name(self) -> str:
         """For people."""
-        return f"{self.system} at noise {self.measurement_noise:g}/{self.information}/{self.seed}"
+        system, noise = get_system(self.system).name, as_name(self.measurement_noise)
+        return f"{system} at noise {noise}/{self.information}/{self.seed}"
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -77,7 +87,7 @@ class Case:
 
         task = get_task(self.system, self.measurement_noise)
         recurrent = self.information.startswith("recurrent")
-        named = versioned(observer_of(get_system(task.system))) if self.information in ("x_hat", "z") else None
+        named = versioned(self.observer or observer_of(get_system(task.system))) if self._observes else None
         return {
             "protocol": PROTOCOL,
             "episodes": self.episodes,
@@ -88,6 +98,10 @@ class Case:
             "observer": None if named is None else [named, fingerprint(named)],
             "version": kkl_gym.__version__,
         }
+
+    @property
+    def _observes(self) -> bool:
+        return self.information in ("x_hat", "z")
 
     @property
     def done(self) -> bool:
@@ -117,6 +131,8 @@ def run_case(case: Case) -> None:
 
 
 def _run(case: Case) -> None:
+    import torch
+
     from training.agents.learn import learn, learn_recurrent
 
     torch.set_num_threads(1)
@@ -129,7 +145,10 @@ def _run(case: Case) -> None:
         env = make(task, of, case.episodes, autoreset_mode="Disabled", with_action=True)
     else:
         information: Any = case.information
-        policy = agent = learn(task, information, case.folder, seed=case.seed, timesteps=case.timesteps)
+        observer = case.observer if case._observes else None
+        policy = agent = learn(
+            task, information, case.folder, seed=case.seed, timesteps=case.timesteps, observer=observer
+        )
         env = agent.make(case.episodes, system=task.system)
     seconds = time.process_time() - began
     x = play(env, policy, steps=task.steps, seed=AGENT_EVALUATION_SEED).x
@@ -141,14 +160,14 @@ def _run(case: Case) -> None:
     write(case.folder / "scores.json", json.dumps(result) + "\n")
 
 
-def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
+def idle(system: str, measurement_noise: Level, episodes: int) -> np.ndarray:
     """Scores of zero input on the evaluation's episodes.
 
     Parameters
     ----------
     system : str
         A system with a control task.
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     episodes : int
         Their number.
@@ -165,43 +184,102 @@ def idle(system: str, measurement_noise: float, episodes: int) -> np.ndarray:
     return scores(get_system(task.system), x)
 
 
+def kinds(
+    levels: Mapping[str, Sequence[Key]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
+) -> Iterator[tuple[str, Key, Compared, int]]:
+    """Agents of a comparison, the first seed of each first.
+
+    Parameters
+    ----------
+    levels : mapping of str to sequence of levels
+        For each system those of measurement noise, or what stands for them; the task's own first.
+    information : sequence of str
+        What agents know.
+    seeds : int
+        Agents of each kind; of recurrent ones at most three, and one at the further noise levels.
+
+    Yields
+    ------
+    system, level, information, seed
+        Of one agent.
+    """
+    for seed in range(seeds):
+        for system, at in levels.items():
+            for level in at:
+                for what in information:
+                    most = RECURRENT_SEEDS if level == at[0] else MORE_NOISE_RECURRENT_SEEDS
+                    if seed < most or not what.startswith("recurrent"):
+                        yield system, level, what, seed
+
+
+def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[Level, ...]]:
+    """Levels of measurement noise at which agents are compared on each system.
+
+    Parameters
+    ----------
+    systems : sequence of str
+        Shipped ones, or classes of the user's.
+    more_noise : bool
+        Also the further level of those that have one.
+
+    Returns
+    -------
+    dict of str to tuple of levels
+        The task's own level first.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if a system has no inputs.
+    """
+    more = MORE_NOISE if more_noise else {}
+    further = {system: (more[system],) if system in more else () for system in systems}
+    return {system: (get_task(system).measurement_noise, *further[system]) for system in systems}
+
+
 def planned(
     out: Path,
     *,
     systems: Sequence[str] = tuple(TASKS),
     information: Sequence[Compared] = COMPARED,
-    seeds: int = 5,
+    seeds: int = SEEDS,
     episodes: int = 100,
     timesteps: int | None = None,
     more_noise: bool = True,
+    observers: Mapping[str, str] | None = None,
 ) -> list[Case]:
-    """All agents of a comparison, the first seed of each first; the defaults are the full set.
+    """All agents of a comparison; the defaults are the full set.
 
     Parameters
     ----------
     out : Path
         Folder of the comparison, under which each agent has one.
     systems : sequence of str
-        Systems with a control task.
+        Shipped ones, or classes of the user's.
     information : sequence of str
         What agents know.
     seeds : int
-        Agents of each kind; of recurrent ones at most three, and one at the further noise level.
+        Agents of each kind, as for :func:`kinds`.
     episodes : int
         Number of episodes that each is played on.
     timesteps : int, optional
         Actions to learn from; by default what the hyperparameters say.
     more_noise : bool
         Also at the further noise level of those systems that have one.
+    observers : mapping of str to str, optional
+        Shipped map or ``.safetensors`` file by the name of the system that it is for.
 
     Returns
     -------
     list of Case
         What is to be done.
+
+    Raises
+    ------
+    ValueError
+        On an unknown name, or if a system has no inputs.
     """
-    noise: dict[str, tuple[Any, ...]] = {system: (get_task(system).measurement_noise,) for system in systems}
-    if more_noise:
-        noise |= {name: (*noise[name], level) for name, level in MORE_NOISE.items() if name in noise}
+    names = {system: get_system(system).name for system in systems}
     return [
         Case(
             system=system,
@@ -210,19 +288,22 @@ def planned(
             seed=seed,
             episodes=episodes,
             timesteps=timesteps,
-            folder=out / "jobs" / f"{system}-{level:g}" / what / str(seed),
+            folder=out / "jobs" / f"{names[system]}-{as_name(level)}" / what / str(seed),
+            observer=(observers or {}).get(names[system]),
         )
-        for seed in range(seeds)
-        for system in systems
-        for level in noise[system]
-        for what in information
-        if not what.startswith("recurrent")
-        or seed < (RECURRENT_SEEDS if level == noise[system][0] else MORE_NOISE_RECURRENT_SEEDS)
+        for system, level, what, seed in kinds(noise_levels(systems, more_noise), information, seeds)
     ]
 
 
-def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
-    """What there is in a comparison's folder, whichever run it is from.
+def collect(
+    out: Path,
+    *,
+    episodes: int,
+    timesteps: int | None,
+    own: Sequence[str] = (),
+    observers: Mapping[str, str] | None = None,
+) -> "pd.DataFrame":
+    """What there is in a comparison's folder of shipped systems and some others, whichever run it is from.
 
     Parameters
     ----------
@@ -232,6 +313,10 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
         Number of episodes that each agent was played on.
     timesteps : int or None
         Actions that each learned from; None for what the hyperparameters say.
+    own : sequence of str
+        Classes of the user's.
+    observers : mapping of str to str, optional
+        As for :func:`planned`.
 
     Returns
     -------
@@ -243,8 +328,11 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
     ValueError
         If some agents are of another comparison.
     """
-    plan = planned(out, seeds=MANY, episodes=episodes, timesteps=timesteps)
-    idle_scores: dict[tuple[str, float], float] = {}
+    import pandas as pd
+
+    systems = (*TASKS, *own)
+    plan = planned(out, systems=systems, seeds=MANY, episodes=episodes, timesteps=timesteps, observers=observers)
+    idle_scores: dict[tuple[str, Level], float] = {}
     rows = []
     for case in plan:
         if not case.done:
@@ -252,19 +340,20 @@ def collect(out: Path, episodes: int, timesteps: int | None) -> pd.DataFrame:
         key = (case.system, case.measurement_noise)
         if key not in idle_scores:
             idle_scores[key] = float(idle(*key, case.episodes).mean())
-        result = json.loads((case.folder / "scores.json").read_text())
-        rows.append(
-            {
-                "system": case.system,
-                "noise": case.measurement_noise,
-                "knows": case.information,
-                "seed": case.seed,
-                "score": np.mean(result["scores"]),
-                "success": np.mean(result["successes"]),
-                "idle": idle_scores[key],
-                "seconds": result["seconds"],
-            }
-        )
+        with explained(case.folder / "scores.json", ValueError):
+            result = json.loads((case.folder / "scores.json").read_text())
+            rows.append(
+                {
+                    "system": get_system(case.system).name,
+                    "noise": as_cell(key[1]),
+                    "knows": case.information,
+                    "seed": case.seed,
+                    "score": np.mean(result["scores"]),
+                    "success": np.mean(result["successes"]),
+                    "idle": idle_scores[key],
+                    "seconds": result["seconds"],
+                }
+            )
     return pd.DataFrame(rows)
 
 
@@ -291,7 +380,7 @@ def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
 
 def middle(values: np.ndarray, axis: int = -1) -> Any:
     """Interquartile mean along an axis."""
-    return trim_mean(values, 0.25, axis=axis)
+    return scipy.stats.trim_mean(values, 0.25, axis=axis)
 
 
 def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
@@ -321,5 +410,5 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     if min(len(values), len(best)) < 3:
         return found, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    ends = bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
     return found, float(ends.low), float(ends.high)

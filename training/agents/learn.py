@@ -23,9 +23,10 @@ from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
 from observers import MLP
+from observers.storage import naming
 from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
-from training.agents.checkpoint import Checkpoint
+from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
@@ -116,7 +117,7 @@ def learn(
         folder=folder,
         checkpoint=checkpoint,
         progress=progress,
-        description=f"{task.system} {information}",
+        description=f"{get_system(task.system).name} {information}",
     )
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     agent = Agent(
@@ -178,7 +179,7 @@ def learn_recurrent(
         seed=seed,
         folder=folder,
         progress=progress,
-        description=f"{task.system} recurrent {of}",
+        description=f"{get_system(task.system).name} recurrent {of}",
     )
 
     def policy() -> Policy:
@@ -228,19 +229,20 @@ def _fit(
     )
     settings["policy_kwargs"] = {"activation_fn": nn.Tanh, **settings.get("policy_kwargs", {})}
     model = ALGORITHMS[algorithm](env=vec_env, seed=seed, device="cpu", learning_rate=rate, **settings)
-    model.set_logger(configure(str(folder), ["csv"]))
-    try:
-        if checkpoint is not None:
-            callbacks.append(checkpoint)
-            checkpoint.restore(model, timesteps)
-            if checkpoint.resumed:
-                first = agent_training_seed(seed, checkpoint.resumed, env.num_envs)
-                model.set_random_seed(first)
-        vec_env.seed(first)  # only now: the model has seeded it with ``seed``
-        model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
-    finally:
-        model.logger.close()
-        vec_env.close()
+    with naming(folder / CURVE):  # which alone is written without its name in errors
+        model.set_logger(configure(str(folder), ["csv"]))
+        try:
+            if checkpoint is not None:
+                callbacks.append(checkpoint)
+                checkpoint.restore(model, timesteps)
+                if checkpoint.resumed:
+                    first = agent_training_seed(seed, checkpoint.resumed, env.num_envs)
+                    model.set_random_seed(first)
+            vec_env.seed(first)  # only now: the model has seeded it with ``seed``
+            model.learn(timesteps - model.num_timesteps, callback=callbacks, reset_num_timesteps=False)
+        finally:
+            model.logger.close()
+            vec_env.close()
     return model
 
 
@@ -305,10 +307,14 @@ class _Bar(BaseCallback):
 
     def __init__(self, progress: Progress | None, name: str, total: int) -> None:
         super().__init__()
-        self._progress = progress
-        self._bar = None if progress is None else progress.add_task(name, total=total)
+        self._progress, self._name, self._total = progress, name, total
+
+    def _on_training_start(self) -> None:
+        if self._progress is not None:
+            done = self.model.num_timesteps  # more than none where a training goes on
+            self._bar = self._progress.add_task(self._name, total=self._total, completed=done)
 
     def _on_step(self) -> bool:
-        if self._progress is not None and self._bar is not None:
-            self._progress.update(self._bar, completed=self.num_timesteps)
+        if self._progress is not None:  # the last rollout ends past the last step
+            self._progress.update(self._bar, completed=min(self.num_timesteps, self._total))
         return True

@@ -10,6 +10,7 @@ from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from observers.storage import replacing
 from training.agents.play import Episodes
+from training.evaluation.levels import show_level
 from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
@@ -50,7 +51,7 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
     for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
         axes[i, 0].set_ylabel(name)
     axes[0, 0].legend(loc="upper right", fontsize="x-small")
-    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {task.measurement_noise:g}")
+    figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
 

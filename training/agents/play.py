@@ -33,7 +33,9 @@ class Episodes:
     escaped: np.ndarray
 
 
-def play(env: VectorEnv, policy: Policy, *, steps: int, seed: int) -> Episodes:
+def play(
+    env: VectorEnv, policy: Policy, *, steps: int, seed: int, report: Callable[[int], object] = lambda done: None
+) -> Episodes:
     """Play one episode in each row of an environment that does not reset by itself.
 
     Parameters
@@ -46,6 +48,8 @@ def play(env: VectorEnv, policy: Policy, *, steps: int, seed: int) -> Episodes:
         Actions in an episode.
     seed : int
         Row i starts from seed + i.
+    report : callable, optional
+        Told the number of actions that are done.
 
     Returns
     -------
@@ -64,10 +68,11 @@ def play(env: VectorEnv, policy: Policy, *, steps: int, seed: int) -> Episodes:
     obs, info = env.reset(seed=seed)
     x, x_hat, u = [info["x"]], [info.get("x_hat")], []
     escaped = np.zeros(env.num_envs, dtype=bool)
-    for _ in range(steps):
+    for done in range(1, steps + 1):
         obs, _, terminated, _, info = env.step(policy(obs))
         escaped |= terminated
         x.append(info["x"])
         x_hat.append(info.get("x_hat"))
         u.append(info["u"])
+        report(done)
     return Episodes(np.array(x), None if x_hat[0] is None else np.array(x_hat), np.array(u), escaped)

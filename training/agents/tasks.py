@@ -6,20 +6,21 @@ import numpy as np
 
 from kkl_gym import get_system
 from kkl_gym.system import System
+from training.evaluation.levels import Level
 from training.systems import PROFILES, ControlTask, profile
 
 TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.items() if found.task}
 
 
-def get_task(name: str, measurement_noise: float | None = None) -> ControlTask:
+def get_task(name: str, measurement_noise: Level | None = None) -> ControlTask:
     """The task of a system, with another noise level if one is given.
 
     Parameters
     ----------
     name : str
         A shipped system, or ``"script.py:Class"``.
-    measurement_noise : float, optional
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny, optional
+        Standard deviation of the noise on each sample of y, of all outputs or each.
 
     Returns
     -------

@@ -13,8 +13,8 @@ import torch
 
 import kkl_gym
 from kkl_gym.systems import get_system
-from observers.storage import write
-from training.benchmark.protocol import Protocol, measure, validate
+from observers.storage import explained, write
+from training.benchmark.protocol import Protocol, measure, step_time, tuned_for, validate
 from training.jobs import check_identity, claimed_job, describe
 from training.maps.optimise import seconds_spent
 from training.methods import ABLATION, METHODS, Budget, Configuration, Method, Task, get_method
@@ -82,7 +82,7 @@ class Job:
             "system": describe(system),
             "method": method.name,
             "configurations": method.configurations(system),
-            "tuned_for": method.tuned_for,
+            "tuned_for": tuned_for(method, system),
             "version": kkl_gym.__version__,
             "revision": REVISION,
         }
@@ -115,6 +115,29 @@ def run_job(job: Job) -> None:
             except Exception:
                 write(job.folder / "failure.txt", traceback.format_exc())
                 raise
+
+
+def time_steps(job: Job) -> None:
+    """Time the steps of a job's observer, unless that is done; to be called while no training runs.
+
+    Parameters
+    ----------
+    job : Job
+        One that is done; its folder receives speed.json.
+
+    Raises
+    ------
+    Exception
+        Whatever the method raises.
+    """
+    path = job.folder / "speed.json"
+    if path.exists():
+        return
+    torch.set_num_threads(1)
+    method, system, dt = get_method(job.method), get_system(job.system), job.budget.dt
+    trained = method.load(job.folder / "trained.safetensors")
+    times = {f"us_batch_{batch}": step_time(method, trained, system=system, dt=dt, batch=batch) for batch in (1, 1000)}
+    write(path, json.dumps(times) + "\n")
 
 
 def _run(job: Job) -> None:
@@ -154,7 +177,8 @@ def _choose(job: Job, method: Method[Any]) -> tuple[Configuration, list[float]]:
             except FloatingPointError:  # a training that blows up is no candidate
                 score = FAILED
             write(path, json.dumps({"configuration": dict(configuration), "score": score}) + "\n")
-        scores.append(float(json.loads(path.read_text())["score"]))
+        with explained(path, ValueError):
+            scores.append(float(json.loads(path.read_text())["score"]))
     best = scores.index(min(scores))
     if min(scores) == FAILED:
         return configurations[best], scores
@@ -178,4 +202,6 @@ def _train(job: Job, method: Method[Any], configuration: Configuration, budget: 
         write(timing, f"{seconds_spent(folder):.1f}\n")
         method.save(trained, path)
         shutil.rmtree(folder)
-    return method.load(path), float(timing.read_text())
+    with explained(timing, ValueError):
+        seconds = float(timing.read_text())
+    return method.load(path), seconds

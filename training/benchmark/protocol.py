@@ -9,7 +9,8 @@ import pandas as pd
 
 from kkl_gym.system import System
 from training.evaluation.errors import TRANSIENT, Domain, UnseenTrajectories, starts, unseen_trajectories
-from training.evaluation.metrics import component_smape, rmse, settling_time, smape
+from training.evaluation.levels import Level, as_cell, multiple
+from training.evaluation.metrics import by_state, component_smape, nrmse, rmse, settling_time, smape
 from training.methods import CausalObserver, Method
 from training.seeds import Stream, generator
 
@@ -24,8 +25,8 @@ class Protocol:
     ----------
     domains : tuple of {"X", "1.5X", "2X"}
         Where they start: in X, or in a multiple of X without X.
-    measurement_noise : tuple of float
-        Standard deviations of the noise on each sample of y.
+    measurement_noise : tuple of float or of tuple of float
+        Standard deviations of the noise on each sample of y, of all outputs or each.
     trajectories : int
         Number for each domain; each is taken at every noise level.
     duration : float
@@ -35,7 +36,7 @@ class Protocol:
     """
 
     domains: tuple[Domain, ...] = ("X", "1.5X", "2X")
-    measurement_noise: tuple[float, ...] = (0.0, 0.5)
+    measurement_noise: tuple[Level, ...] = (0.0, 0.5)
     trajectories: int = 100
     duration: float = 50.0
     seed: int = 0
@@ -65,7 +66,7 @@ def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
 
 
 def with_shared_noise(
-    system: System, runs: UnseenTrajectories, *, measurement_noise: float, n: int, seed: tuple[Stream, *tuple[int, ...]]
+    system: System, runs: UnseenTrajectories, *, measurement_noise: Level, n: int, seed: tuple[Stream, *tuple[int, ...]]
 ) -> np.ndarray:
     """Outputs with noise on every sample, the same for every method.
 
@@ -75,8 +76,8 @@ def with_shared_noise(
         Of the trajectories.
     runs : UnseenTrajectories
         All ``n``, or the first few.
-    measurement_noise : float
-        Standard deviation.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation, of all outputs or each.
     n : int
         Trajectories for which noise is drawn.
     seed : tuple
@@ -88,7 +89,7 @@ def with_shared_noise(
         y = h(x) + v.
     """
     unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
-    v = measurement_noise * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
+    v = np.asarray(measurement_noise) * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
     y: np.ndarray = system.output(runs.x) + v
     return y
 
@@ -113,8 +114,9 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
     -------
     DataFrame
         A row for each trajectory, noise level and domain. Columns: starts, noise, trajectory, escaped, smape (all
-        steps), smape_late, component_late, rmse_late (after the first fifth), rmse, settling (seconds), lost. A
-        trajectory that leaves the system's declared bounds is marked as escaped and has no errors.
+        steps), smape_late, component_late, rmse_late (after the first fifth), rmse, settling (seconds), lost, and for
+        each state nrmse1, nrmse2, ... (after the first fifth). A trajectory that leaves the system's declared bounds
+        is marked as escaped and has no errors.
     """
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     frames = []
@@ -138,12 +140,18 @@ def measure(method: Method[Any], trained: Any, system: System, *, dt: float, pro
                     "rmse_late": rmse(runs.x, x_hat, skip),
                     "settling": settling_time(runs.x, x_hat, dt),
                     "lost": ((late > LOST) | ~np.isfinite(x_hat).all((0, 2))).astype(float),
+                    **by_state(nrmse(runs.x, x_hat, skip)),
                 }
             )
-            frame = pd.DataFrame({"starts": domain, "noise": noise, "trajectory": range(n)})
+            frame = pd.DataFrame({"starts": domain, "noise": as_cell(noise), "trajectory": range(n)})
             frame["escaped"] = (~runs.inside).astype(int)
             frames.append(frame.merge(errors, how="left", on="trajectory"))
     return pd.concat(frames, ignore_index=True)
+
+
+def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
+    """Levels of noise at which a method's configurations are compared; None for those of the test."""
+    return None if method.tuned_for is None else tuple(multiple(system, factor) for factor in method.tuned_for)
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
@@ -182,7 +190,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
         raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
     seed = (Stream.VALIDATION, protocol.seed, 1)
     medians = []
-    for noise in method.tuned_for or protocol.measurement_noise:
+    for noise in tuned_for(method, system) or protocol.measurement_noise:
         y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
         x_hat = run(method.observer(trained, system, dt, noise), y)
         medians.append(np.median(smape(runs.x, x_hat)))
@@ -208,7 +216,7 @@ def step_time(
     float
         Microseconds of CPU time, the least of five rounds.
     """
-    observer = method.observer(trained, system, dt, 0.5)
+    observer = method.observer(trained, system, dt, system.measurement_noise)
     y = system.output(starts(system, "X", batch, np.random.default_rng(0)))
     observer.reset(y)
     best = np.inf

@@ -1,6 +1,7 @@
 """Tables and the figure, from the benchmark's two CSV files and nothing else."""
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from observers.storage import replacing, write
+from training.evaluation.levels import read_level, show_level
 from training.markdown import table
 from training.systems import PROFILES
 
@@ -44,6 +46,7 @@ MEASURES = (
         "Median time from which the error stays below a tenth of the trajectory's size.",
     ),
 )
+NRMSE = re.compile(r"nrmse\d+")  # columns of results.csv
 NEVER = 1e12  # stands for an infinite time or error, of which no quantile can be taken
 DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2X \\ X"}
 
@@ -94,22 +97,31 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
     note : str
         What the page begins with.
     """
+    results = _by_text_of_noise(results)
     cases = sorted(
         results[["starts", "noise"]].drop_duplicates().itertuples(index=False, name=None),
-        key=lambda case: (list(DOMAINS).index(case[0]), case[1]),
+        key=lambda case: (list(DOMAINS).index(case[0]), _size(case[1])),
     )
     lines = ["# Benchmark", "", note, ""]
     for column, title, form, explanation in MEASURES:
         summary = summarise(results, column).set_index(["starts", "noise", "system", "method"])
         for case in cases:
-            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]:g}", "", explanation, ""]
+            lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", explanation, ""]
             lines += _by_method(methods, partial(_spread, summary, form, case))
+    states = [column for column in results if NRMSE.fullmatch(column)]  # none in results of earlier versions
+    if states:
+        medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
+        for case in cases:
+            lines += [f"## NRMSE in % after the first 20 %, {DOMAINS[case[0]]}, noise {case[1]}", ""]
+            lines += ["Of each state: median of its rms error over its standard deviation in all trajectories.", ""]
+            lines += _by_method(methods, partial(_each_state, medians, case))
     lines += ["## Lost trajectories in %", "", "Above 50 % after the first 20 %, or not finite. In this order: "]
-    lines[-1] += ", ".join(f"{starts} at noise {noise:g}" for starts, noise in cases) + "."
+    lines[-1] += ", ".join(f"{starts} at noise {noise}" for starts, noise in cases) + "."
     lost = results[results.escaped == 0].groupby(["system", "method", "starts", "noise"]).lost.mean() * 100
     lines += ["", *_by_method(methods, partial(_lost, lost, cases))]
-    if (results.noise == 0).any():
-        component = summarise(results[results.noise == 0], "component_late").set_index(["system", "method", "starts"])
+    noise_free = results[results.noise == "0"]
+    if len(noise_free):
+        component = summarise(noise_free, "component_late").set_index(["system", "method", "starts"])
         lines += [
             "## Component-wise SMAPE in % after the first 20 %, no noise",
             "",
@@ -144,7 +156,27 @@ def _by_method(methods: pd.DataFrame, cell: Callable[[tuple[str, str]], str]) ->
     return [*table(["", *(system.replace("_", " ") for system in systems)], rows), ""]
 
 
-def _spread(summary: pd.DataFrame, form: str, case: tuple[str, float], job: tuple[str, str]) -> str:
+def _by_text_of_noise(results: pd.DataFrame) -> pd.DataFrame:
+    """The same with levels of noise as text, whether they are numbers or one for each output."""
+    shown = {noise: show_level(read_level(str(noise))) for noise in results.noise.unique()}
+    return results.assign(noise=results.noise.map(shown))
+
+
+def _size(noise: str) -> list[float]:
+    """By which levels of noise are put in order."""
+    return np.atleast_1d(read_level(noise)).tolist()
+
+
+def _each_state(medians: pd.DataFrame, case: tuple[str, str], job: tuple[str, str]) -> str:
+    """The figures of the states that the system has; a state that does not move has none."""
+    if (*case, *job) not in medians.index:
+        return "–"
+    row = medians.loc[(*case, *job)].to_numpy()
+    known = np.flatnonzero(~np.isnan(row))
+    return " / ".join("–" if np.isnan(value) else _number(value) for value in row[: known.max(initial=0) + 1])
+
+
+def _spread(summary: pd.DataFrame, form: str, case: tuple[str, str], job: tuple[str, str]) -> str:
     if (*case, *job) not in summary.index:  # every trajectory escaped
         return "–"
     row = summary.loc[(*case, *job)]
@@ -158,7 +190,7 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if value >= 0.001 or value == 0 else "<0.001"
 
 
-def _lost(lost: pd.Series, cases: Sequence[tuple[str, float]], job: tuple[str, str]) -> str:
+def _lost(lost: pd.Series, cases: Sequence[tuple[str, str]], job: tuple[str, str]) -> str:
     return " / ".join(f"{lost[(*job, *case)]:.0f}" if (*job, *case) in lost.index else "–" for case in cases)
 
 
@@ -224,10 +256,11 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
+    results = _by_text_of_noise(results)
     labels, systems = _labels(methods), list(dict.fromkeys(methods.system))
     summary = summarise(results, "smape").set_index(["system", "method", "starts", "noise"])
     domains = [domain for domain in DOMAINS if domain in set(results.starts)]
-    levels = sorted(set(results.noise))
+    levels = sorted(set(results.noise), key=_size)
     size = (2.2 + (0.8 + 0.95 * len(systems)) * len(domains), 1.0 + (0.6 + 0.36 * len(labels)) * len(levels))
     figure = Figure(figsize=size, layout="constrained")
     axes: Any = figure.subplots(len(levels), len(domains), squeeze=False, sharex=True, sharey=True)
@@ -244,7 +277,7 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
             image = ax.imshow(values, cmap="RdYlBu_r", norm=LogNorm(0.1, 200, clip=True), aspect="auto")
             ax.set_xticks(range(len(systems)), [system.replace("_", "\n") for system in systems], fontsize=7)
             ax.set_yticks(range(len(labels)), list(labels.values()), fontsize=8)
-            ax.set_title(f"{DOMAINS[domain]}, noise {noise:g}", fontsize=9)
+            ax.set_title(f"{DOMAINS[domain]}, noise {noise}", fontsize=9)
             ax.tick_params(length=0)
     figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", shrink=0.6)
     figure.suptitle(note, fontsize=9)

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import torch
+import scipy
 import tyro
 from rich.console import Console
 from rich.table import Table
-from scipy.stats import bootstrap
 
 from kkl_gym import SYSTEMS, System, get_system
 from training.agents.agent import Agent, AgentError
@@ -20,8 +19,10 @@ from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
+from training.commands.options import NoiseLevel, SystemName
+from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
-from training.progress import progress_bars
+from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
 
 
@@ -33,19 +34,14 @@ class Train:
     run's folder. Hyperparameters are those of training/agents/hyperparameters.
     """
 
-    system: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SYSTEM")]
-    """A shipped system, or a class of yours with inputs as script.py:Class or module:Class."""
+    system: SystemName
     information: Annotated[Information, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
     """What the agent knows: docs/agents.md explains each."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
-    measurement_noise: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the task's, 0.5)")
-    ] = None
+    measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
-    timesteps: Annotated[
-        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
-    ] = None
+    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
     """Actions to learn from, in all environments together."""
     observer: Annotated[
         str | None,
@@ -54,14 +50,12 @@ class Train:
     """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
     algorithm: Annotated[
         Literal["ppo", "sac"] | None,
-        tyro.conf.arg(
-            metavar="{ppo,sac}", help_behavior_hint="(default: the profile's; sac for reverse_duffing, else ppo)"
-        ),
+        tyro.conf.arg(help_behavior_hint="(default: the profile's; sac for reverse_duffing, else ppo)"),
     ] = None
     """What the agent is trained with."""
-    out: Annotated[
-        Path | None, tyro.conf.arg(metavar="PATH", help_behavior_hint="(default: runs/agents/SYSTEM-INFORMATION-SEED)")
-    ] = None
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/SYSTEM-INFORMATION-SEED)")] = (
+        None
+    )
     """The run's folder."""
     resume: bool = False
     """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
@@ -83,7 +77,9 @@ class Train:
         FileExistsError
             If the folder holds an agent or a checkpoint already, and nothing is to be resumed.
         """
-        from training.agents.learn import learn  # stable-baselines3 takes seconds to import
+        import torch  # which takes seconds to import, as stable-baselines3 does
+
+        from training.agents.learn import learn
 
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name
@@ -91,7 +87,7 @@ class Train:
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
         torch.set_num_threads(self.threads)
-        with locked(folder), progress_bars(console) as progress:
+        with locked(folder), progress_bars(console, folder / LOG) as progress:
             if (folder / "agent.safetensors").exists() and not self.resume:
                 raise FileExistsError(f"{folder} holds an agent already; choose another folder with --out")
             if (folder / f"agent{SUFFIX}").exists() and not self.resume:
@@ -99,6 +95,7 @@ class Train:
                     f"{folder} holds the checkpoint of a training: go on with it (--resume), remove it, or choose "
                     "another folder with --out"
                 )
+            progress.say(f"training an agent for {name} that knows {self.information}, in {folder}")
             agent = learn(
                 task,
                 self.information,
@@ -110,8 +107,8 @@ class Train:
                 resume=self.resume,
                 progress=progress,
             )
-        show(console, agent, 100, trusted=agent.task.system)
-        console.print(f"wrote agent.safetensors and progress.csv in {folder}")
+            show(progress, agent, 100, trusted=agent.task.system)
+            progress.say(f"wrote agent.safetensors, progress.csv and {LOG} in {folder}")
 
 
 @dataclass(frozen=True)
@@ -151,12 +148,15 @@ class Evaluate:
         task = agent.task
         if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
-        episodes = show(console, agent, self.episodes, self.seed, trusted=self.system)
-        system = get_system(task.system).name
-        name = f"{system}-{agent.information}-{task.measurement_noise:g}-{agent.seed}"
-        draw(task, episodes, self.out / f"{name}.png")
-        animate(task, episodes, self.out / f"{name}.gif")
-        console.print(f"wrote {name}.png and {name}.gif in {self.out}")
+        with progress_bars(console) as progress:
+            episodes = show(progress, agent, self.episodes, self.seed, trusted=self.system)
+            system = get_system(task.system).name
+            name = f"{system}-{agent.information}-{as_name(task.measurement_noise)}-{agent.seed}"
+            with progress.phase("drawing", 2) as report:
+                draw(task, episodes, self.out / f"{name}.png")
+                report(1)
+                animate(task, episodes, self.out / f"{name}.gif")
+            progress.say(f"wrote {name}.png and {name}.gif in {self.out}")
 
 
 @dataclass(frozen=True)
@@ -175,12 +175,14 @@ class AgentCommand:
         self.command.run(console)
 
 
-def show(console: Console, agent: Agent, n: int, seed: int = 0, *, trusted: str | System | None = None) -> Episodes:
+def show(
+    progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | System | None = None
+) -> Episodes:
     """Play episodes; print score and success.
 
     Parameters
     ----------
-    console : Console
+    progress : ProgressBars
         Where they are printed.
     agent : Agent
         Who plays.
@@ -204,20 +206,22 @@ def show(console: Console, agent: Agent, n: int, seed: int = 0, *, trusted: str 
     first = agent_evaluation_seed(seed, n)
     task = agent.task
     system = get_system(task.system)
-    episodes = play(agent.make(n, system=trusted), agent, steps=task.steps, seed=first)
+    env = agent.make(n, system=trusted)
+    with progress.phase(f"playing {n} episodes", task.steps) as report:
+        episodes = play(env, agent, steps=task.steps, seed=first, report=report)
     score, success = scores(system, episodes.x), successes(task, episodes.x)
     table = Table(show_header=False)
     for label, value in (
-        ("system", str(task.system)),
+        ("system", system.name),
         ("information", agent.information),
-        ("measurement noise", f"{task.measurement_noise:g}"),
+        ("measurement noise", show_level(task.measurement_noise)),
         ("episodes", str(n)),
         ("score", "{:.3f} [{:.3f}, {:.3f}]".format(*interval(score))),
         (f"holds the target within {task.tolerance:g}", "{:.0f} % [{:.0f}, {:.0f}]".format(*interval(100.0 * success))),
         ("escaped", f"{100 * episodes.escaped.mean():.0f} %"),
     ):
         table.add_row(label, value)
-    console.print(table)
+    progress.console.print(table)
     return episodes
 
 
@@ -237,7 +241,7 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]
     mean = float(np.mean(values))
     if len(values) < 2:
         return mean, np.nan, np.nan
-    ends = bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
+    ends = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return mean, float(ends.low), float(ends.high)
 
 

@@ -1,10 +1,10 @@
 """``kkl-gym certify``: a certificate as table, JSON and figure."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
@@ -15,12 +15,13 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
-from training.evaluation.certificates.certificate import Certificate, certify
-from training.evaluation.certificates.forward import AGES, QUANTILES
-from training.evaluation.certificates.gains import noise_variance
-from training.evaluation.certificates.settled import SettledTrajectories, record_settled
-from training.evaluation.report import draw_residual
+from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
+from training.evaluation.levels import beyond, level_for, show_level
+from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    from training.evaluation.certificates.certificate import Certificate
+    from training.evaluation.certificates.settled import SettledTrajectories
 
 SHOWN = 30_000  # states in the figure
 
@@ -37,15 +38,12 @@ class Certify:
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
     policy: OwnPolicy = None
-    measurement_noise: float = 0.5
-    """Standard deviation of the noise on each sample of y; for the theorems it is cut at three of these."""
-    process_noise: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the system's)")
-    ] = None
+    measurement_noise: NoiseLevel = None
+    """Standard deviation of the noise on each sample of y, or one for each output as in 0.1,0.3. For the theorems it is
+    cut at three of these. Maps that were trained for less are left out."""
+    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Bound of the process noise, in multiples of the system's scale per second."""
-    psi: Annotated[
-        float | None, tyro.conf.arg(metavar="FLOAT", help_behavior_hint="(default: the motion's diameter)")
-    ] = None
+    psi: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the motion's diameter)")] = None
     """Bound of how far process noise moves the state from where it would have been."""
     trajectories: int = 200
     """Number of trajectories, from starts uniform in X."""
@@ -56,7 +54,7 @@ class Certify:
     out: Path = Path("runs/certificates")
     """Folder for what is written."""
 
-    def run(self, console: Console) -> list[Certificate]:
+    def run(self, console: Console) -> "list[Certificate]":
         """Certify.
 
         Parameters
@@ -74,21 +72,28 @@ class Certify:
         ValueError
             If an observer cannot be had, or a number makes no sense.
         """
+        from training.evaluation.certificates.certificate import certify, parts  # torch takes seconds to import
+        from training.evaluation.certificates.settled import record_settled
+
         names = [Path(given).stem if given.endswith(".safetensors") else given for given in self.observers]
         if len(set(names)) < len(names):
             raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
         found = []
-        for name, (_, artifact, system) in zip(names, read_observers(self.observers, self.system), strict=True):
-            with console.status(f"certifying {name}"):
-                process_noise = system.process_noise if self.process_noise is None else self.process_noise
-                KKLObserver(artifact, self.measurement_noise, process_noise=process_noise)  # refuses bad levels now
-                levels = (self.measurement_noise, process_noise)
+        observers = read_observers(self.observers, self.system)
+        for name, (_, artifact, system) in zip(names, observers, strict=True):
+            level = level_for(artifact, system, self.measurement_noise)
+            if reason := beyond(artifact, level):
+                console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
+                continue
+            process_noise = system.process_noise if self.process_noise is None else self.process_noise
+            KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now
+            noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
+            with progress_bars(console) as progress, progress.phase(f"certifying {name}", parts(artifact)) as report:
                 policy = read_policy(artifact, system, self.policy)
                 motion = record_settled(
                     artifact,
                     system,
-                    measurement_noise=self.measurement_noise,
-                    process_noise=process_noise,
+                    **noise,
                     trajectories=self.trajectories,
                     seed=self.seed,
                     policy=policy,
@@ -96,25 +101,27 @@ class Certify:
                 certificate = certify(
                     artifact,
                     system,
-                    measurement_noise=self.measurement_noise,
-                    process_noise=process_noise,
+                    **noise,
                     psi=self.psi,
                     trajectories=self.trajectories,
                     delta=self.delta,
                     seed=self.seed,
                     name=name,
                     recorded=motion,
+                    report=report,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, name=name, levels=levels, motion=motion)
+                draw(self.out / f"{name}.png", artifact, system, name=name, noise=noise, motion=motion)
             found.append(certificate)
+        if not found:
+            raise ValueError(f"nothing is left to certify of {', '.join(names)}: the lines above say why")
         console.print(table(found))
         write(self.out / "table.md", page(found))
         console.print(f"wrote table.md, JSON and figures in {self.out}")
         return found
 
 
-def lines(found: Certificate) -> list[dict[str, str]]:
+def lines(found: "Certificate") -> list[dict[str, str]]:
     """What a certificate says, in sections: label to value.
 
     Parameters
@@ -125,8 +132,10 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     Returns
     -------
     list of dict
-        The sections, with the same labels for all observers.
+        The sections, with the same labels for all observers of systems of one pace.
     """
+    from training.evaluation.certificates.forward import QUANTILES
+
     forward = found.forward
 
     def number(value: float | None) -> str:
@@ -138,12 +147,17 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     def ratio(bound: float, error: float) -> str:
         return number((bound / error) ** 0.5 if error > 0 else None)
 
+    def states(values: Sequence[float]) -> str:
+        return " / ".join(map(number, values))
+
     residual = {f"\\|P\\|, {100 * level:g} % of X below": level for level in QUANTILES}
-    start = {f"start's \\|z - T(x)\\|, at most, at {age:g} s": age for age in AGES}
+    left = forward.envelope if forward else {}
     return [
         {
             "rms error in the long run, no noise": number(found.error**0.5),
             "the same, v and w bounded": number(found.noisy_error**0.5),
+            "rms error by state in % of its standard deviation, no noise": states(found.nrmse),
+            "the same by state, v and w bounded": states(found.noisy_nrmse),
             "error due to v alone, predicted": number(found.predicted_noise_error),
             "the same, measured": number(found.measured_noise_error),
         },
@@ -166,7 +180,7 @@ def lines(found: Certificate) -> list[dict[str, str]]:
             "T_inv(T(x)) - T_inv(z) along the motion, mean square": of("propagated_risk"),
         },
         {
-            **{label: number(forward.envelope[age] if forward else None) for label, age in start.items()},
+            **{f"start's \\|z - T(x)\\|, at most, at {age:g} s": number(value) for age, value in left.items()},
             "start forgotten after, s": of("forgets_start"),
         },
         {
@@ -198,29 +212,34 @@ def lines(found: Certificate) -> list[dict[str, str]]:
     ]
 
 
-def table(found: Sequence[Certificate]) -> Table:
+def table(found: "Sequence[Certificate]") -> Table:
     """Certificates side by side, one row for each label."""
     out = Table("", *(certificate.observer for certificate in found))
-    for sections in zip(*map(lines, found), strict=True):
-        for label in sections[0]:
-            out.add_row(label.replace("\\", ""), *(section[label] for section in sections))
+    for section in _sections(found):
+        for label, *values in section:
+            out.add_row(label.replace("\\", ""), *values)
         out.add_section()
     return out
 
 
-def page(found: Sequence[Certificate]) -> str:
+def page(found: "Sequence[Certificate]") -> str:
     """Certificates side by side in Markdown, with the noise that they were made for."""
-    rows = [
-        [label, *(section[label] for section in sections)]
-        for sections in zip(*map(lines, found), strict=True)
-        for label in sections[0]
-    ]
-    first = found[0]
-    head = (
-        f"Measurement noise {first.measurement_noise:g}, cut at {first.noise_bound:g} for the bounds; "
-        f"{first.samples} samples along the motion of the first.\n\n"
+    rows = [row for section in _sections(found) for row in section]
+    noise = dict.fromkeys(
+        f"{show_level(one.measurement_noise)}, cut at {show_level(one.noise_bound)} for the bounds" for one in found
     )
+    head = f"Measurement noise {'; '.join(noise)}; {found[0].samples} samples along the motion of the first.\n\n"
     return head + "\n".join(markdown.table(["", *(certificate.observer for certificate in found)], rows)) + "\n"
+
+
+def _sections(found: "Sequence[Certificate]") -> list[list[list[str]]]:
+    """Rows of each section: a label, and what each certificate has under it."""
+    out = []
+    for sections in zip(*map(lines, found), strict=True):
+        longest_first = sorted(sections, key=len, reverse=True)  # some lack lines that others have
+        labels = dict.fromkeys(label for section in longest_first for label in section)
+        out.append([[label, *(section.get(label, "–") for section in sections)] for label in labels])
+    return out
 
 
 def draw(
@@ -229,8 +248,8 @@ def draw(
     system: System,
     *,
     name: str,
-    levels: tuple[float, float],
-    motion: SettledTrajectories,
+    noise: Mapping[str, Any],
+    motion: "SettledTrajectories",
 ) -> None:
     """Draw the PDE's residual over X, and along the motion the error that noise will make.
 
@@ -244,27 +263,30 @@ def draw(
         What it was made for.
     name : str
         For the title.
-    levels : tuple of float
-        Measurement noise and process noise.
+    noise : mapping
+        The levels ``measurement_noise`` and ``process_noise``.
     motion : SettledTrajectories
         Where the error is shown.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 
+    from training.evaluation.certificates.gains import noise_variance
+    from training.evaluation.report import draw_residual
+
     panels = 1 + (artifact.forward is not None)
     figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")
     axes = figure.subplots(1, panels, squeeze=False)[0]
     first, second = (i % system.nx for i in system.portrait)
     shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
-    variance = noise_variance(artifact, motion.z[shown], measurement_noise=levels[0], process_noise=levels[1])
+    variance = noise_variance(artifact, motion.z[shown], **noise)
     x, size = motion.x[shown], np.sqrt(variance)
     order = size.argsort()
     points: Any = axes[-1].scatter(
         x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
     )
     figure.colorbar(points, ax=axes[-1], label="predicted rms error")
-    axes[-1].set_title(f"error due to noise {levels[0]:g}, along the motion")
+    axes[-1].set_title(f"error due to noise {show_level(noise['measurement_noise'])}, along the motion")
     axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
     if artifact.forward is not None:
         draw_residual(axes[0], artifact, system)

@@ -2,19 +2,37 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 
+from kkl_gym import get_system
+from observers import Artifact
+from observers.artifact import resolve
 from observers.storage import replacing, write
 from training import markdown
-from training.agents.comparison import COMPARED, Compared, collect, interval, middle, normalised, planned, run_case
+from training.agents.comparison import (
+    COMPARED,
+    Compared,
+    collect,
+    interval,
+    kinds,
+    middle,
+    noise_levels,
+    normalised,
+    planned,
+    run_case,
+)
+from training.agents.information import observer_of
 from training.agents.tasks import TASKS
+from training.evaluation.levels import as_name
 from training.jobs import run_all
-from training.progress import progress_bars
+from training.progress import LOG, progress_bars, under_way
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LABELS = {
     "state": "full state",
@@ -37,19 +55,19 @@ class Compare:
     """
 
     systems: tuple[str, ...] = tuple(TASKS)
-    """Shipped systems."""
+    """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[tuple[Compared, ...], tyro.conf.arg(aliases=["--knows"])] = COMPARED
     """What agents know: docs/agents.md explains each."""
     seeds: int = 5
     """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
     episodes: int = 100
     """Number of episodes that each agent is played on."""
-    timesteps: Annotated[
-        int | None, tyro.conf.arg(metavar="INT", help_behavior_hint="(default: the hyperparameters')")
-    ] = None
+    timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None
     """Actions to learn from, in all environments together."""
     more_noise: bool = True
     """Compare also at noise 0.2 on Van der Pol and at noise 2 on Lorenz."""
+    observers: tuple[str, ...] = ()
+    """Observers for agents that know x_hat or z: a .safetensors file for each system of yours, or shipped maps."""
     jobs: int = 2
     """Number of worker processes, of one thread each."""
     out: Path = Path("runs/agents/comparison")
@@ -72,9 +90,10 @@ class Compare:
             raise ValueError(
                 f"seeds, episodes and jobs must be positive, got {self.seeds}, {self.episodes} and {self.jobs}"
             )
-        for names, known in ((self.systems, tuple(TASKS)), (self.information, COMPARED)):
-            if not names or len(set(names)) < len(names) or not set(names) <= set(known):
-                raise ValueError(f"give some of {', '.join(known)}, each once; got {', '.join(names) or 'none'}")
+        for what, given in (("systems", self.systems), ("information", self.information)):
+            if not given or len(set(given)) < len(given):
+                raise ValueError(f"give some {what}, each once; got {', '.join(given) or 'none'}")
+        observers = self._observers()
         cases = planned(
             self.out,
             systems=self.systems,
@@ -83,25 +102,49 @@ class Compare:
             episodes=self.episodes,
             timesteps=self.timesteps,
             more_noise=self.more_noise,
+            observers=observers,
         )
         todo = [case for case in cases if not case.done]
         failures = []
         try:
-            with progress_bars(console) as progress:
+            with progress_bars(console, self.out / LOG) as progress:
+                workers = min(self.jobs, max(1, len(todo)))
                 bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
-                for case, failure, _ in run_all(run_case, todo, min(self.jobs, max(1, len(todo)))):
+                progress.update(bar, description=under_way("agents", [case.name for case in todo[:workers]]))
+                for case, failure, running in run_all(run_case, todo, workers):
                     if failure:
                         failures.append(f"{case.name}: {failure}")
-                    progress.console.print(f"[red]failed[/red] {failures[-1]}" if failure else f"finished {case.name}")
-                    progress.advance(bar)
+                    progress.say(f"failed {failures[-1]}" if failure else f"finished {case.name}")
+                    progress.update(bar, advance=1, description=under_way("agents", running))
         finally:  # also after an interruption
-            results = collect(self.out, self.episodes, self.timesteps)
-            if len(results):
-                write(self.out / "results.csv", results.to_csv(index=False))
-                report(self.out)
-                console.print(f"wrote results.csv, table.md and scores.png in {self.out}")
+            with progress_bars(console, self.out / LOG) as progress, progress.phase("collecting results"):
+                own = [system for system in self.systems if system not in TASKS]
+                results = collect(
+                    self.out, episodes=self.episodes, timesteps=self.timesteps, own=own, observers=observers
+                )
+                if len(results):
+                    write(self.out / "results.csv", results.to_csv(index=False))
+                    report(self.out)
+                    progress.say(f"wrote results.csv, table.md and scores.png in {self.out}")
         if failures:
             raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
+
+    def _observers(self) -> dict[str, str]:
+        """Observers by the name of the system that they were made for."""
+        found: dict[str, str] = {}
+        systems = {get_system(name).name for name in self.systems}
+        for name in self.observers:
+            system = Artifact.read(resolve(name)).system
+            if system not in systems or system in found:
+                raise ValueError(
+                    f"the observer {name} is for {system}: name one for each of {', '.join(systems)} at most"
+                )
+            found[system] = name
+        if {"x_hat", "z"} & set(self.information):
+            for name in self.systems:
+                if (own := get_system(name)).name not in found:
+                    observer_of(own)  # an error now, not when their turn comes
+        return found
 
 
 def report(out: Path) -> None:
@@ -112,10 +155,17 @@ def report(out: Path) -> None:
     out : Path
         Folder of the comparison.
     """
+    import pandas as pd  # which takes half a second that help need not wait for
+
     results = pd.read_csv(out / "results.csv")
-    kinds = ["system", "noise", "knows", "seed"]
-    plan = {(case.system, case.measurement_noise, case.information, case.seed) for case in planned(out)}
-    missing = plan - set(results[kinds].itertuples(index=False, name=None))
+    results["noise"] = [_plain(level) for level in results.noise]
+    shipped = noise_levels() if set(results.system) & set(TASKS) else {}
+    levels = {name: tuple(map(as_name, at)) for name, at in shipped.items()}
+    for name, group in results.groupby("system", sort=False):
+        if name not in TASKS:
+            levels[str(name)] = tuple(group.noise.unique())
+    plan = set(kinds(levels))
+    missing = plan - set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
     partial = f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
     tasks = list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
     lines = [
@@ -139,7 +189,7 @@ def report(out: Path) -> None:
             spread = "" if np.isnan(low) else f" [{low:.2f}, {high:.2f}]"
             row.append(f"{found:.2f}{spread}, {100 * cell['success']:.0f} %, {len(cell['agents'])}")
         rows.append(row)
-    lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise:g}" for system, noise in tasks)], rows)
+    lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise}" for system, noise in tasks)], rows)
     minutes = results.groupby("knows").seconds.mean() / 60
     spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
@@ -147,7 +197,15 @@ def report(out: Path) -> None:
     _draw(out / "scores.png", results, tasks, partial)
 
 
-def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[str, float, str], dict[str, Any]]:
+def _plain(level: float | str) -> str:
+    """A level of noise as :func:`as_name` gives it, from a column in which some are numbers."""
+    try:
+        return as_name(float(level))
+    except ValueError:  # one for each output
+        return str(level)
+
+
+def _cells(results: "pd.DataFrame", tasks: list[tuple[str, str]]) -> dict[tuple[str, str, str], dict[str, Any]]:
     """What table and figure show for each task and kind of agent."""
     cells = {}
     for system, noise in tasks:
@@ -168,7 +226,7 @@ def _cells(results: pd.DataFrame, tasks: list[tuple[str, float]]) -> dict[tuple[
     return cells
 
 
-def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], partial: str) -> None:
+def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, str]], partial: str) -> None:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")
@@ -183,7 +241,7 @@ def _draw(path: Path, results: pd.DataFrame, tasks: list[tuple[str, float]], par
                 ax.plot([low, high], [place, place], color="C0", lw=2)
                 ax.plot(found, place, "o", color="C0")
         ax.axvline(1.0, color="0.8", lw=0.8)
-        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]:g}", xlabel="normalised score")
+        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]}", xlabel="normalised score")
         ax.set_yticks(range(len(COMPARED)), [LABELS[knows] for knows in reversed(COMPARED)])
     figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
     with replacing(path) as temporary:

@@ -1,14 +1,13 @@
-"""``kkl-gym demo``: the four environments with their shipped observers, in one table and one figure."""
+"""``kkl-gym demo``: environments with their observers, in one table and one figure."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -16,24 +15,28 @@ import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
+from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
+from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
 
-DT = 0.01  # s, of the environments
+EVERY = 100  # steps between two reports
 
 
 @dataclass(frozen=True)
 class Demo:
-    """Run all four environments with their shipped observers; print a table and draw true and estimated states.
+    """Run environments with their observers; print a table and draw true and estimated states.
 
-    The default observer runs inside the environment. SPINN, the paper's, is given the same outputs afterwards.
+    The observer runs inside the environment. SPINN, the paper's, is given the same outputs afterwards, where it ships.
     """
 
+    system: OneSystem = None
+    observer: OneObserver = None
     out: Path = Path("runs/demo")
-    """Folder for the figure."""
-    measurement_noise: Annotated[float, tyro.conf.arg(aliases=["--noise"])] = 0.5
+    """Folder for the figure: estimates.png, of one system alone estimates-NAME.png."""
+    measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
-    duration: float = 50.0
+    duration: Seconds = None
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
@@ -50,35 +53,32 @@ class Demo:
         -------
         Path
             The figure.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, or there is no observer for the system.
         """
-        check_duration(self.duration, DT)
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        table = Table(
-            "environment",
-            "default",
-            "late",
-            "SPINN",
-            "late",
-            "µs a step",
-            title=f"SMAPE in %, all steps and late (after 20 %), measurement noise {self.measurement_noise:g}",
-        )
-        episodes = []
+        environments = shown(self.system, self.observer)
+        for one in environments:
+            if not one.observed:
+                raise ValueError(f"no observer ships for {one.system.name!r}: name a file, --observer FILE")
         with progress_bars(console) as progress:
-            for env_id in progress.track(kkl_gym.ENV_IDS.values(), description="running"):
-                episode = play(env_id, self.measurement_noise, duration=self.duration, seed=self.seed)
-                steps = len(episode.x) - 1
-                errors = [
-                    smape(episode.x[:, None], x_hat[:, None], skip)[0]
-                    for x_hat in (episode.x_hat, episode.spinn)
-                    for skip in (0, (steps + 1) // 5)
-                ]
-                table.add_row(env_id, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds / steps:.0f}")
-                episodes.append(episode)
-        console.print(table)
-        path = self.out / "estimates.png"
-        draw(path, episodes, self.measurement_noise)
-        console.print(f"wrote {path}: true states in black, estimates in magenta and blue, the measured output in grey")
+            episodes = []
+            for one in environments:
+                duration = one.system.duration if self.duration is None else self.duration
+                dt = one.options.get("dt", one.system.dt)
+                check_duration(duration, dt)
+                steps = round(duration / dt)
+                with progress.phase(f"running {one.label}", steps) as report:
+                    episodes.append(play(one, steps, self.measurement_noise, seed=self.seed, report=report))
+            console.print(table(episodes))
+            path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
+            with progress.phase("drawing"):
+                draw(path, episodes)
+            progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
         return path
 
 
@@ -88,64 +88,140 @@ class Episode:
 
     Parameters
     ----------
+    label : str
+        For tables.
+    chosen : bool
+        Whether the observer is another than the default.
     env : KKLObservation
         Where it was played.
     x, x_hat : ndarray, shape (steps + 1, nx)
         States and their estimates.
-    spinn : ndarray, shape (steps + 1, nx)
-        What the paper's observer makes of the same outputs.
+    spinn : ndarray, shape (steps + 1, nx), or None
+        What the paper's observer makes of the same outputs, if it ships.
     y : ndarray, shape (steps + 1, ny)
         Noisy outputs.
     seconds : float
         Time that the steps took.
     """
 
+    label: str
+    chosen: bool
     env: kkl_gym.KKLObservation
     x: np.ndarray
     x_hat: np.ndarray
-    spinn: np.ndarray
+    spinn: np.ndarray | None
     y: np.ndarray
     seconds: float
 
+    @property
+    def name(self) -> str:
+        """The system's."""
+        return self.env.unwrapped.system.name  # type: ignore[attr-defined]
 
-def play(env_id: str, measurement_noise: float, *, duration: float, seed: int) -> Episode:
-    """Play one undriven episode with the shipped observer.
+    @property
+    def measurement_noise(self) -> str:
+        """Its level, for people."""
+        return show_level(self.env.unwrapped.measurement_noise)  # type: ignore[attr-defined]
+
+
+def play(
+    environment: Shown,
+    steps: int,
+    measurement_noise: Level | None,
+    *,
+    seed: int,
+    report: Callable[[int], object] = lambda done: None,
+) -> Episode:
+    """Play one undriven episode with an observer.
 
     Parameters
     ----------
-    env_id : str
-        Of a shipped environment.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
-    duration : float
-        Length in seconds.
+    environment : Shown
+        What is shown.
+    steps : int
+        Length in sampling intervals.
+    measurement_noise : float, tuple of float or None
+        Standard deviation of the noise on each sample of y; None for the system's own.
     seed : int
         Seed of start and noise.
+    report : callable, optional
+        Told now and then the number of steps that are done.
 
     Returns
     -------
     Episode
         It ends early where the state leaves the system's bounds.
     """
-    steps = round(duration / DT)
-    env = kkl_gym.KKLObservation(gym.make(env_id, measurement_noise=measurement_noise, max_episode_steps=steps))
+    made = gym.make(
+        environment.env_id, **environment.options, measurement_noise=measurement_noise, max_episode_steps=steps
+    )
+    env = kkl_gym.KKLObservation(made, environment.observer)
     _, info = env.reset(seed=seed)
     infos = [info]
     action = np.zeros(env.action_space.shape or (), np.float32)
-    started = time.perf_counter()
-    for _ in range(steps):
-        _, _, terminated, _, info = env.step(action)
-        infos.append(info)
+    seconds = 0.0
+    for first in range(0, steps, EVERY):
+        started = time.perf_counter()
+        for _ in range(first, min(first + EVERY, steps)):
+            _, _, terminated, _, info = env.step(action)
+            infos.append(info)
+            if terminated:
+                break
+        seconds += time.perf_counter() - started
+        report(len(infos) - 1)
         if terminated:
             break
-    seconds = time.perf_counter() - started
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
-    name = env.unwrapped.system.name  # type: ignore[attr-defined]
-    spinn = load(f"{name}-spinn", measurement_noise).estimate(y)
-    return Episode(env, x, x_hat, spinn, y, seconds)
+    system, level = environment.system, env.unwrapped.measurement_noise  # type: ignore[attr-defined]
+    paper = f"{system.name}-spinn" if type(system) in kkl_gym.SYSTEMS.values() else None
+    return Episode(
+        label=environment.label,
+        chosen=environment.observer is not None,
+        env=env,
+        x=x,
+        x_hat=x_hat,
+        spinn=load(paper, level).estimate(y) if paper else None,
+        y=y,
+        seconds=seconds,
+    )
 
 
-def draw(path: Path, episodes: Sequence[Episode], measurement_noise: float) -> None:
+def table(episodes: Sequence[Episode]) -> Table:
+    """Errors of the observers, and the time of a step.
+
+    Parameters
+    ----------
+    episodes : sequence of Episode
+        A row each.
+
+    Returns
+    -------
+    Table
+        For the console.
+    """
+    noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+    with_spinn = any(episode.spinn is not None for episode in episodes)
+    found = Table(
+        "environment",
+        "observer" if episodes[0].chosen else "default",
+        "late",
+        *("SPINN", "late") if with_spinn else (),
+        "µs a step",
+        title=f"SMAPE in %, all steps and late (after 20 %), measurement noise {noise}",
+    )
+    for episode in episodes:
+        steps = len(episode.x) - 1
+        estimates = [episode.x_hat, *([episode.spinn] if with_spinn else [])]
+        errors = [
+            smape(episode.x[:, None], x_hat[:, None], skip)[0]  # type: ignore[index]
+            for x_hat in estimates
+            for skip in (0, (steps + 1) // 5)
+        ]
+        found.add_row(episode.label, *(f"{error:.2f}" for error in errors), f"{1e6 * episode.seconds / steps:.0f}")
+    return found
+
+
+def draw(path: Path, episodes: Sequence[Episode]) -> None:
     """Draw true and estimated states over time, a column for each episode (like the paper's fig. 2).
 
     Parameters
@@ -154,8 +230,6 @@ def draw(path: Path, episodes: Sequence[Episode], measurement_noise: float) -> N
         Of the figure; its folder is made.
     episodes : sequence of Episode
         What is shown.
-    measurement_noise : float
-        Level that the title names.
     """
     from matplotlib.figure import Figure
 
@@ -170,20 +244,23 @@ def draw(path: Path, episodes: Sequence[Episode], measurement_noise: float) -> N
             if i >= system.nx:
                 ax.set_visible(False)
                 continue
-            if C is not None and np.array_equal(C[0], np.eye(system.nx)[i]):
-                ax.plot(t, episode.y[:, 0], color="0.75", lw=0.6, label="measured")
+            for measured, row in zip(episode.y.T, [] if C is None else C, strict=False):
+                if np.array_equal(row, np.eye(system.nx)[i]):
+                    ax.plot(t, measured, color="0.75", lw=0.6, label="measured")
             ax.plot(t, episode.x[:, i], "k", lw=1.2, label="true")
-            ax.plot(t, episode.x_hat[:, i], "m--", lw=1.0, label="default observer")
-            ax.plot(t, episode.spinn[:, i], ":", color="tab:blue", lw=1.2, label="SPINN")
+            ax.plot(t, episode.x_hat[:, i], "m--", lw=1.0, label="observer" if episode.chosen else "default observer")
+            if episode.spinn is not None:
+                ax.plot(t, episode.spinn[:, i], ":", color="tab:blue", lw=1.2, label="SPINN")
             low, high = episode.x[:, i].min(), episode.x[:, i].max()
-            ax.set_ylim(low - 0.25 * (high - low), high + 0.25 * (high - low))  # the first estimates may be far off
+            margin = 0.25 * (high - low) or 1.0
+            ax.set_ylim(low - margin, high + margin)  # the first estimates may be far off
             ax.set_ylabel(system.state_names[i])
         axes[0, column].set_title(system.name.replace("_", " "))
         axes[system.nx - 1, column].set_xlabel("t in s")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower left", ncols=len(labels))
-    figure.suptitle(
-        f"Hidden states estimated from one noisy output (standard deviation {measurement_noise:g} on every sample)"
-    )
+    handles = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="lower left", ncols=len(handles))
+    noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+    what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
+    figure.suptitle(f"Hidden states estimated from {what} (standard deviation {noise} on every sample)")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)

@@ -1,11 +1,12 @@
 """``kkl-gym evaluate``."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 from rich.table import Table
@@ -13,8 +14,34 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
-from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
-from training.evaluation.errors import Domain, errors, unseen_trajectories
+from training.commands.options import (
+    NoiseLevels,
+    Observers,
+    OwnPolicy,
+    OwnSystem,
+    Seconds,
+    read_observers,
+    read_policy,
+)
+from training.evaluation.errors import (
+    Domain,
+    Errors,
+    NoStartsError,
+    UnseenTrajectories,
+    errors,
+    kalman_errors,
+    unseen_trajectories,
+)
+from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
+from training.evaluation.metrics import by_state
+from training.progress import ProgressBars, progress_bars
+from training.trajectories.controllers import Controller
+
+CASES: tuple[tuple[str, Domain, bool], ...] = (("X", "X", False), ("2X \\ X", "2X", False), ("X", "X", True))
+SKIPPED = 5.0  # seconds of driven runs at the pace of the shipped systems, half of the run at most
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -22,30 +49,37 @@ class Evaluate:
     """Print observers' errors on unseen trajectories: in X and in 2X without X, with and without noise.
 
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
-    after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines. Observers are
-    told the levels of noise if they can use them. Trajectories that leave the system's declared bounds are counted, and
-    left out. The column "driven" is there for observers that take inputs, "process noise" where there is any; the CSV
-    file always has both. Under a policy, those are driven in which it errs about the state and explores.
+    after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines (of systems of
+    another pace, 500 samples). A second table has the NRMSE of each state after the transient, the median over the
+    trajectories: its root mean square error in percent of its standard deviation over all of them. SMAPE is of one norm
+    of all states, which says little where their units differ.
+
+    2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
+    told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is
+    there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
+    Under a policy, those are driven in which it errs about the state and explores.
     """
 
     observers: Observers
     """Shipped maps, or .safetensors files."""
     system: OwnSystem = None
     policy: OwnPolicy = None
-    measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)
-    """Standard deviations of the noise on each sample of y, one table row for each."""
+    measurement_noise: NoiseLevels = None
+    """Standard deviations of the noise on each sample of y, a table row for each. 0.1,0.3 is one for each output."""
     process_noise: float = 0.0
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
-    duration: float = 50.0
-    """Length of each trajectory in seconds."""
+    duration: Seconds = None
+    """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
     """Seed of the trajectories and the noise; no seed gives any that training draws."""
+    ekf: bool = False
+    """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
-    def run(self, console: Console) -> pd.DataFrame:
+    def run(self, console: Console) -> "pd.DataFrame":
         """Evaluate.
 
         Parameters
@@ -61,78 +95,137 @@ class Evaluate:
         Raises
         ------
         ValueError
-            If an observer cannot be had, or a number makes no sense.
+            If an observer cannot be had, a number makes no sense, or nothing can be measured.
         """
-        if not self.measurement_noise:
+        import pandas as pd  # which takes half a second that help need not wait for
+
+        if self.measurement_noise is not None and not self.measurement_noise:
             raise ValueError("give at least one level of measurement noise; 0 is none")
         if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
             raise ValueError(f"csv = {self.csv} is a folder: name a file")
-        frames = []
-        for name, artifact, system in read_observers(self.observers, self.system):
-            with console.status(f"evaluating {name}"):
-                frames.append(self._evaluate(name, artifact, system, console))
+        frames: list[pd.DataFrame] = []
+        with progress_bars(console) as progress:
+            for name, artifact, system in read_observers(self.observers, self.system):
+                frames += self._evaluate(name, artifact, system, progress)
+        if not frames:
+            raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
         if self.csv:
             write(self.csv, found.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
         return found
 
-    def _evaluate(self, name: str, artifact: Artifact, system: System, console: Console) -> pd.DataFrame:
-        policy = read_policy(artifact, system, self.policy)
-        cases: list[tuple[str, Domain, bool]] = [("X", "X", False), ("2X \\ X", "2X", False)]
-        if artifact.nu:
-            cases.append(("X", "X", True))
-        table = Table(title=f"{name}: SMAPE in %, median (IQR) of {self.trajectories} runs of {self.duration:g} s")
-        table.add_column("starts")
-        if artifact.nu:
-            table.add_column("driven")
-        process = [f"{self.process_noise:g}"] if self.process_noise else []
-        if process:
-            table.add_column("process\nnoise", justify="right")
-        for column in ("noise\non y", "all steps", "after transient", "escaped"):
-            table.add_column(column, justify="right")
+    def _evaluate(self, name: str, artifact: Artifact, system: System, progress: ProgressBars) -> list["pd.DataFrame"]:
+        """Print an observer's tables, and what is left out of them; rows of the CSV file."""
+        import pandas as pd
+
+        duration = system.duration if self.duration is None else self.duration
+        runs = f"{self.trajectories} runs of {duration:g} s"
+        smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}", artifact)
+        nrmse = self._table(f"{name}: NRMSE in % after transient, median", artifact)
+        for table, measures in ((smape, ("all steps", "after transient", "escaped")), (nrmse, system.state_names)):
+            for measure in measures:
+                table.add_column(measure, justify="right")
         frames = []
+        shown = Path(name).stem if self.ekf else name
+        everyone: dict[str, Callable[..., Errors]] = {shown: partial(errors, artifact, system)}
+        if self.ekf:
+            everyone["exact EKF"] = lambda runs, **how: kalman_errors(system, runs, artifact.filter.dt, **how)
+        policy = read_policy(artifact, system, self.policy)
+        levels, left_out = self._levels(artifact, system)
+        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
+        bar = progress.add_task(f"evaluating {name}", total=len(cases) * (1 + len(levels)))
         for starts, domain, driven in cases:
-            trajectories = unseen_trajectories(
+            trajectories = self._trajectories(artifact, system, domain, duration=duration, driven=driven, policy=policy)
+            if isinstance(trajectories, str):
+                progress.advance(bar, 1 + len(levels))
+                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
+                continue
+            progress.advance(bar)
+            skip = min(SKIPPED * system.pace, duration / 2) if driven else None
+            for level in levels:
+                for who, measure_errors in everyone.items():
+                    found = measure_errors(trajectories, measurement_noise=level, seed=self.seed, skip=skip)
+                    case = [*([who] if self.ekf else []), starts, *(["yes" if driven else "no"] if artifact.nu else [])]
+                    case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
+                    smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
+                    nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
+                    columns: dict[str, Any] = {
+                        "observer": who,
+                        "starts": starts,
+                        "driven": driven,
+                        "process_noise": self.process_noise,
+                        "measurement_noise": as_cell(level),
+                        "trajectory": np.arange(len(found.full)),
+                        "smape": found.full,
+                        "smape_late": found.late,
+                    }
+                    frames.append(pd.DataFrame(columns | by_state(found.nrmse)))
+                progress.advance(bar)
+        if frames:
+            progress.console.print(smape, nrmse)
+        for reason in left_out:
+            progress.say(f"{name}, left out: {reason}")
+        return frames
+
+    def _trajectories(
+        self,
+        artifact: Artifact,
+        system: System,
+        domain: Domain,
+        *,
+        duration: float,
+        driven: bool,
+        policy: Controller | None,
+    ) -> UnseenTrajectories | str:
+        """Test trajectories, or why there are none."""
+        try:
+            found = unseen_trajectories(
                 system,
                 artifact.filter.dt,
                 n=self.trajectories,
-                duration=self.duration,
+                duration=duration,
                 seed=self.seed,
                 domain=domain,
                 driven=driven,
                 process_noise=self.process_noise,
                 policy=policy,
             )
-            for level in self.measurement_noise:
-                found = errors(
-                    artifact,
-                    system,
-                    trajectories,
-                    measurement_noise=level,
-                    seed=self.seed,
-                    skip=min(5.0, self.duration / 2) if driven else None,
-                )
-                case = [starts, *(["yes" if driven else "no"] if artifact.nu else []), *process, f"{level:g}"]
-                table.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
-                columns = {
-                    "observer": name,
-                    "starts": starts,
-                    "driven": driven,
-                    "process_noise": self.process_noise,
-                    "measurement_noise": level,
-                    "trajectory": np.arange(len(found.full)),
-                    "smape": found.full,
-                    "smape_late": found.late,
-                }
-                frames.append(pd.DataFrame(columns))
-        console.print(table)
-        return pd.concat(frames, ignore_index=True)
+        except NoStartsError as error:
+            return str(error)
+        if found.inside.any():
+            return found
+        return f"each of {self.trajectories} runs left bounds = {system.bounds}"
+
+    def _levels(self, artifact: Artifact, system: System) -> tuple[list[Level], list[str]]:
+        """Levels of measurement noise that a map can be told, and what is to be said of the others."""
+        if self.measurement_noise is None:
+            return list(dict.fromkeys([0.0, level_for(artifact, system)])), []
+        levels = [level_for(artifact, system, level) for level in self.measurement_noise]
+        reasons = [beyond(artifact, level) for level in levels]
+        inside = [level for level, reason in zip(levels, reasons, strict=True) if not reason]
+        return inside, [reason for reason in reasons if reason]
+
+    def _table(self, title: str, artifact: Artifact) -> Table:
+        """A table with the columns that say of what a row is."""
+        table = Table(title=title)
+        if self.ekf:
+            table.add_column("observer")
+        table.add_column("starts")
+        if artifact.nu:
+            table.add_column("driven")
+        if self.process_noise:
+            table.add_column("process\nnoise", justify="right")
+        table.add_column("noise\non y", justify="right")
+        return table
 
 
 def spread(values: np.ndarray) -> str:
     """Median and interquartile range as text."""
-    if not len(values):
-        return "–"
     low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
     return f"{median:.2f} ({low:.2f} – {high:.2f})"
+
+
+def percent(value: float) -> str:
+    """An NRMSE as text; NaN is that of a state that does not move."""
+    return "–" if np.isnan(value) else "∞" if np.isinf(value) else f"{value:.2f}"

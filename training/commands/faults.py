@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import pandas as pd
 import tyro
 from rich.console import Console
 from rich.table import Column, Table
@@ -13,8 +12,20 @@ from rich.table import Column, Table
 from kkl_gym import SYSTEMS
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
-from training.evaluation.faults import FAULTS, simulate_faults
+from training.commands.options import (
+    NoiseLevel,
+    Observers,
+    OwnPolicy,
+    OwnSystem,
+    Seconds,
+    read_observers,
+    read_policy,
+)
+from training.evaluation.levels import beyond, level_for
+from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True)
@@ -34,16 +45,17 @@ class Faults:
     policy: OwnPolicy = None
     trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 500
     """Number of trajectories for each observer."""
-    duration: float = 50.0
-    """Length of each trajectory in seconds."""
-    measurement_noise: float = 0.5
-    """Standard deviation of the noise on each sample of y."""
+    duration: Seconds = None
+    """Length of each trajectory in seconds; 50 for the systems that ship."""
+    measurement_noise: NoiseLevel = None
+    """Standard deviation of the noise on each sample of y, or one for each output as in 0.1,0.3. Maps that were trained
+    for less are left out."""
     seed: int = 0
     """Seed of starts, inputs and noise."""
     out: Path = Path("runs/faults")
     """Folder for what is written."""
 
-    def run(self, console: Console) -> pd.DataFrame:
+    def run(self, console: Console) -> "pd.DataFrame":
         """Simulate and report.
 
         Parameters
@@ -61,6 +73,10 @@ class Faults:
         ValueError
             If an observer cannot be had or has no limits, or a number makes no sense.
         """
+        import pandas as pd  # which takes half a second that help need not wait for
+
+        from training.evaluation.faults import PARTS, simulate_faults
+
         if self.trajectories < 2 or self.seed < 0:
             raise ValueError(
                 f"need at least 2 trajectories and a seed that is not negative, got {self.trajectories}, {self.seed}"
@@ -68,19 +84,27 @@ class Faults:
         if len(set(self.observers)) < len(self.observers):
             raise ValueError(f"name each observer once, got {', '.join(self.observers)}")
         frames = []
-        for name, artifact, system in read_observers(self.observers, self.system):
-            with console.status(f"breaking the sensor of {name}"):
-                found = simulate_faults(
-                    artifact,
-                    system,
-                    trajectories=self.trajectories,
-                    duration=self.duration,
-                    measurement_noise=self.measurement_noise,
-                    seed=self.seed,
-                    policy=read_policy(artifact, system, self.policy),
-                )
-            found.insert(0, "observer", name)
-            frames.append(found)
+        with progress_bars(console) as progress:
+            for name, artifact, system in read_observers(self.observers, self.system):
+                level = level_for(artifact, system, self.measurement_noise)
+                if reason := beyond(artifact, level):
+                    progress.say(f"{name}, left out: {reason}")
+                    continue
+                with progress.phase(f"breaking the sensor of {name}", PARTS) as report_parts:
+                    found = simulate_faults(
+                        artifact,
+                        system,
+                        trajectories=self.trajectories,
+                        duration=system.duration if self.duration is None else self.duration,
+                        measurement_noise=level,
+                        seed=self.seed,
+                        policy=read_policy(artifact, system, self.policy),
+                        report=report_parts,
+                    )
+                found.insert(0, "observer", name)
+                frames.append(found)
+        if not frames:
+            raise ValueError(f"nothing is left of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
         write(self.out / "faults.csv", found.to_csv(index=False, float_format="%.6g"))
         console.print(report(self.out))
@@ -101,6 +125,8 @@ def report(out: Path) -> Table:
     Table
         To be printed.
     """
+    import pandas as pd
+
     found = pd.read_csv(out / "faults.csv")
     header = ["false alarms", "fault", "within", "noticed in time", "median delay in s", "95 %"]
     rows = []
@@ -122,7 +148,9 @@ def report(out: Path) -> Table:
     return shown
 
 
-def _by_amplitude(duffing: pd.DataFrame) -> list[str]:
+def _by_amplitude(duffing: "pd.DataFrame") -> list[str]:
+    import pandas as pd
+
     edges = np.quantile(duffing.amplitude, [0.0, 0.25, 0.5, 0.75, 1.0])
     quarter = pd.cut(duffing.amplitude, edges, include_lowest=True, labels=False)
     names = [f"{low:.1f} to {high:.1f}" for low, high in zip(edges, edges[1:])]  # noqa: RUF007
@@ -133,8 +161,10 @@ def _by_amplitude(duffing: pd.DataFrame) -> list[str]:
     return markdown.table(["fault", *names], rows)
 
 
-def _draw(path: Path, found: pd.DataFrame) -> None:
+def _draw(path: Path, found: "pd.DataFrame") -> None:
     from matplotlib.figure import Figure
+
+    from training.evaluation.faults import FAULTS
 
     observers = list(found.observer.unique())
     figure = Figure(figsize=(3.3 * len(observers), 3.4), layout="constrained")

@@ -10,6 +10,8 @@ from observers import Artifact, shipped
 from observers.artifact import resolve
 from training.config import current_names
 
+LEAST_WIDTH = 80  # of the table
+
 
 @dataclass(frozen=True)
 class Maps:
@@ -40,4 +42,6 @@ class Maps:
                 f"{artifact.process_noise_max:g}" if artifact.process_noise_max is not None else "–",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
-        console.print(table)
+        if console.width < LEAST_WIDTH:  # the terminal breaks lines then, which cuts nothing
+            table.width = LEAST_WIDTH
+        console.print(table, crop=False)

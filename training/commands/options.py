@@ -1,17 +1,48 @@
-"""What several commands ask for: observers by name or file, and the system of one's own that they are for."""
+"""What several commands ask for: observers, the system of one's own that they are for, levels of noise, durations."""
 
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import tyro
+from tyro.constructors import PrimitiveConstructorSpec
 
+from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
 from kkl_gym.systems import system_of
 from observers import Artifact, shipped
 from observers.artifact import resolve
+from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
 
+SystemName = Annotated[
+    tyro.conf.Positional[str],
+    tyro.conf.arg(metavar="SYSTEM", help="A shipped system, or a class of yours as script.py:Class or module:Class."),
+]
+OneSystem = Annotated[
+    tyro.conf.Positional[str | None],
+    tyro.conf.arg(
+        metavar="[SYSTEM]",
+        help="One system alone: a shipped one, or a class of yours as script.py:Class or module:Class.",
+        help_behavior_hint="(default: all four that ship)",
+    ),
+]
+OneObserver = Annotated[
+    str | None,
+    tyro.conf.arg(
+        metavar="MAP",
+        help="An observer for that system: a shipped map or a .safetensors file.",
+        help_behavior_hint="(default: the newest that ships for it)",
+    ),
+]
+Parameters = Annotated[
+    dict[str, float],
+    tyro.conf.arg(
+        help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
+        help_behavior_hint="(default: none)",
+    ),
+]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
 ]
@@ -23,6 +54,30 @@ OwnSystem = Annotated[
         help_behavior_hint="",
     ),
 ]
+# A level is written as a number for all outputs, or as one for each with commas between them. Defaults are in words.
+NoiseLevel = Annotated[
+    Level | None,
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="LEVEL",
+        instance_from_str=lambda words: read_level(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda level: [str(level)],
+    ),
+    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: the system's own)"),
+]
+NoiseLevels = Annotated[
+    tuple[Level, ...] | None,
+    PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="LEVEL [LEVEL ...]",
+        instance_from_str=lambda words: tuple(map(read_level, words)),
+        is_instance=lambda value: True,
+        str_from_instance=lambda levels: [str(levels)],
+    ),
+    tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: 0 and the system's own)"),
+]
+Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
 OwnPolicy = Annotated[
     str | None,
     tyro.conf.arg(
@@ -58,6 +113,69 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
     return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """An environment that a command shows.
+
+    Parameters
+    ----------
+    label : str
+        For tables.
+    env_id : str
+        For :func:`gymnasium.make`.
+    options : mapping of str to object
+        For that, too.
+    system : System
+        What moves in it.
+    observer : str or None
+        A shipped map or a ``.safetensors`` file; None for the one that ships for the system, if one does.
+    """
+
+    label: str
+    env_id: str
+    options: Mapping[str, Any]
+    system: System
+    observer: str | None
+
+    @property
+    def observed(self) -> bool:
+        """Whether there is an observer, named or shipped."""
+        return self.observer is not None or self.system.name in shipped()
+
+
+def shown(system: str | None, observer: str | None) -> list[Shown]:
+    """Find the environments to show: those that ship, or one that is named.
+
+    Parameters
+    ----------
+    system : str or None
+        A shipped system, or a class of the user's.
+    observer : str or None
+        In place of the one that ships for it.
+
+    Returns
+    -------
+    list of Shown
+        One at least.
+
+    Raises
+    ------
+    ValueError
+        If the system is unknown, or the observer cannot be had or was made for another.
+    """
+    if system is None:
+        if observer is not None:
+            raise ValueError(f"name the system that the observer {observer} is for")
+        return [Shown(env_id, env_id, {}, get_system(name), None) for name, env_id in ENV_IDS.items()]
+    if observer is None:
+        found, options = get_system(system), {}
+    else:
+        artifact = Artifact.read(resolve(observer))
+        found, options = system_of(artifact, system), {"dt": artifact.filter.dt}
+    label = ENV_IDS[found.name] if type(found) in SYSTEMS.values() else found.name
+    return [Shown(label, OWN_ID, {"system": found, **options}, found, observer)]
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:

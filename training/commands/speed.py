@@ -1,7 +1,7 @@
 """How fast the environments step, as a ratio to well-known ones measured in the same run."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,8 @@ from rich.table import Column, Table
 
 import kkl_gym
 from kkl_gym.compiled import batch_step
+from training.commands.options import OneObserver, OneSystem, Shown, shown
+from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
@@ -22,9 +24,12 @@ class Speed:
     """Time environments, bare and with an observer, against Gymnasium's Pendulum-v1 and batched CartPole-v1.
 
     Actions are drawn beforehand. The environments take turns, several times over, and each ratio is the median of
-    those to the reference in the same turn, because a shared machine's speed drifts.
+    those to the reference in the same turn, because a shared machine's speed drifts. A system of yours has rows with an
+    observer if one is named.
     """
 
+    system: OneSystem = None
+    observer: OneObserver = None
     steps: int = 5000
     """Steps of each single environment in a turn."""
     turns: int = 7
@@ -47,42 +52,48 @@ class Speed:
         dict of str to float
             Steps per second of each environment, as a multiple of its reference's.
         """
-        for name, count in vars(self).items():
-            if count < 1:
-                raise ValueError(f"{name} must be positive, got {count}")
-        ratios = self._single(console)
-        return ratios | self._vector(console)
+        for name in ("steps", "turns", "num_envs", "vector_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        environments = shown(self.system, self.observer)
+        with progress_bars(console) as progress:
+            return self._single(environments, progress) | self._vector(environments, progress)
 
-    def _single(self, console: Console) -> dict[str, float]:
+    def _single(self, environments: Sequence[Shown], progress: ProgressBars) -> dict[str, float]:
         envs = {REFERENCE: gym.make(REFERENCE)}
-        for env_id in kkl_gym.ENV_IDS.values():
-            envs[env_id] = gym.make(env_id)
-            envs[f"{env_id}, x_hat"] = kkl_gym.KKLObservation(gym.make(env_id))
+        for one in environments:
+            envs[one.label] = gym.make(one.env_id, **one.options)
+            if one.observed:
+                made = gym.make(one.env_id, **one.options)
+                envs[f"{one.label}, x_hat"] = kkl_gym.KKLObservation(made, one.observer)
         actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
-        seconds = self._in_turns(tasks)
+        seconds = self._in_turns(tasks, progress.bar("timing single environments", self._runs(tasks)))
         ratios = _ratios(seconds, REFERENCE)
         table = Table(Column("environment", no_wrap=True), "µs per step", f"speed relative to {REFERENCE}")
         for name, ratio in ratios.items():
             table.add_row(name, f"{1e6 * np.median(seconds[name]) / self.steps:.1f}", f"{ratio:.2f}")
-        console.print(table)
+        progress.console.print(table)
         return ratios
 
-    def _vector(self, console: Console) -> dict[str, float]:
+    def _vector(self, environments: Sequence[Shown], progress: ProgressBars) -> dict[str, float]:
         """Whole steps, and how long their parts take by themselves on what the environment then holds."""
 
-        def make(env_id: str) -> gym.vector.VectorEnv:
-            return gym.make_vec(env_id, num_envs=self.num_envs, vectorization_mode="vector_entry_point")
+        def make(env_id: str, **options: Any) -> gym.vector.VectorEnv:
+            return gym.make_vec(env_id, num_envs=self.num_envs, vectorization_mode="vector_entry_point", **options)
 
         envs = {VECTOR_REFERENCE: make(VECTOR_REFERENCE)}
         parts: dict[str, dict[str, str]] = {}
-        for env_id in kkl_gym.ENV_IDS.values():
-            envs[env_id] = make(env_id)
-            envs[f"{env_id}, z"] = kkl_gym.KKLVectorObservation(make(env_id), estimate="z")
-            envs[f"{env_id}, x_hat"] = kkl_gym.KKLVectorObservation(make(env_id))
+        for one in environments:
+            envs[one.label] = make(one.env_id, **one.options)
+            if one.observed:
+                inner = [make(one.env_id, **one.options) for _ in range(2)]
+                envs[f"{one.label}, z"] = kkl_gym.KKLVectorObservation(inner[0], one.observer, estimate="z")
+                envs[f"{one.label}, x_hat"] = kkl_gym.KKLVectorObservation(inner[1], one.observer)
         actions = {name: _drawn(env.action_space, self.vector_steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed_vector(env, actions[name]) for name, env in envs.items()}
-        seconds = self._in_turns(tasks)
+        report = progress.bar(f"timing {self.num_envs} environments at once", self._runs(tasks))
+        seconds = self._in_turns(tasks, report)
         for name, env in envs.items():
             info = env.step(actions[name][0])[-1]
             parts[name] = _parts(env, info, np.median(seconds[name]) / self.vector_steps)
@@ -93,16 +104,22 @@ class Speed:
         for name, ratio in ratios.items():
             whole = f"{1e6 * np.median(seconds[name]) / self.vector_steps:.0f}"
             table.add_row(name, whole, parts[name]["simulation"], parts[name]["network"], f"{ratio:.2f}")
-        console.print(table)
+        progress.console.print(table)
         return {f"{name}, {self.num_envs} rows": ratio for name, ratio in ratios.items()}
 
-    def _in_turns(self, tasks: Mapping[str, Callable[[], float]]) -> dict[str, list[float]]:
+    def _runs(self, tasks: Mapping[str, Any]) -> int:
+        return len(tasks) * (self.turns + 1)
+
+    def _in_turns(
+        self, tasks: Mapping[str, Callable[[], float]], report: Callable[[int], object] = lambda done: None
+    ) -> dict[str, list[float]]:
         seconds: dict[str, list[float]] = {name: [] for name in tasks}
         for turn in range(self.turns + 1):
-            for name, task in tasks.items():
+            for i, (name, task) in enumerate(tasks.items(), 1):
                 elapsed = task()
                 if turn:  # the first one warms up
                     seconds[name].append(elapsed)
+                report(turn * len(tasks) + i)
         return seconds
 
 

@@ -1,87 +1,88 @@
 """``kkl-gym train``."""
 
-import dataclasses
+import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import torch
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.config import Config, Pipeline, read_changes, setting_types
+from training.commands.options import Parameters, SystemName
+from training.commands.settings import Settings
+from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
+from training.progress import LOG, ProgressBars, progress_bars
+from training.spectrum import Spectrum
 from training.systems import named_policy
-
-
-def _options() -> type[Any]:
-    """A class of all settings of a configuration, each None unless it is given, with Config's own descriptions."""
-    described = Config.__pydantic_fields__  # type: ignore[attr-defined]
-    options = []
-    for name, kind in setting_types().items():
-        if name == "pipeline":
-            continue
-        plain = get_args(kind)[0] if get_origin(kind) is Annotated else kind
-        argument = tyro.conf.arg(
-            help=" ".join((described[name].description or "").split()),
-            help_behavior_hint="(default: the preset's)",
-            metavar=plain.__name__.upper() if isinstance(plain, type) and get_origin(plain) is None else None,
-        )
-        options.append((name, Annotated[kind | None, argument], None))
-    return dataclasses.make_dataclass("Settings", options, frozen=True)
-
+from training.trajectories.controllers import Controller
 
 if TYPE_CHECKING:
     from training.dry_run import Estimate
-
-    Settings = Any
-else:
-    Settings = _options()
+    from training.pipeline import Result
 
 
 @dataclass(frozen=True)
 class Train:
     """Learn an observer for a system and write it to one file.
 
-    The run's folder, runs/NAME, receives NAME.safetensors, a report (PNG), checkpoints and, where TensorBoard is
-    installed, its scalars.
+    The run's folder, runs/NAME, receives NAME.safetensors, a report (PNG), checkpoints, log.txt with what is
+    printed and, where TensorBoard is installed, its scalars.
     """
 
-    system: tyro.conf.Positional[str]
-    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    system: SystemName
     pipeline: Annotated[Pipeline, tyro.conf.arg(aliases=["--method"])] = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
     """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
-    config: Path | None = None
+    config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
     """Settings that differ from the preset's, as `kkl-gym tune` writes them; options given here come before them."""
     closed_loop: bool = False
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
     monitor: bool = True
-    """Find limits for the observer's monitor as well, which takes a minute or two; left out where the output is not
-    linear."""
+    """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
+    takes no symbols."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
-    parameters: dict[str, float] = field(default_factory=dict)
-    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
+    parameters: Parameters = field(default_factory=dict)
     threads: int = 1
     """CPU threads. More than one hardly help networks of the fast preset's size."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     dry_run: bool = False
     """Train nothing; say what it would take on this machine, by a few batches of the same sizes."""
-    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
+    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
     """What of the preset's configuration is to differ."""
 
     def run(self, console: Console) -> Path | None:
-        """Train; returns the artifact's path, None if the run is a dry one."""
-        from training.dry_run import estimate
-        from training.evaluation.calibration import calibrate
+        """Train.
+
+        Parameters
+        ----------
+        console : rich.console.Console
+            For people.
+
+        Returns
+        -------
+        Path or None
+            The artifact's file; None if the run is a dry one.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, as :func:`training.presets.preset` and :func:`training.train` say.
+        """
+        began = time.monotonic()
+        import torch  # which takes longer to import than all the rest
+
+        from training.dry_run import RUNS, estimate
         from training.evaluation.report import write_report
         from training.pipeline import train
 
@@ -90,38 +91,101 @@ class Train:
         if self.device == "cuda" and not torch.cuda.is_available():
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
         torch.set_num_threads(self.threads)
+        device = None if self.device == "auto" else torch.device(self.device)
         system = get_system(self.system, self.parameters)
-        given = {name: value for name, value in vars(self.settings).items() if value is not None}
-        changes = (read_changes(self.config) if self.config else {}) | given
+        changes = self._changes()
+        with progress_bars(console) as progress, progress.phase("choosing a spectrum"):
+            config = preset(system, self.pipeline, self.preset, changes=changes)
+        policy = None if config.policy is None else named_policy(system, config.policy)
+        if self.dry_run:
+            with progress_bars(console) as progress, progress.phase("timing a few batches", RUNS) as report:
+                found = estimate(system, config, device=device, report=report)
+            console.print(expected(config, found))
+            return None
+        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
+        name += "-closed-loop" if config.closed_loop_trajectories else ""
+        folder = self.out or Path("runs") / name
+        path = folder / f"{name}.safetensors"
+        with progress_bars(console, folder / LOG) as progress:
+            for line in described(system, config, self.preset, changes):
+                progress.say(line)
+            result = train(system, config, folder, resume=self.resume, device=device, console=progress)
+            result.artifact.save(path)  # before anything else may fail
+            if self.monitor or not result.artifact.knows_output:  # which is to be said in any case
+                find_limits(path, result, system, policy=policy, progress=progress)
+            with progress.phase("drawing the report"):
+                write_report(folder / "report.png", result, system, policy=policy)
+            size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
+            progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
+        return path
+
+    def _changes(self) -> dict[str, Any]:
+        """The settings that are to differ from the preset's: those of the file, and those of options before them."""
+        changes = (read_changes(self.config) if self.config else {}) | self.settings
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
-        config = preset(system, self.pipeline, self.preset, changes=changes)
-        policy = None if config.policy is None else named_policy(system, config.policy)
-        name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
-        name += "-closed-loop" if config.closed_loop_trajectories else ""
-        folder = self.out or Path("runs") / name
-        device = None if self.device == "auto" else torch.device(self.device)
-        if self.dry_run:
-            with console.status("timing a few batches"):
-                console.print(expected(config, estimate(system, config, device=device)))
-            return None
-        result = train(system, config, folder, resume=self.resume, device=device, console=console)
-        path = folder / f"{name}.safetensors"
-        result.artifact.save(path)  # before anything else may fail
-        if self.monitor and result.artifact.C is None:
-            console.print("[yellow]no monitor:[/yellow] the output is not linear, so there is no C x_hat to compare")
-        elif self.monitor:
-            try:
-                with console.status("finding the monitor's limits"):
-                    calibrate(result.artifact, system, seed=config.seed, policy=policy).save(path)
-            except ValueError as error:
-                console.print(f"[yellow]no limits for a monitor:[/yellow] {error}")
-        console.print(f"wrote {path} ({path.stat().st_size / 1e6:.2f} MB) in {result.artifact.training['seconds']} s")
-        write_report(folder / "report.png", result, system, policy=policy)
-        console.print(f"wrote {folder / 'report.png'}")
-        return path
+        return changes
+
+
+def find_limits(
+    path: Path, result: "Result", system: System, *, policy: Controller | None, progress: ProgressBars
+) -> None:
+    """Write an artifact again, with limits for its monitor, or say why there are none.
+
+    Parameters
+    ----------
+    path : Path
+        The artifact's file.
+    result : Result
+        What the training made.
+    system : System
+        What it was made for.
+    policy : callable or None
+        Under which it was trained.
+    progress : ProgressBars
+        Where progress is shown.
+    """
+    from training.evaluation.calibration import PARTS, calibrate
+
+    artifact = result.artifact
+    try:
+        with progress.phase("finding the monitor's limits", PARTS) as report:
+            calibrate(artifact, system, seed=artifact.training["seed"], policy=policy, report=report).save(path)
+    except ValueError as error:
+        progress.say(f"no limits for a monitor: {error}")
+
+
+def described(system: System, config: Config, name: Preset, changes: Mapping[str, Any]) -> list[str]:
+    """What is going to be done.
+
+    Parameters
+    ----------
+    system : System
+        Of the run.
+    config : Config
+        Of the run.
+    name : {"fast", "paper"}
+        The preset.
+    changes : mapping of str to object
+        Settings that differ from the preset's.
+
+    Returns
+    -------
+    list of str
+        Lines for people.
+    """
+    own = "".join(f", {parameter} = {value:g}" for parameter, value in system.parameters.items())
+    given = "".join(f"; {setting} = {value}" for setting, value in changes.items())
+    spectrum = Spectrum(config.eigenvalues, config.pairs)
+    rates = spectrum.poles.real
+    return [
+        f"training an observer for {system.name}{own}: {system.nx} states, {system.ny} outputs, {system.nu} inputs",
+        f"pipeline {config.pipeline}, preset {name}{given}",
+        f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
+        f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
+    ]
 
 
 def expected(config: Config, found: "Estimate") -> Table:

@@ -8,7 +8,10 @@ import numpy as np
 from kkl_gym.simulate import check_duration, simulate
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.evaluation.metrics import smape
+from observers.checks import noise_levels
+from training.evaluation.levels import Level
+from training.evaluation.metrics import nrmse, smape
+from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
@@ -17,6 +20,7 @@ from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
+LEAST_PROCESS_NOISE = 0.005  # that a Kalman filter assumes: a tenth of the environments' default
 TRIES = 1000  # starts of which one at least should lie beyond X
 
 Domain = Literal["X", "1.5X", "2X"]
@@ -28,20 +32,23 @@ class NoStartsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """SMAPE in percent of each trajectory that stayed within bounds, and how many did not.
+    """Errors in percent of each trajectory that stayed within bounds, and how many did not.
 
     Parameters
     ----------
     full : ndarray, shape (n,)
-        Over all steps (the paper's).
+        SMAPE over all steps (the paper's).
     late : ndarray, shape (n,)
-        After the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+        SMAPE after the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
+    nrmse : ndarray, shape (n, nx)
+        Of each state after the transient, see :func:`training.evaluation.metrics.nrmse`.
     escaped : int
-        Number of trajectories that left the system's declared bounds and are not in ``full`` and ``late``.
+        Number of trajectories that left the system's declared bounds and are not among these.
     """
 
     full: np.ndarray
     late: np.ndarray
+    nrmse: np.ndarray
     escaped: int
 
 
@@ -210,7 +217,7 @@ def errors(
     system: System,
     trajectories: UnseenTrajectories,
     *,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int,
     skip: float | None = None,
 ) -> Errors:
@@ -224,8 +231,8 @@ def errors(
         What it was made for.
     trajectories : UnseenTrajectories
         What it is to follow.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of the measurement noise.
     skip : float, optional
@@ -235,10 +242,75 @@ def errors(
     -------
     Errors
         One for each trajectory.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or beyond the map's range.
     """
-    rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(system, trajectories.x, measurement_noise=measurement_noise, rng=rng)
-    observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
+    level = noise_levels("measurement_noise", measurement_noise, system.ny)
+    observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
+    y = _measured(system, trajectories, level, seed)
     x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
-    first = round(TRANSIENT * len(y)) if skip is None else round(skip / artifact.filter.dt)
-    return Errors(smape(trajectories.x, x_hat), smape(trajectories.x, x_hat, first), trajectories.escaped)
+    return _errors(trajectories, x_hat, artifact.filter.dt, skip)
+
+
+def kalman_errors(
+    system: System,
+    trajectories: UnseenTrajectories,
+    dt: float,
+    *,
+    measurement_noise: Level,
+    seed: int,
+    skip: float | None = None,
+) -> Errors:
+    """Errors of an extended Kalman filter on the trajectories and the noise that :func:`errors` takes.
+
+    It knows the equations, the inputs and both levels of noise, and that starts are uniform in X.
+
+    Parameters
+    ----------
+    system : System
+        What moves.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    dt : float
+        Sampling interval in seconds.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
+    seed : int
+        Seed of the measurement noise.
+    skip : float, optional
+        As for :func:`errors`.
+
+    Returns
+    -------
+    Errors
+        One for each trajectory.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or the equations take no symbols.
+    """
+    level = noise_levels("measurement_noise", measurement_noise, system.ny)
+    y = _measured(system, trajectories, level, seed)
+    assumed = max(trajectories.process_noise, LEAST_PROCESS_NOISE / system.pace)
+    Q = np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)  # of a uniform w that is held over dt
+    kalman = ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
+    x_hat = np.empty_like(trajectories.x)
+    x_hat[0] = kalman.reset(y[0])
+    for k in range(1, len(y)):
+        x_hat[k] = kalman.step(y[k], trajectories.u[k - 1])
+    return _errors(trajectories, x_hat, dt, skip)
+
+
+def _measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
+    rng = generator(Stream.EVALUATION, seed, 1)
+    return noisy_output(system, trajectories.x, measurement_noise=level, rng=rng)
+
+
+def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, dt: float, skip: float | None) -> Errors:
+    x = trajectories.x
+    first = round(TRANSIENT * len(x)) if skip is None else round(skip / dt)
+    return Errors(smape(x, x_hat), smape(x, x_hat, first), nrmse(x, x_hat, first), trajectories.escaped)

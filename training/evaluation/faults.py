@@ -1,5 +1,6 @@
 """Faulty sensors, and how soon an observer's monitor notices them."""
 
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
@@ -8,6 +9,7 @@ import pandas as pd
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.calibration import sound_trajectories
+from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.systems import profile
 from training.trajectories.controllers import Controller
@@ -15,6 +17,7 @@ from training.trajectories.controllers import Controller
 Fault = Literal["none", "bias", "drop-out", "freeze"]
 FAULTS: tuple[Fault, ...] = get_args(Fault)
 BIAS = 0.2  # of the output's range
+PARTS = 1 + len(FAULTS)  # of the work: simulating, and each fault
 
 
 def deadline(system: System, duration: float) -> float:
@@ -28,9 +31,10 @@ def simulate_faults(
     *,
     trajectories: int,
     duration: float,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int,
     policy: Controller | None = None,
+    report: Callable[[int], object] = lambda done: None,
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
@@ -44,12 +48,14 @@ def simulate_faults(
         Number of trajectories; each has every fault once.
     duration : float
         Length of each in seconds.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of starts, inputs and noise.
     policy : callable, optional
         Acts on the system, as for :func:`training.evaluation.calibration.calibrate`.
+    report : callable, optional
+        Told how many of the ``PARTS`` of the work are done.
 
     Returns
     -------
@@ -72,13 +78,14 @@ def simulate_faults(
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng, policy=policy)
     clean = system.output(x)
-    y = clean + measurement_noise * rng.standard_normal(clean.shape)
+    y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it
     width = np.ptp(clean[len(clean) // 2 :, counted], axis=(0, 1))
     at, within = len(y) // 2, round(allowed / dt)
     observer = KKLObserver(artifact, measurement_noise, monitor=True, process_noise=system.process_noise)
     frames = []
-    for fault in FAULTS:
+    for done, fault in enumerate(FAULTS, 1):
+        report(done)
         seen = y.copy()
         if fault == "bias":
             seen[at:] += BIAS * width

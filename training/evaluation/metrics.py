@@ -6,6 +6,7 @@ An estimate that is not finite counts as one infinitely far away.
 import numpy as np
 
 SETTLED = 0.1  # of a trajectory's root mean square size
+STILL = 1e-12  # of a state's size: a standard deviation below it is rounding
 
 
 def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
@@ -83,6 +84,44 @@ def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
+
+
+def nrmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
+    """Root mean square error of each state over that state's standard deviation, in percent.
+
+    The standard deviation is over all steps of all trajectories, those that are skipped included, so that motions that
+    come to rest do not make a small error a large one. Unlike one norm of all states, it knows no units. In tables
+    stands the median over the trajectories.
+
+    Parameters
+    ----------
+    x, x_hat : ndarray, shape (steps, n, nx)
+        States and estimates.
+    skip : int
+        Number of first steps whose errors are left out.
+
+    Returns
+    -------
+    ndarray, shape (n, nx)
+        Percent; NaN for a state that does not move.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or no step is left.
+    """
+    late, estimated = _compared(x, x_hat, skip)
+    error = np.sqrt(((late - estimated) ** 2).mean(0))
+    if not len(error):
+        return error
+    size = x.std((0, 1))
+    moves = size > STILL * np.abs(x).max((0, 1))
+    return 100.0 * np.divide(error, size, out=np.full_like(error, np.nan), where=moves)
+
+
+def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
+    """Columns of a CSV file from the values (n, nx) of :func:`nrmse`: nrmse1, nrmse2, ..., in the states' order."""
+    return {f"nrmse{i + 1}": column for i, column in enumerate(values.T)}
 
 
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The forward map T as a physics-informed network (paper, sec. 5)."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -165,7 +166,7 @@ class ForwardProblem(nn.Module):
         return z
 
     @torch.no_grad()
-    def solve_output_layer(self, rng: np.random.Generator) -> None:
+    def solve_output_layer(self, rng: np.random.Generator, report: Callable[[int], object] = lambda done: None) -> None:
         """Put the output layer where it minimises the risk for the features that the other layers have learned.
 
         That is linear least squares, in float64 and on more samples than a batch has; gradients come close to it.
@@ -174,6 +175,8 @@ class ForwardProblem(nn.Module):
         ----------
         rng : Generator
             Of the samples.
+        report : callable, optional
+            Told the number of modes that are solved for.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
         assert isinstance(last, nn.Linear)
@@ -192,6 +195,7 @@ class ForwardProblem(nn.Module):
                 self.z_offset + self.z_scale * self._z.cpu()[some].double().numpy(),
             ),
             physics_weight=self._physics_weight,
+            report=report,
         )
         weights[:, -1] -= self.z_offset
         weights /= self.z_scale[:, None]

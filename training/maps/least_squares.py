@@ -1,5 +1,7 @@
 """The output layer of the forward map T by linear least squares, in place of gradients."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from scipy.linalg import qr, solve_triangular
@@ -20,6 +22,7 @@ def output_layer(
     speed: np.ndarray,
     pairs: tuple[np.ndarray, np.ndarray] | None = None,
     physics_weight: float = 1.0,
+    report: Callable[[int], object] = lambda done: None,
 ) -> np.ndarray:
     """Solve for the weights with which fixed features phi make T(x) = W [phi(x), 1].
 
@@ -41,6 +44,8 @@ def output_layer(
         The features at states of which the filter's state is known, and that.
     physics_weight : float
         Weight of the equation where there are pairs.
+    report : callable, optional
+        Told the number of modes that are solved for.
 
     Returns
     -------
@@ -57,6 +62,7 @@ def output_layer(
         target = np.linalg.solve(V, pairs[1].T).T / np.sqrt(len(pairs[0]))
     solved = np.empty((len(poles), phi.shape[1]), dtype=V.dtype)
     for i, pole in enumerate(poles):
+        report(i)
         row = np.sqrt(physics_weight / len(phi)) / (speed + abs(pole))
         matrix = np.vstack([(phi_along - pole * phi) * row[:, None], known])
         ridge = RIDGE * np.linalg.norm(matrix) / np.sqrt(phi.shape[1]) * np.eye(phi.shape[1])
@@ -67,7 +73,13 @@ def output_layer(
 
 
 def solve_forward(
-    system: System, linear: LinearFilter, *, features: int, points: np.ndarray, rng: np.random.Generator
+    system: System,
+    linear: LinearFilter,
+    *,
+    features: int,
+    points: np.ndarray,
+    rng: np.random.Generator,
+    report: Callable[[int], object] = lambda done: None,
 ) -> ForwardMap:
     """Solve for T with random features, from its equation alone.
 
@@ -86,6 +98,8 @@ def solve_forward(
         States from which collocation points are taken.
     rng : Generator
         Of features and points.
+    report : callable, optional
+        Told the number of modes that are solved for.
 
     Returns
     -------
@@ -108,6 +122,7 @@ def solve_forward(
         linear,
         equation=(value.numpy(), derivative.numpy(), system.output(x)),
         speed=np.linalg.norm(f, axis=1),
+        report=report,
     )
     z = value.numpy() @ solved[:, :-1].T + solved[:, -1]
     middle, spread = z.mean(0), np.maximum(z.std(0), 1e-12)

@@ -2,6 +2,7 @@
 
 import math
 import operator
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ import torch
 from rich.progress import Progress
 from torch import nn
 
+from observers.storage import naming
 from training import checkpoints
 from training.config import Optimiser
 
@@ -118,8 +120,11 @@ def optimise(
     def seconds() -> float:
         return spent + time.process_time() - began
 
+    def part(step: int) -> float:
+        return max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
+
     def rate(step: int) -> float:
-        done = max(step / stage.steps, min(1.0, seconds() / stage.cpu_seconds))
+        done = part(step)
         return min(1.0, (done + 1 / stage.steps) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
 
     task = progress.add_task(stage.name, total=stage.steps, completed=course.step)
@@ -143,7 +148,8 @@ def optimise(
             if log is not None:
                 for name, value in terms.items():
                     log(f"{stage.name}/{name}", float(value.detach()), step + 1)
-            progress.update(task, completed=step + 1, description=f"{stage.name} (error {mean:.3g})")
+            total_steps = round((step + 1) / part(step + 1))  # that there will be by the time the clock ends it
+            progress.update(task, completed=step + 1, total=total_steps, description=f"{stage.name} (error {mean:.3g})")
             if time.monotonic() - saved_at > checkpoints.SECONDS or last:
                 course.step, course.seconds = step + 1, seconds()
                 _save(stage, parts, generator, course)
@@ -169,8 +175,14 @@ def log_to(folder: Path) -> Iterator[Log | None]:
     except ImportError:
         yield None
         return
-    with SummaryWriter(folder) as writer:
-        yield writer.add_scalar
+    hook = threading.excepthook
+    # The thread that writes tells its errors to whoever calls next: it need not print them as well.
+    threading.excepthook = lambda failed: None if isinstance(failed.exc_value, OSError) else hook(failed)
+    try:
+        with naming(folder), SummaryWriter(folder) as writer:
+            yield writer.add_scalar
+    finally:
+        threading.excepthook = hook
 
 
 def seconds_spent(folder: Path) -> float:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 from kkl_gym.system import System
 from observers import Artifact
 from training.config import Pipeline
+from training.evaluation.levels import multiple
 from training.methods.base import Configuration, Task
 from training.methods.kkl import KKLMethod, within
 from training.pipeline import train
@@ -19,8 +20,7 @@ from training.spectrum import papers_spectrum
 from training.tuning import Probe, Spectrum
 
 PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
-NO_NOISE = 0.01  # the largest measurement noise in the training of those that are to know none
-TUNED_FOR = 0.5
+NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of those that are to know none
 # How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
 TOGETHER: dict[str, Any] = {
     "free_inverse": False,
@@ -165,7 +165,7 @@ class Transients(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """No noise."""
-        return {**super().changes(task), **EARLIER, "measurement_noise_max": NO_NOISE}
+        return {**super().changes(task), **EARLIER, "measurement_noise_max": multiple(task.system, NO_NOISE)}
 
 
 class NoiseAware(Ablation):
@@ -213,7 +213,7 @@ class OwnFree(Ablation):
 
 
 class Tuned(Ablation):
-    """The default with modes chosen anew for the system and a noise level of 0.5."""
+    """The default with modes chosen anew for the system and its own level of noise."""
 
     name: ClassVar[str] = "ablation-tuned"
     label: ClassVar[str] = "... tuned spectrum"
@@ -226,7 +226,7 @@ class Tuned(Ablation):
 
 @cache
 def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """Choose modes for noise of 0.5; systems are tuned once.
+    """Choose modes for a system's own level of noise; systems are tuned once.
 
     Parameters
     ----------
@@ -242,4 +242,4 @@ def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
     Spectrum
         The last one of the choice, which is made anew.
     """
-    return Probe(system, dt, duration).choose(TUNED_FOR)[-1].spectrum
+    return Probe(system, dt, duration).choose(multiple(system, 1.0))[-1].spectrum

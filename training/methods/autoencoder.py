@@ -21,6 +21,7 @@ BATCH = 512
 LEARNING_RATE = 1e-3  # the authors'; at several times that the PDE residual jumps
 RECONSTRUCTION = 0.1  # weight of |x - T_inv(T(x))|^2 beside the PDE residual, the authors'
 TUNING = 0.15  # share of the CPU time in which the maps are learned for every cutoff
+STARTS = 100_000  # among which states are drawn where the system draws its own starts
 CUTOFFS = (0.1, 1.0)  # range of the cutoff, in multiples of the system's median rate over X
 
 
@@ -110,6 +111,8 @@ class _Problem(nn.Module):
         self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
         self._states = tensor(states, device)
         self._low, self._span = tensor(low, device), tensor(high - low, device)
+        own = type(system).draw_starts is not System.draw_starts
+        self._starts = tensor(system.draw_starts(np.random.default_rng(0), STARTS), device) if own else None
 
     def feature(self, w: torch.Tensor) -> torch.Tensor:
         """What the networks are told of the cutoff."""
@@ -126,9 +129,12 @@ class _Problem(nn.Module):
         return x
 
     def draw(self, n: int, generator: torch.Generator) -> torch.Tensor:
-        """States, half of them along the trajectories and half uniform in X."""
+        """States, half of them along the trajectories and half uniform in X, or starts as the system draws them."""
         device = self._states.device
         rows = torch.randint(len(self._states), (n // 2,), generator=generator, device=device)
+        if self._starts is not None:
+            others = torch.randint(len(self._starts), (n - n // 2,), generator=generator, device=device)
+            return torch.cat([self._states[rows], self._starts[others]])
         uniform = torch.rand((n - n // 2, len(self._low)), generator=generator, device=device)
         return torch.cat([self._states[rows], self._low + self._span * uniform])
 

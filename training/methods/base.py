@@ -14,6 +14,7 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import storage
+from training.evaluation.levels import Level
 from training.jobs import describe
 from training.maps.optimise import Loss, Stage, optimise
 from training.progress import progress_bars
@@ -242,7 +243,8 @@ class Method(ABC, Generic[Trained]):
     trajectories : int or None
         The largest number of test trajectories, for methods too slow for all of them.
     tuned_for : tuple of float or None
-        Noise levels at which its configurations are compared; None for all those of the test.
+        Noise levels at which its configurations are compared, in multiples of the system's own measurement noise; None
+        for all those of the test.
     """
 
     name: ClassVar[str]
@@ -305,7 +307,7 @@ class Method(ABC, Generic[Trained]):
         """
 
     @abstractmethod
-    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: float, /) -> CausalObserver:
+    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
         """Make an observer. The arguments are given by position, so that a class may name them as it likes.
 
         Parameters
@@ -316,8 +318,8 @@ class Method(ABC, Generic[Trained]):
             To be observed.
         dt : float
             Sampling interval in seconds.
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y; many methods need not know it.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each; many methods need not know it.
 
         Returns
         -------

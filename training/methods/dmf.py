@@ -10,6 +10,7 @@ from kkl_gym.system import System
 from observers import MLP, LinearFilter
 from observers.network import ACTIVATIONS
 from observers.storage import get_mlp, put_mlp
+from training.evaluation.levels import Level, multiple
 from training.maps.networks import Network
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 from training.methods.kkl import SPECTRA, spectrum
@@ -17,7 +18,7 @@ from training.methods.recurrent import SPECTRUM_PACE, Batches, Decoder, distance
 from training.spectrum import Spectrum
 
 SHARE = 0.6  # of the transient stage in the CPU time; the asymptotic stage has the rest
-EPSILON = 1e-3  # 1/s, no mode is slower
+EPSILON = 1e-3  # 1/s at the pace of the shipped systems, no mode is slower
 LEARNING_RATE = 1e-2
 FORGET = 0.98  # of the filtered innovations, per sample
 
@@ -38,7 +39,7 @@ class DMF(Method[Arrays]):
     label: ClassVar[str] = "DMF"
     tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
     noise: ClassVar[float] = 0.0
-    """Standard deviation of the noise added to y in training."""
+    """Standard deviation of the noise added to y in training, in multiples of the system's own."""
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three initial spectra."""
@@ -57,10 +58,10 @@ class DMF(Method[Arrays]):
             )
             decoder = Decoder(network, linear, task.data, device=task.device)
             start = Network(inputs, linear.size, width=budget.width, depth=2, activation=budget.activation)
-            return _Stage(decoder, start, linear, device=task.device)
+            return _Stage(decoder, start, linear, pace=system.pace, device=task.device)
 
         transient, asymptotic = stage(system.ny), stage(system.nx)
-        batches = Batches(task.data, transient.decoder, noise=self.noise, device=task.device)
+        batches = Batches(task.data, transient.decoder, noise=multiple(system, self.noise), device=task.device)
         y_offset, y_scale = task.data.y.mean((0, 1)), task.data.y.std((0, 1))
         offset, scale = torch.as_tensor(y_offset).double(), torch.as_tensor(y_scale).double()
 
@@ -85,7 +86,7 @@ class DMF(Method[Arrays]):
             arrays |= {f"{name}.{key}": value for key, value in found.export().items()}
         return arrays
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The switching observer."""
         return Switching(trained, system)
 
@@ -95,17 +96,19 @@ class DMFNoise(DMF):
 
     name: ClassVar[str] = "dmf-noise"
     label: ClassVar[str] = "DMF, noise"
-    tuned_for: ClassVar[tuple[float, ...] | None] = (0.5,)
-    noise: ClassVar[float] = 0.5
+    tuned_for: ClassVar[tuple[float, ...] | None] = (1.0,)
+    noise: ClassVar[float] = 1.0
 
 
 class _Stage(nn.Module):
-    """One filter with its decoder, and the network that gives its start."""
+    """One filter with its decoder, and the network that gives its start. Its time is in units of the system's pace."""
 
-    def __init__(self, decoder: Decoder, start: Network, linear: LinearFilter, *, device: torch.device) -> None:
+    def __init__(
+        self, decoder: Decoder, start: Network, linear: LinearFilter, *, pace: float, device: torch.device
+    ) -> None:
         super().__init__()
-        self.decoder, self.start, self.dt = decoder, start.to(device), linear.dt
-        self._S = torch.diag(torch.as_tensor(np.sqrt(-linear.A.diagonal()), device=device))
+        self.decoder, self.start, self.dt = decoder, start.to(device), linear.dt / pace
+        self._S = torch.diag(torch.as_tensor(np.sqrt(-pace * linear.A.diagonal()), device=device))
         self.S = nn.Parameter(torch.zeros_like(self._S))
         self.K = nn.Parameter(torch.zeros_like(self.S))
         self.B = torch.as_tensor(linear.dt * linear.B, device=device)

@@ -7,18 +7,18 @@ import torch
 from torch import nn
 
 from kkl_gym.system import System
+from training.evaluation.levels import Level
 from training.maps.networks import tensor
-from training.methods.base import Arrays, CausalObserver, Configuration, Data, Method, Task
+from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
 BATCH = 128
-NOISE_MAX = 0.5
 LEARNING_RATE = 3e-3
 
 
 class GRU(Method[Arrays]):
     """torch's GRU with a linear read-out, trained by truncated back-propagation along trajectories from their start.
 
-    Half of the trajectories carry no noise, the others a level between 0 and 0.5 that the network is not told.
+    Half of the trajectories carry no noise, the others a level up to the system's own that the network is not told.
     """
 
     name: ClassVar[str] = "gru"
@@ -31,12 +31,12 @@ class GRU(Method[Arrays]):
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """The network and its scaling."""
         torch.manual_seed(task.seed)
-        problem = _Problem(task.data, **configuration, device=task.device)
+        problem = _Problem(task, **configuration)
         task.fit("gru", problem, problem.loss, LEARNING_RATE)
         arrays = {key: value.cpu().numpy() for key, value in problem.network.state_dict().items()}
         return {**arrays, **problem.scaling}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The network, one sample at a time."""
         return Recurrent(trained)
 
@@ -51,8 +51,9 @@ class _Network(nn.Module):
 class _Problem(nn.Module):
     """The network, and how far the current batch of trajectories has come: all of it is part of a checkpoint."""
 
-    def __init__(self, data: Data, *, hidden: int, chunk: int, device: torch.device) -> None:
+    def __init__(self, task: Task, *, hidden: int, chunk: int) -> None:
         super().__init__()
+        data, device = task.data, task.device
         ny, nx = data.y.shape[-1], data.x.shape[-1]
         self.network = _Network(ny, nx, hidden).to(device)
         self.scaling = {
@@ -64,7 +65,7 @@ class _Problem(nn.Module):
         scaling = self.scaling
         self._y = tensor((data.y - scaling["y_offset"]) / scaling["y_scale"], device)
         self._x = tensor((data.x - scaling["x_offset"]) / scaling["x_scale"], device)
-        self._unit = tensor(1.0 / scaling["y_scale"], device)
+        self._largest = tensor(np.asarray(task.system.measurement_noise) / scaling["y_scale"], device)
         self._ages, self._chunk = data.ages, chunk
         self.register_buffer("position", torch.tensor(len(data.y)))
         self.register_buffer("rows", torch.zeros(BATCH, dtype=torch.long, device=device))
@@ -82,11 +83,11 @@ class _Problem(nn.Module):
             self.position.zero_()
             self.rows.copy_(torch.randint(self._y.shape[1], (BATCH,), generator=generator, device=device))
             level = torch.rand((BATCH, 1), generator=generator, device=device) * 2 - 1
-            self.level.copy_(NOISE_MAX * level.clamp(min=0.0))
+            self.level.copy_(level.clamp(min=0.0))
             self.hidden.zero_()
         first = int(self.position)
         y = self._y[first : first + self._chunk, self.rows]
-        y = y + self.level * self._unit * torch.randn(y.shape, generator=generator, device=device)
+        y = y + self.level * self._largest * torch.randn(y.shape, generator=generator, device=device)
         features, hidden = self.network.gru(y, self.hidden.clone())
         recorded = np.flatnonzero((self._ages >= first) & (self._ages < first + len(y)))
         self.position.add_(len(y))

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.system import Components, System
+from training.evaluation.levels import Level
 from training.kalman import (
     ExtendedKalmanFilter,
     KalmanFilter,
@@ -14,7 +15,7 @@ from training.kalman import (
 )
 from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
 
-# Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of a second:
+# Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
 # linearisation, for there is none in the trajectories.
 DIFFUSION = (1e-3, 1e-2, 1e-1)
@@ -38,7 +39,7 @@ class EKF(Method[Arrays]):
         """Nothing to learn."""
         return {"diffusion": np.array([configuration["diffusion"]])}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The filter, told the noise level."""
         Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
         R = measurement_covariance(system, noise)
@@ -84,7 +85,7 @@ class UntunedEKF(EKF):
         """Nothing to learn."""
         return {}
 
-    def observer(self, trained: Arrays, system: System, dt: float, noise: float) -> CausalObserver:
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The filter, told nothing."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)

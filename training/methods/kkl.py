@@ -9,6 +9,7 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.artifact import resolve
 from training.config import Config
+from training.evaluation.levels import Level
 from training.methods.base import Budget, CausalObserver, Configuration, Method, Task
 from training.pipeline import train
 from training.presets import preset
@@ -28,23 +29,22 @@ def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...
     system : System
         With nx states.
     fastest, slowest : float
-        The ends, in 1/s and negative.
+        The ends, negative and in 1/s for a system of the pace of those that ship.
 
     Returns
     -------
     tuple of float
         From the slowest on.
     """
-    return evenly_spaced(2 * system.nx + 1, slowest, fastest)
+    return evenly_spaced(2 * system.nx + 1, slowest / system.pace, fastest / system.pace)
 
 
 class KKLMethod(Method[Artifact]):
     """Whatever trains an artifact."""
 
-    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: float, /) -> CausalObserver:
+    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
         """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
-        level = min(measurement_noise, trained.inverse.measurement_noise_max)
-        return KKLObserver(trained, level, process_noise=0.0)
+        return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""

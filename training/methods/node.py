@@ -8,6 +8,7 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import Artifact, InverseMap
+from training.evaluation.levels import multiple
 from training.maps.networks import Network
 from training.methods.base import Configuration, Task
 from training.methods.kkl import SPECTRA, KKLMethod, spectrum
@@ -27,7 +28,7 @@ class NODE(KKLMethod):
     label: ClassVar[str] = "NODE"
     tuned_for: ClassVar[tuple[float, ...] | None] = (0.0,)
     noise: ClassVar[float] = 0.0
-    """Standard deviation of the noise added to y in training."""
+    """Standard deviation of the noise added to y in training, in multiples of the system's own."""
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three initial spectra."""
@@ -43,7 +44,7 @@ class NODE(KKLMethod):
         decoder = Decoder(network, linear, task.data, device=task.device)
         rates = -linear.A.diagonal()[: linear.size // system.ny]
         problem = _Problem(decoder, rates, ny=system.ny, dt=budget.dt, device=task.device)
-        batches = Batches(task.data, decoder, noise=self.noise, device=task.device)
+        batches = Batches(task.data, decoder, noise=multiple(system, self.noise), device=task.device)
         task.fit("node", problem, lambda generator: problem.loss(*batches(generator)), learning_rate=1e-2)
         eigenvalues = tuple(problem.theta().tolist())
         return Artifact(
@@ -69,8 +70,8 @@ class NODENoise(NODE):
 
     name: ClassVar[str] = "node-noise"
     label: ClassVar[str] = "NODE, noise"
-    tuned_for: ClassVar[tuple[float, ...] | None] = (0.5,)
-    noise: ClassVar[float] = 0.5
+    tuned_for: ClassVar[tuple[float, ...] | None] = (1.0,)
+    noise: ClassVar[float] = 1.0
 
 
 class _Problem(nn.Module):

@@ -6,6 +6,7 @@ from torch import nn
 from torch.nn.functional import smooth_l1_loss
 
 from observers import LinearFilter
+from training.evaluation.levels import Level
 from training.maps.networks import Network, tensor
 from training.methods.base import Data
 
@@ -124,14 +125,14 @@ class Batches:
         Training trajectories.
     decoder : Decoder
         Whose scaling of the states is taken.
-    noise : float
-        Standard deviation of the noise that is added to y.
+    noise : float or tuple of float, length ny
+        Standard deviation of the noise that is added to y, of all outputs or each.
     device : torch.device
         Where batches are made.
     """
 
-    def __init__(self, data: Data, decoder: Decoder, *, noise: float, device: torch.device) -> None:
-        self._ages, self._noise = data.ages, noise
+    def __init__(self, data: Data, decoder: Decoder, *, noise: Level, device: torch.device) -> None:
+        self._ages, self._noisy, self._noise = data.ages, np.any(noise), tensor(np.atleast_1d(noise), device)
         self._y = tensor(data.y.transpose(1, 0, 2), device)
         self._x = tensor((data.x - decoder.x_offset) / decoder.x_scale, device)
 
@@ -142,6 +143,6 @@ class Batches:
         chosen = torch.randperm(len(self._ages), generator=generator, device=device)[:AGES_PER_BATCH].sort().values
         ages = self._ages[chosen.cpu().numpy()]
         y = self._y[rows, : ages[-1] + 1]
-        if self._noise:
+        if self._noisy:
             y = y + self._noise * torch.randn(y.shape, generator=generator, device=device)
         return y.double(), ages, self._x[chosen[:, None], rows]

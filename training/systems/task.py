@@ -10,6 +10,8 @@ from kkl_gym.system import Box, System
 from kkl_gym.wrappers.vector import VectorEnv
 from observers.checks import is_finite
 
+MOST_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
+
 
 @dataclass(frozen=True)
 class ControlTask:
@@ -24,7 +26,7 @@ class ControlTask:
     period : float
         Seconds for which an action is held; the observer sees every sample within.
     duration : float
-        Length of an episode in seconds.
+        Length of an episode in seconds, at most 100,000 sampling intervals.
     start_box : tuple of (float, float), optional
         Low and high end of each state, where episodes start; by default the training box.
     tolerance : float
@@ -52,6 +54,10 @@ class ControlTask:
                 raise ValueError(f"a task's {name} must be a finite number, got {getattr(self, name)!r}")
         if not self.tolerance > 0 or not 0 < self.dt <= self.period <= self.duration:
             raise ValueError(f"a task needs tolerance > 0 and 0 < dt <= period <= duration, got {self}")
+        if self.duration / self.dt > MOST_SAMPLES:
+            raise ValueError(
+                f"an episode has at most {MOST_SAMPLES} samples, got {self.duration} s at dt = {self.dt} s"
+            )
         for name, time, unit in (("period", self.period, self.dt), ("duration", self.duration, self.period)):
             if abs(time / unit - round(time / unit)) > 1e-6:
                 raise ValueError(f"{name} = {time} s must be a whole multiple of {unit} s")

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import solve_continuous_are
+import scipy
 
 from kkl_gym.system import System
 from training.trajectories.derivatives import linearised
@@ -17,7 +17,7 @@ INPUT_WEIGHT = 0.1  # beside a weight of 1 on the states, both in units of their
 def linear_quadratic(system: System) -> Controller:
     """Linear-quadratic regulator of the linearisation at the target, u = -K (x - target) cut at the input bounds.
 
-    Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input.
+    Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input, on each step in discrete time.
 
     Parameters
     ----------
@@ -37,7 +37,11 @@ def linear_quadratic(system: System) -> Controller:
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)
     Q, R = np.diag(1.0 / np.square(system.scale)), np.diag(INPUT_WEIGHT / u_max**2)
-    K = np.linalg.solve(R, B.T @ solve_continuous_are(A, B, Q, R))
+    if system.discrete:
+        P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+    else:
+        K = np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R))
 
     def act(x: np.ndarray) -> np.ndarray:
         action: np.ndarray = np.clip(-(x - target) @ K.T / u_max, -1.0, 1.0)

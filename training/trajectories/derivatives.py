@@ -84,14 +84,32 @@ def evaluate(rows: Sequence[dict[int, Callable[..., Any]]], x: np.ndarray) -> np
 
 
 def linearised(system: System, x: Components) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linearise a system at a state x: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx)."""
-    g = np.array(input_matrix(system, x), dtype=float).reshape(system.nx, system.nu)
-    at = np.array(x, dtype=float)
-    return evaluate(jacobian(system.f, system.nx), at), g, evaluate(jacobian(system.h, system.nx), at)
+    """Linearise a system at a state x without input: df/dx (nx, nx), g (nx, nu) and dh/dx (ny, nx).
+
+    In discrete time the first two are the derivatives of the step.
+    """
+    at, nx = np.array(x, dtype=float), system.nx
+    C = evaluate(jacobian(system.h, nx), at)
+    if system.discrete:
+        both = evaluate(_of_step(system), np.concatenate([at, np.zeros(system.nu)]))
+        return both[:, :nx], both[:, nx:], C
+    g = np.array(input_matrix(system, x), dtype=float).reshape(nx, system.nu)
+    return evaluate(jacobian(system.f, nx), at), g, C
+
+
+def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of a step in discrete time, by state and then by input."""
+
+    def moved(both: Components) -> Components:
+        return components(system.step, both[: system.nx], both[system.nx :])
+
+    return jacobian(moved, system.nx + system.nu)
 
 
 def with_sensitivity(system: System, driven: bool = True) -> System:
     """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
+
+    In discrete time the next Phi is that of the step, d step/dx Phi.
 
     Parameters
     ----------
@@ -108,42 +126,71 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
     Raises
     ------
     ValueError
-        If f, or a g that depends on the state, does not take sympy symbols.
+        If the equations do not take sympy symbols.
     """
-    nx, rows = system.nx, jacobian(system.f, system.nx)
-    nu = system.nu if driven else 0
-    varying = nu > 0 and type(system).g is not System.g
+    nx, nu = system.nx, system.nu if driven else 0
+    box: Box = (*system.X, *((0.0, 1.0),) * nx**2)
+    limits: Box = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+    inputs = system.u_max if driven else ()
+    joint = f"{system.name}-sensitivity"
+    if system.discrete:
+        moves = _of_step(system)
 
-    def entries(x: Components) -> Components:
-        return [entry for row in input_matrix(system, x) for entry in row]
+        class Stepping(System):
+            name = joint
+            X: ClassVar[Box] = box
+            bounds: ClassVar[Box] = limits
+            u_max: ClassVar[tuple[float, ...]] = inputs
+            dt = system.dt
 
-    input_rows = jacobian(entries, nx) if varying else []
+            def step(self, x: Components, u: Components) -> Components:
+                acting = u if nu else (0.0,) * system.nu
+                return [*system.step(x[:nx], acting), *_times(moves, (*x[:nx], *acting), x[nx:])]
 
-    def carried(row: dict[int, Callable[..., Any]], x: Components) -> list[Any]:
-        """A row of derivatives by the states, times Phi."""
-        at = {k: derivative(*x[:nx]) for k, derivative in row.items()}
-        return [sum(value * x[nx + k * nx + j] for k, value in at.items()) for j in range(nx)]
+        return Stepping()
+    rows = jacobian(system.f, nx)
+    steered = bool(nu) and type(system).g is not System.g
+    columns = [_of_column(system, j) for j in range(nu)] if steered else []
 
     class Sensitivity(System):
-        name = f"{system.name}-sensitivity"
-        X: ClassVar[Box] = (*system.X, *((0.0, 1.0),) * nx**2)
-        bounds: ClassVar[Box] = (*system.bounds, *((-1e9, 1e9),) * nx**2)
-        u_max: ClassVar[tuple[float, ...]] = system.u_max if driven else ()
-        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not varying else ()
+        name = joint
+        X: ClassVar[Box] = box
+        bounds: ClassVar[Box] = limits
+        u_max: ClassVar[tuple[float, ...]] = inputs
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *((0.0,) * nu,) * nx**2) if nu and not steered else ()
 
         def f(self, x: Components) -> Components:
-            return [*system.f(x[:nx]), *(value for row in rows for value in carried(row, x))]
+            state = x[:nx]
+            return [*system.f(state), *_times(rows, state, x[nx:])]
 
-        if varying:
+        if steered:
 
             def g(self, x: Components) -> Sequence[Components]:
-                by_input = [[carried(input_rows[i * nu + m], x) for m in range(nu)] for i in range(nx)]
-                return [*system.g(x[:nx]), *(column for row in by_input for column in zip(*row, strict=True))]
+                state = x[:nx]
+                return [*system.g(state), *zip(*(_times(column, state, x[nx:]) for column in columns), strict=True)]
 
         def rate(self, x: Components) -> Any:
             return system.rate(x[:nx])
 
     return Sensitivity()
+
+
+def _of_column(system: System, j: int) -> list[dict[int, Callable[..., Any]]]:
+    """Derivatives of a column of the input matrix, by state."""
+
+    def column(x: Components) -> Components:
+        return [row[j] for row in input_matrix(system, x)]
+
+    return jacobian(column, system.nx)
+
+
+def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: Components) -> list[Any]:
+    """Derivatives by the state, of as many components as it has, times Phi, row by row."""
+    nx, out = len(rows), []
+    for row in rows:
+        values = {k: derivative(*at) for k, derivative in row.items() if k < nx}
+        out += [sum(value * Phi[k * nx + j] for k, value in values.items()) for j in range(nx)]
+    return out
 
 
 def output_matrix(system: System) -> np.ndarray | None:

@@ -1,6 +1,7 @@
 """Choosing the spectrum of a physics-informed map: T must be smooth, and the predicted error small."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers.storage import write
+from training.evaluation.levels import Level
 from training.smoothness import Smoothness, intervals, smoothest, smoothness
 from training.spectrum import Spectrum, papers_spectrum
 from training.tuning.probe import Choice, Probe
@@ -75,7 +77,15 @@ class Judged:
         write(folder / "intervals.csv", pd.DataFrame(rows).to_csv(index=False, float_format="%.6g"))
 
 
-def judge(system: System, dt: float, *, duration: float, measurement_noise: float, seed: int = 0) -> Judged:
+def judge(
+    system: System,
+    dt: float,
+    *,
+    duration: float,
+    measurement_noise: Level,
+    seed: int = 0,
+    report: Callable[[float], object] = lambda share: None,
+) -> Judged:
     """Judge the intervals of :mod:`training.smoothness` and the paper's.
 
     Parameters
@@ -86,10 +96,12 @@ def judge(system: System, dt: float, *, duration: float, measurement_noise: floa
         Sampling interval in seconds.
     duration : float
         Length in seconds of the runs over which errors are predicted.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int, default 0
         Of the motions' starts.
+    report : callable, optional
+        Told the share of the work that is done.
 
     Returns
     -------
@@ -103,8 +115,18 @@ def judge(system: System, dt: float, *, duration: float, measurement_noise: floa
     """
     probe = Probe(system, dt, duration, seed=seed)
     candidates, papers = intervals(system, dt), Spectrum(papers_spectrum(system))
-    choices = [Choice(one, probe.error(one, measurement_noise), CANDIDATE) for one in candidates]
-    choices.append(Choice(papers, probe.error(papers, measurement_noise), PAPERS))
+    choices, found = list[Choice](), list[Smoothness]()
+
+    def tell() -> None:
+        report((len(choices) + len(found)) / (2 * len(candidates) + 2))
+
+    for one in (*candidates, papers):
+        kind = PAPERS if one is papers else CANDIDATE
+        choices.append(Choice(one, probe.error(one, measurement_noise), kind))
+        tell()
     # The paper's apart: motions are as long as the slowest asks, and the others are to see those of smooth_spectrum.
-    found = [*smoothness(system, candidates, dt, seed=seed), *smoothness(system, [papers], dt, seed=seed)]
+    for spectra in (candidates, [papers]):
+        for judged in smoothness(system, spectra, dt, seed=seed):
+            found.append(judged)
+            tell()
     return Judged(choices, found)

@@ -5,11 +5,13 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.signal import periodogram
+import scipy
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance
+from training.kalman import unknown_start
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, bessel_spectrum
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
@@ -24,9 +26,6 @@ FARTHEST = 1e5  # that an error in the start may grow; what is known of it is a 
 SHORTEST = 10  # samples that must be followed
 SMALLEST = 1e-9  # size of a state, in the largest's, below which errors are no longer taken relative to it
 MIXED = 10.0  # largest half-width of X, in the smallest, beyond which states are taken to have different units
-
-NoiseLevels = float | Sequence[float]
-"""Standard deviation of the noise on each sample of y, of all outputs or each."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ class Probe:
         self.x, self.Phi = joint[:end, :, :nx], joint[:end, :, nx:].reshape(end, -1, nx, nx)
         self.y = system.output(self.x)
         self.signal = evaluate(jacobian(system.h, nx), self.x) @ self.Phi
-        self._known = 12.0 / (high - low) ** 2  # inverse variances of a start uniform in X
+        self._known = np.linalg.inv(unknown_start(system)[1])
         early, late = np.geomspace(5, end - 1, 16).round(), np.linspace(0, end - 1, 32).round()
         self.ages = np.unique(np.concatenate([early, late])).astype(int)
         self.share = np.gradient(self.ages.astype(float))
@@ -147,7 +146,7 @@ class Probe:
         moving = self.y[..., self.y.std((0, 1)) > 0]
         if not moving.size:
             return np.empty(0)
-        frequency, power = periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
+        frequency, power = scipy.signal.periodogram(moving - moving.mean(0), 1.0 / self.dt, "hann", axis=0)
         share = np.cumsum((power.mean(1) / power.sum(0).mean(0)).mean(-1))
         at = 2 * np.pi * np.interp(FREQUENCIES, share / share[-1], frequency)
         return np.unique([_rounded(w) for w in at if w > 0])
@@ -174,9 +173,9 @@ class Probe:
         signals = np.moveaxis(self.signal, -1, 2).reshape(steps, n * nx, ny)
         z = linear.run(self.y, np.zeros((steps - 1, n, 0)), self.ages)
         Z = linear.run(signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
-        return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
+        return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages).sum(1)
 
-    def error(self, spectrum: Spectrum, measurement_noise: NoiseLevels) -> float:
+    def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
         """Predict the error of the best decoder.
 
         Parameters
@@ -198,7 +197,7 @@ class Probe:
         """
         return self._relative(self._information(*self.response(spectrum), measurement_noise))
 
-    def least(self, measurement_noise: NoiseLevels) -> float:
+    def least(self, measurement_noise: Level) -> float:
         """Predict the error of whoever knows the equations and remembers every sample of y.
 
         Parameters
@@ -214,11 +213,11 @@ class Probe:
         Raises
         ------
         ValueError
-            Without noise.
+            If an output is without noise.
         """
         return self._relative(self._all_information(measurement_noise))
 
-    def error_of_states(self, spectrum: Spectrum | None, measurement_noise: NoiseLevels) -> np.ndarray:
+    def error_of_states(self, spectrum: Spectrum | None, measurement_noise: Level) -> np.ndarray:
         """Predict the error of the best decoder, or the least possible, for each state.
 
         Parameters
@@ -244,7 +243,7 @@ class Probe:
             information = self._information(*self.response(spectrum), measurement_noise)
         return np.asarray(self.share @ np.linalg.norm(self._left(information), axis=-1).mean(1))
 
-    def unknown_of_starts(self, measurement_noise: NoiseLevels) -> np.ndarray:
+    def unknown_of_starts(self, measurement_noise: Level) -> np.ndarray:
         """Predict what all of y leaves unknown of where a run started.
 
         Parameters
@@ -263,11 +262,11 @@ class Probe:
         ValueError
             Without noise.
         """
-        known = np.diag(self._known)
-        root = np.sqrt(known) @ _inverse_root(self._all_information(measurement_noise)[-1] + known)
+        known = np.linalg.cholesky(self._known).T
+        root = known @ _inverse_root(self._all_information(measurement_noise)[-1] + self._known)
         return np.asarray((root @ root.mT).mean(0))
 
-    def _information(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: NoiseLevels) -> np.ndarray:
+    def _information(self, z: np.ndarray, Z: np.ndarray, P: np.ndarray, measurement_noise: Level) -> np.ndarray:
         """What z tells of the start, (ages, motions, nx, nx), from what :meth:`response` returns."""
         spread = np.cov(z.reshape(-1, z.shape[-1]).T).reshape(z.shape[-1], -1)
         levels = np.broadcast_to(np.asarray(measurement_noise, dtype=float), (self.system.ny,))
@@ -276,7 +275,7 @@ class Probe:
         seen = Z @ _inverse_root(R)[:, None]
         return np.asarray(seen @ seen.mT)
 
-    def _all_information(self, measurement_noise: NoiseLevels) -> np.ndarray:
+    def _all_information(self, measurement_noise: Level) -> np.ndarray:
         """What all of y tells of the start, (ages, motions, nx, nx)."""
         levels = np.broadcast_to(np.asarray(measurement_noise, dtype=float), (self.system.ny,))
         if not (levels > 0).all():
@@ -286,7 +285,7 @@ class Probe:
 
     def _left(self, information: np.ndarray) -> np.ndarray:
         """Roots of the states' covariances, (ages, motions, nx, nx), from what is known of the start beside X."""
-        return np.asarray(self.Phi[self.ages] @ _inverse_root(information + np.diag(self._known)))
+        return np.asarray(self.Phi[self.ages] @ _inverse_root(information + self._known))
 
     def _relative(self, information: np.ndarray) -> float:
         """The mean error in percent."""
@@ -298,13 +297,13 @@ class Probe:
             raise FloatingPointError(f"the predicted error of {self.system.name} is no number")
         return found
 
-    def choose(self, measurement_noise: float, most: int = 21, anew: bool = False) -> list[Choice]:
+    def choose(self, measurement_noise: Level, most: int = 21, anew: bool = False) -> list[Choice]:
         """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         most : int
             Modes for each output at which it ends. It also ends where none lowers the error by LEAST_GAIN.
         anew : bool
@@ -351,13 +350,13 @@ class Probe:
             chosen, columns, before = chosen + spectrum, columns + own, error
             found.append(Choice(chosen, error))
 
-    def bessel(self, measurement_noise: float, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
+    def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
         """Find Bessel filters to compare with.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation of the noise on each sample of y.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviation of the noise on each sample of y, of all outputs or each.
         orders : sequence of int
             Of the filters: their numbers of modes.
         cutoffs : iterable of float

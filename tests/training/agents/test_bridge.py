@@ -3,6 +3,7 @@
 from functools import partial
 
 import gymnasium as gym
+import linear_system
 import numpy as np
 import pytest
 import torch
@@ -179,6 +180,11 @@ def test_attributes_of_batched_environments(saved):
 def test_other_autoreset_modes_are_refused(mode):
     with pytest.raises(ValueError, match='autoreset_mode="SameStep"'):
         SB3VecEnv(KKLVectorEnv("lorenz", 2, autoreset_mode=mode))
+
+
+def test_a_system_without_inputs_is_refused():
+    with pytest.raises(ValueError, match="the action space is empty"):
+        SB3VecEnv(KKLVectorEnv(f"{linear_system.__file__}:Autonomous", 2, autoreset_mode="SameStep"))
 
 
 def test_options_of_single_rows_are_refused():

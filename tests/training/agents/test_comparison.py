@@ -1,10 +1,12 @@
 """The comparison of agents, at toy size."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import linear_system
 import numpy as np
 import pandas as pd
 import pytest
@@ -13,9 +15,19 @@ from rich.console import Console
 import training.agents.comparison
 import training.agents.learn
 import training.commands.compare
-from training.agents.comparison import COMPARED, MORE_NOISE, interval, middle, normalised, planned, run_case
+from training.agents.comparison import (
+    COMPARED,
+    MORE_NOISE,
+    OTHER,
+    collect,
+    interval,
+    middle,
+    normalised,
+    planned,
+    run_case,
+)
 from training.commands.compare import Compare, report
-from training.jobs import locked
+from training.jobs import claimed_job, locked
 from training.systems import PROFILES
 
 
@@ -90,6 +102,15 @@ def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path
     assert case.done
 
 
+@pytest.mark.parametrize("text", ["", "[]", '{"scores": [0.0]}', '{"scores": [0.0], "successes": [1], "seconds": '])
+def test_scores_that_are_damaged_are_named(text, tmp_path):
+    (case,) = toy_cases(tmp_path, "y")
+    with claimed_job(case.folder, case.identity, OTHER):
+        (case.folder / "scores.json").write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(case.folder / "scores.json"))):
+        collect(tmp_path, episodes=case.episodes, timesteps=case.timesteps)
+
+
 def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
     def interrupted(run, jobs, workers):
         run(jobs[0])
@@ -141,12 +162,32 @@ def test_wrong_numbers(tmp_path):
         toy(tmp_path, seeds=0).run(Console())
     for wrong in (
         {"systems": ("lorenz", "lorenz")},
-        {"systems": ("mine.py:Mine",)},  # whose agents the report would leave out
         {"information": ("y", "y")},
         {"information": ()},
     ):
         with pytest.raises(ValueError, match="each once"):
             toy(tmp_path, **wrong).run(Console())
+    for wrong, message in (
+        ({"systems": ("mine.py:Mine",)}, "no file mine.py"),
+        ({"observers": ("rossler",)}, "the observer rossler is for rossler: name one for each of lorenz at most"),
+        ({"observers": ("lorenz", "lorenz-v1")}, "the observer lorenz-v1 is for lorenz"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            toy(tmp_path, **wrong).run(Console())
+
+
+def test_a_system_and_an_observer_of_ones_own(tmp_path, saved, capsys):
+    own = f"{linear_system.__file__}:Oscillator"
+    with pytest.raises(ValueError, match="no observer ships for 'oscillator'"):
+        toy(tmp_path, systems=(own,), information=("x_hat",), seeds=1).run(Console())
+    options = {"information": ("state", "x_hat"), "seeds": 1, "observers": (saved(system=own),)}
+    toy(tmp_path, systems=(own,), **options).run(Console())
+    results = pd.read_csv(tmp_path / "results.csv")
+    assert results[["system", "knows"]].to_numpy().tolist() == [["oscillator", "state"], ["oscillator", "x_hat"]]
+    table = (tmp_path / "table.md").read_text()
+    assert "| oscillator, noise 0.1 |" in table  # the system's own
+    assert f"Partial: {6 * 5 + 2 * 3 - 2} of {6 * 5 + 2 * 3} agents are missing" in table
+    assert "finished oscillator at noise 0.1/x_hat/0" in (tmp_path / "log.txt").read_text()
 
 
 def test_an_interrupted_training_is_of_one_comparison_as_well(tmp_path, monkeypatch):
@@ -176,3 +217,14 @@ def test_the_published_table_follows_from_the_published_results(tmp_path):
     shutil.copy(published / "results.csv", tmp_path)
     report(tmp_path)
     assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()
+
+
+def test_noise_of_each_output_has_a_name(tmp_path):
+    rows = [
+        {"system": system, "noise": noise, "knows": "state", "seed": 0, "score": -0.2, "success": 0.5, "idle": -0.6,
+         "seconds": 60.0}
+        for system, noise in (("lorenz", 2.0), ("two", "0.1-0.02"))
+    ]  # fmt: skip
+    pd.DataFrame(rows).to_csv(tmp_path / "results.csv", index=False)
+    report(tmp_path)
+    assert "| lorenz, noise 2 | two, noise 0.1-0.02 |" in (tmp_path / "table.md").read_text()

@@ -1,5 +1,8 @@
 """Trainings of agents that were cut off and go on."""
 
+import errno
+import os
+import re
 import shutil
 from pathlib import Path
 
@@ -7,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from stable_baselines3.common.logger import CSVOutputFormat
 
 from training import checkpoints
 from training.agents.agent import Agent
@@ -150,3 +154,17 @@ def test_the_command_goes_on(tmp_path, capsys, monkeypatch):
     assert sorted(Path(tmp_path).glob("[!.]*")) == [
         tmp_path / name for name in ("agent.checkpoint.pt", "agent.safetensors", "progress.csv")
     ]
+
+
+def test_a_full_disk_is_told_by_the_name_of_the_file(tmp_path, monkeypatch):
+    def full(self, *arguments):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(CSVOutputFormat, "write", full)
+        with pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path / 'progress.csv'}'")):
+            learn(TASK, "y", tmp_path, timesteps=1)
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path / 'agent.checkpoint.pt'}'")):
+        learn(TASK, "y", tmp_path, timesteps=1)
+    assert os.listdir(tmp_path) == ["progress.csv"]

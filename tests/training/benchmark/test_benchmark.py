@@ -2,8 +2,10 @@
 
 import json
 import math
+import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -15,16 +17,18 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from rich.console import Console
 
-import training.commands.benchmark as command
+import training.benchmark.jobs
+import training.benchmark.sizes as sizes
 from kkl_gym import get_system
 from training.benchmark import protocol as protocol_module
 from training.benchmark.jobs import OTHER, Job, run_job
 from training.benchmark.protocol import Protocol, measure, run, step_time, validate, with_shared_noise
+from training.benchmark.results import collect
 from training.benchmark.tables import _number, heatmap, summarise
 from training.cli import main
 from training.commands.benchmark import Benchmark
 from training.evaluation.errors import starts, unseen_trajectories
-from training.evaluation.metrics import component_smape, rmse, settling_time, smape
+from training.evaluation.metrics import component_smape, nrmse, rmse, settling_time, smape
 from training.jobs import claimed_job, run_all
 from training.methods import METHODS, Budget, Method, get_method
 from training.seeds import Stream
@@ -104,12 +108,12 @@ def toy(tmp_path):
 @pytest.fixture
 def tiny(monkeypatch):
     """The command at toy size."""
-    monkeypatch.setitem(command.BUDGETS, "cpu", TINY)
-    monkeypatch.setitem(command.BUDGETS, "quick", TINY)
-    monkeypatch.setattr(command, "PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "QUICK_PROTOCOL", SHORT)
-    monkeypatch.setattr(command, "VALIDATION", SHORT)
-    monkeypatch.setattr(command, "step_time", lambda *_, **__: 1.0)
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", TINY)
+    monkeypatch.setitem(sizes.BUDGETS, "quick", TINY)
+    monkeypatch.setattr(sizes, "PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", SHORT)
+    monkeypatch.setattr(sizes, "VALIDATION", SHORT)
+    monkeypatch.setattr(training.benchmark.jobs, "step_time", lambda *_, **__: 1.0)
 
 
 def quiet():
@@ -181,6 +185,15 @@ def test_measure_marks_the_lost_and_the_escaped():
     assert inside.lost.tolist() == [1.0, 1.0] + [0.0] * (len(inside) - 2)
     assert (inside.smape[2:] == 0).all()
     assert inside.smape.iloc[0] == 200.0
+    nrmse = inside[["nrmse1", "nrmse2", "nrmse3"]].to_numpy()
+    assert (nrmse[0] == math.inf).all()
+    np.testing.assert_allclose(nrmse[1], 100 * rms(1e6 - runs.x[:, 1], skip=20 * 20) / runs.x.std((0, 1)))
+    assert (nrmse[2:] == 0).all()
+    assert escaped.nrmse3.isna().all()
+
+
+def rms(error, skip):
+    return np.sqrt((error[skip:] ** 2).mean(0))
 
 
 def test_methods_that_are_slow_get_the_first_trajectories():
@@ -252,7 +265,7 @@ def test_methods_made_for_one_noise_level_are_validated_there():
     protocol = Protocol(measurement_noise=(0.0, 0.5), trajectories=2, duration=0.1)
     exact = unseen_trajectories(system, 0.01, n=2, duration=0.1, seed=0, stream=Stream.VALIDATION).x
     validate(Particular(exact), None, system, dt=0.01, protocol=protocol)
-    assert asked == [0.25]
+    assert asked == [0.125]  # of the 0.5 that are the system's own
 
 
 @pytest.mark.parametrize("domain", ["1.5X", "2X"])
@@ -306,6 +319,12 @@ def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     np.testing.assert_allclose(found, smape(expected, np.broadcast_to(mean, expected.shape)), rtol=1e-3)
     table = (out / "table.md").read_text()
     assert "| constant mean |" in table
+    expected = nrmse(expected, np.broadcast_to(mean, expected.shape), skip=8)
+    np.testing.assert_allclose(row[row.noise == 0][["nrmse1", "nrmse2", "nrmse3"]], expected, rtol=1e-3)
+    _, cells = rows_of(table, "NRMSE in % after the first 20 %, starts in X, noise 0")
+    of_two, of_three = (cell.split(" / ") for cell in cells["constant mean"])
+    assert (len(of_two), len(of_three)) == (2, 3)
+    np.testing.assert_allclose([float(figure) for figure in of_three], np.median(expected, 0), rtol=6e-3)
     assert "Partial: 4 of 52 observers. Missing: default; spinn; ae; dmf and 9 more methods." in table
     assert imread(out / "heatmap.png").shape[1] > 300
     assert len(trainings.read_text().splitlines()) == 2 * 4  # three configurations and the final one
@@ -370,6 +389,31 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0", "lorenz", "1.0"]
 
 
+@pytest.mark.parametrize(("file", "text"), [
+    ("configuration-0.json", "{"), ("configuration-0.json", "[]"), ("configuration-0.json", '{"configuration": {}}'),
+    ("trained.seconds", ""), ("trained.seconds", "a minute"),
+])  # fmt: skip
+def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
+    job = Job("lorenz", toy[0], tmp_path / "job", TINY, SHORT, 1.0, SHORT)
+    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
+    (job.folder / "errors.csv").unlink()
+    (job.folder / file).write_text(text)
+    ((_, failure, _),) = run_all(run_job, [job], 1)
+    assert isinstance(failure, ValueError)
+    assert str(job.folder / file) in str(failure)
+
+
+@pytest.mark.parametrize(("file", "text"), [
+    ("errors.csv", ""), ("info.json", "{"), ("info.json", "{}"), ("job.json", "[]"), ("speed.json", "[1]"),
+])  # fmt: skip
+def test_results_that_are_damaged_are_named(file, text, toy, tiny, tmp_path):
+    out = Benchmark(systems=("lorenz",), methods=(toy[0],), out=tmp_path / "out", jobs=1).run(quiet())
+    folder = out / "jobs" / "lorenz" / "constant"
+    (folder / file).write_text(text)
+    with pytest.raises(ValueError, match=re.escape(str(folder))):
+        collect(out)
+
+
 def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     name, _ = toy
     script = Path(name.rpartition(":")[0])
@@ -385,7 +429,7 @@ def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monk
     name, _ = toy
     out = tmp_path / "out"
     Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
-    monkeypatch.setitem(command.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
+    monkeypatch.setitem(sizes.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
         Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
@@ -413,7 +457,7 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
         ({"methods": ()}, "at least one"),
         ({"jobs": 0}, "at least one"),
         ({"report": True}, "does not exist; run the benchmark first"),
-        ({"measurement_noise": (-0.1,)}, r"measurement_noise = \(-0.1,\) must be finite and not negative"),
+        ({"measurement_noise": (-0.1,)}, "measurement_noise must be a finite number, not negative, got -0.1"),
         ({"measurement_noise": (math.inf,)}, "measurement_noise"),
         ({"seed": -1}, "seed = -1 must be a whole number from 0"),
         ({"seed": 2**32}, "seed = 4294967296 must be"),
@@ -554,6 +598,46 @@ def test_levels_of_noise_by_both_names(toy, tiny, tmp_path):
         out = str(tmp_path / option)
         main(["benchmark", "--systems", "lorenz", "--methods", name, option, "0.25", "1", "--jobs", "1", "--out", out])
         assert set(pd.read_csv(tmp_path / option / "results.csv").noise) == {0.25, 1.0}
+
+
+SLOW = """
+from linear_system import Oscillator
+
+
+class Slow(Oscillator):
+    name, dt = "slow", 0.1
+
+
+class Two(Slow):
+    name = "two"
+    measurement_noise = (0.1, 0.3)
+
+    def h(self, x):
+        return x[0], x[1]
+"""
+
+
+def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeypatch):
+    """Beside one that ships, in one folder."""
+    script = tmp_path / "slow.py"
+    script.write_text(SLOW)
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", replace(SHORT, duration=5.0))
+    out = tmp_path / "out"
+    systems = ("van_der_pol", f"{script}:Slow", f"{script}:Two")
+    Benchmark(quick=True, systems=systems, methods=("ekf",), out=out, jobs=1).run(quiet())
+    jobs = [json.loads((out / "jobs" / name / "ekf" / "job.json").read_text()) for name in ("van_der_pol", "slow")]
+    assert [job["budget"]["dt"] for job in jobs] == [0.01, 0.1]
+    assert [job["budget"]["duration"] for job in jobs] == [20.0, 200.0]
+    assert [job["protocol"]["duration"] for job in jobs] == [5.0, 50.0]
+    assert [job["validation"]["duration"] for job in jobs] == [20.0, 200.0]
+    results = pd.read_csv(out / "results.csv")
+    levels = results.groupby("system").noise.unique().map(list).to_dict()
+    assert levels == {"van_der_pol": ["0.0", "0.5"], "slow": ["0.0", "0.1"], "two": ["0.0", "0.1, 0.3"]}
+    page = (out / "table.md").read_text()
+    cells = [rows_of(page, f"SMAPE in %, all steps, starts in X, noise {level}")[1] for level in ("0.1, 0.3", "0.5")]
+    assert [[cell == "–" for cell in one["EKF"]] for one in cells] == [[True, True, False], [False, True, True]]
+    shown = heatmap(results, pd.read_csv(out / "methods.csv"), note="")
+    assert [ax.get_title()[-3:] for ax in shown.axes[:-1:3]] == ["e 0", "0.1", "0.3", "0.5"]
 
 
 def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):

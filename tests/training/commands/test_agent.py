@@ -39,7 +39,8 @@ def test_an_agent_is_played_on_the_episodes_of_a_seed(tmp_path, capsys, monkeypa
     told = []
     for seed in ("0", "0", "1"):
         main(["agent", "evaluate", "lorenz", "--episodes", "5", "--seed", seed, "--out", str(tmp_path)])
-        told.append(capsys.readouterr().out)
+        lines = capsys.readouterr().out.splitlines()
+        told.append("\n".join(line for line in lines if " passed" not in line))  # progress, on a slow machine
     assert "[" in told[0]
     assert told[0] == told[1] != told[2]
     with pytest.raises(SystemExit, match="kkl-gym: seed must not be negative"):
@@ -58,6 +59,6 @@ def test_an_agent_for_a_system_of_ones_own(tmp_path, saved, script, monkeypatch)
     with pytest.raises(SystemExit, match="if you trust that, give --system"):
         main(["agent", "evaluate", str(path), "--episodes", "2"])
     main(["agent", "evaluate", str(path), "--episodes", "2", "--system", OWN])
-    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.5-0.gif").exists()
+    assert (tmp_path / "runs" / "agents" / "oscillator-x_hat-0.1-0.gif").exists()
     with pytest.raises(SystemExit, match="Pendulum has no inputs"):
         main(["agent", "train", f"{script}:Pendulum", "--information", "y"])

@@ -1,12 +1,54 @@
-"""kkl-gym demo and kkl-gym maps."""
+"""``kkl-gym demo``."""
+
+import linear_system
+import pytest
 
 from training.cli import main
 
+OWN = f"{linear_system.__file__}:Oscillator"
+AUTONOMOUS = f"{linear_system.__file__}:Autonomous"
 
-def test_demo_and_maps(tmp_path, capsys):
+
+def test_all_that_ship(tmp_path, capsys):
     main(["demo", "--out", str(tmp_path), "--duration", "1"])
-    main(["maps"])
     out = capsys.readouterr().out
     assert "KKLLorenz-v0" in out
-    assert "van_der_pol-spinn" in out
+    assert "measurement noise 0.5" in out
     assert (tmp_path / "estimates.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("system", [OWN, AUTONOMOUS])
+def test_a_system_of_ones_own(system, saved, tmp_path, capsys):
+    observer = saved(system=system, dt=0.02)
+    main(["demo", system, "--observer", observer, "--out", str(tmp_path), "--duration", "1", "--noise", "0.2"])
+    out = capsys.readouterr().out
+    name = system.rpartition(":")[2].lower()
+    assert f" {name} " in out
+    assert "SPINN" not in out
+    assert (tmp_path / f"estimates-{name}.png").stat().st_size > 10_000
+
+
+def test_one_that_ships_with_another_observer(tmp_path, capsys):
+    main(["demo", "lorenz", "--observer", "lorenz-v1", "--out", str(tmp_path), "--duration", "1"])
+    assert "observer" in capsys.readouterr().out
+    assert (tmp_path / "estimates-lorenz.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--observer", "lorenz"], "name the system that the observer lorenz is for"),
+        (["lorenz", "--observer", "rossler"], "the observer was made for the system 'rossler'"),
+        (["lorentz"], "unknown system 'lorentz'"),
+        ([OWN, "--observer", "nowhere.safetensors"], "nowhere.safetensors"),
+    ],
+)
+@pytest.mark.parametrize("command", ["demo", "speed"])
+def test_what_cannot_be_shown(command, arguments, message):
+    with pytest.raises(SystemExit, match=message):
+        main([command, *arguments])
+
+
+def test_a_demo_needs_an_observer():
+    with pytest.raises(SystemExit, match="no observer ships for 'oscillator': name a file, --observer FILE"):
+        main(["demo", OWN])

@@ -1,7 +1,9 @@
 """``kkl-gym evaluate``."""
 
+import io
 from pathlib import Path
 
+import linear_system
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -18,7 +20,7 @@ def test_every_column_of_the_csv_file_holds_one_thing(option, saved, tmp_path):
     path, csv = saved(), tmp_path / "new" / "errors.csv"
     main(["evaluate", path, "--trajectories", "2", "--duration", "2", option, "0", "0.3", "--process-noise", "0.1",
           "--csv", str(csv)])  # fmt: skip
-    assert csv.read_text().splitlines()[0] == COLUMNS
+    assert csv.read_text().splitlines()[0] == f"{COLUMNS},nrmse1,nrmse2"
     found = pd.read_csv(csv)
     assert len(found) == 3 * 2 * 2
     assert set(found.observer) == {path}
@@ -31,19 +33,123 @@ def test_every_column_of_the_csv_file_holds_one_thing(option, saved, tmp_path):
 
 @pytest.mark.parametrize("inputs", [False, True])
 @pytest.mark.parametrize("process_noise", [0.0, 0.1])
-def test_every_column_of_the_printed_table_holds_one_thing(inputs, process_noise, saved):
-    console = Console(width=200, record=True)
-    Evaluate((saved(inputs=inputs),), process_noise=process_noise, trajectories=2, duration=2.0).run(console)
-    title, table = console.export_text().split("┏")
-    assert "noise" not in title
-    names = [line.split("┃")[1:-1] for line in table.splitlines() if line.startswith("┃")]
-    header = [" ".join(" ".join(lines).split()) for lines in zip(*names, strict=True)]
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in table.splitlines() if line.startswith("│")]
+def test_every_column_of_the_printed_tables_holds_one_thing(inputs, process_noise, saved):
+    (smape, nrmse), _ = printed((saved(inputs=inputs),), process_noise=process_noise, trajectories=2, duration=2.0)
     driven, process = ["driven"] * inputs, ["process noise"] * (process_noise > 0)
-    assert header == ["starts", *driven, *process, "noise on y", "all steps", "after transient", "escaped"]
+    keys = ["starts", *driven, *process, "noise on y"]
+    assert smape[0] == [*keys, "all steps", "after transient", "escaped"]
+    assert nrmse[0] == [*keys, "x1", "x2"]
     cases = [["X", "no"], ["2X \\ X", "no"], ["X", "yes"]] if inputs else [["X"], ["2X \\ X"]]
     level = ["0.1"] if process_noise else []
-    assert [row[:-3] for row in rows] == [[*case, *level, noise] for case in cases for noise in ("0", "0.5")]
+    expected = [[*case, *level, noise] for case in cases for noise in ("0", "0.5")]
+    assert [row[:-3] for row in smape[1:]] == [row[:-2] for row in nrmse[1:]] == expected
+
+
+def test_an_exact_kalman_filter_stands_beside_the_observer(saved):
+    (smape, nrmse), _ = printed((saved(),), trajectories=2, duration=2.0, ekf=True)
+    assert smape[0][:2] == nrmse[0][:2] == ["observer", "starts"]
+    assert [row[0] for row in smape[1:]] == [row[0] for row in nrmse[1:]] == [Path(saved()).stem, "exact EKF"] * 6
+
+
+def printed(observers, **options):
+    """What the command prints: its tables, each a header and rows of cells, and the lines below them."""
+    console = Console(width=200, record=True, file=io.StringIO())
+    Evaluate(observers, **options).run(console)
+    tables, below = [], []
+    for line in console.export_text().splitlines():
+        if line.startswith("┏"):
+            tables.append(([], []))
+        elif line.startswith("┃"):
+            tables[-1][0].append(line.split("┃")[1:-1])
+        elif line.startswith("│"):
+            tables[-1][1].append([cell.strip() for cell in line.split("│")[1:-1]])
+        elif ", left out: " in line:
+            below.append(line)
+    joined = [[" ".join(" ".join(lines).split()) for lines in zip(*names, strict=True)] for names, _ in tables]
+    return [[header, *rows] for header, (_, rows) in zip(joined, tables, strict=True)], below
+
+
+@pytest.fixture(scope="module")
+def reactor(tmp_path_factory):
+    """An observer in mixed units: 0.03 K off, and 2 % in the concentration."""
+    path = tmp_path_factory.mktemp("reactor") / "reactor.safetensors"
+    linear_system.reactor_observer(offset=0.03, gain=1.02).save(path)
+    return str(path)
+
+
+def test_nrmse_says_what_smape_of_mixed_units_does_not(reactor):
+    options = {"system": f"{linear_system.__file__}:Reactor", "trajectories": 20, "duration": 20.0}
+    (smape, nrmse), below = printed((reactor,), measurement_noise=(0.0,), **options)
+    assert nrmse[0][2:] == ["T in K", "c in mol/l"]
+    assert [row[3].split()[0] for row in smape[1:]] == ["0.01", "0.01"]
+    for row in nrmse[1:]:
+        assert 0.1 < float(row[2]) < 0.4
+        assert 1.5 < float(row[3]) < 2.5
+    assert not below
+
+
+def test_durations_and_levels_are_the_systems_own(reactor):
+    found = Evaluate((reactor,), f"{linear_system.__file__}:Reactor", trajectories=2).run(
+        console := Console(record=True)
+    )
+    assert "2 runs of 250 s" in console.export_text()  # 5,000 samples, as of the systems that ship
+    assert set(found.measurement_noise) == {0.0, 2.0}  # 5 % of 40 K
+    assert set(found.columns) == {*COLUMNS.split(","), "nrmse1", "nrmse2"}
+
+
+CORNERED = """
+from linear_system import Oscillator
+
+
+class Cornered(Oscillator):
+    name = "oscillator"
+    bounds = ((-1, 1), (-1, 1))
+
+
+class Driven(Cornered):
+    bounds = ((-1.2, 1.2), (-1.2, 1.2))
+
+
+class Unstable(Oscillator):
+    name = "oscillator"
+
+    def f(self, x):
+        return 5 * x[0], 5 * x[1]
+"""
+
+
+@pytest.fixture(scope="module")
+def cornered(tmp_path_factory):
+    """An exact observer of the oscillator, and a script of its variants whose runs leave their bounds."""
+    folder = tmp_path_factory.mktemp("cornered")
+    linear_system.exact_observer().save(folder / "map.safetensors")
+    (folder / "cornered.py").write_text(CORNERED)
+    return str(folder / "map.safetensors"), f"{folder / 'cornered.py'}"
+
+
+def test_why_there_are_no_runs(cornered):
+    path, script = cornered
+    (smape, _), below = printed((path,), system=f"{script}:Cornered", trajectories=10, duration=1.0)
+    assert {row[0] for row in smape[1:]} == {"X"}
+    assert int(smape[1][-1]) > 0
+    (line,) = below
+    assert line.startswith(f"{path}, left out: starts in 2X \\ X: no state of oscillator in 2X lies beyond X")
+    with pytest.raises(ValueError, match=r"nothing is left to evaluate of .*map.safetensors"):
+        Evaluate((path,), f"{script}:Unstable", trajectories=5, duration=20.0).run(console := Console(record=True))
+    text = " ".join(console.export_text().split())
+    assert "left out: starts in X: each of 5 runs left bounds = ((-30, 30), (-30, 30))" in text
+    assert "starts in 2X \\ X: each of 5 runs left" in text
+
+
+def test_a_level_beyond_the_maps_range_is_left_out_and_named(saved):
+    path = saved(inputs=False)
+    (smape, _), (line,) = printed((path,), measurement_noise=(0.0, 1.0, 1.5), trajectories=2, duration=2.0)
+    assert [row[1] for row in smape[1:]] == ["0", "1", "0", "1"]
+    assert line == f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1"
+    with pytest.raises(ValueError, match="nothing is left"):
+        printed((path,), measurement_noise=(1.5,), trajectories=2, duration=2.0)
+    with pytest.raises(ValueError, match="measurement_noise must be one number, or one for each of 1 outputs"):
+        printed((path,), measurement_noise=((0.1, 0.2),), trajectories=2, duration=2.0)
 
 
 @pytest.mark.parametrize(("name", "process_noise"), [("accuracy", 0.0), ("accuracy-process-noise", 0.05)])

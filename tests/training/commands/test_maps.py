@@ -25,6 +25,7 @@ def test_one_row_for_each_file_and_no_name_cut():
     for name in set(shipped()) - files:
         assert words.count(f"({name})") == 1
     assert max(map(len, narrow.splitlines())) <= 80
+    assert printed(40).split() == words
 
 
 def test_what_each_map_is_told():

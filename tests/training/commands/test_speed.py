@@ -1,5 +1,6 @@
 """kkl-gym speed."""
 
+import linear_system
 import numpy as np
 import pytest
 from rich.console import Console
@@ -83,3 +84,16 @@ def test_speed_measures_every_environment(capsys):
                 simulated, network = ("%" in part for part in parts)
                 assert simulated == (name != reference)
                 assert network == name.endswith("x_hat")
+
+
+def test_a_system_of_ones_own_alone(saved, capsys):
+    own = f"{linear_system.__file__}:Oscillator"
+    sizes = {"steps": 5, "turns": 1, "num_envs": 4, "vector_steps": 3}
+    bare = Speed(own, **sizes).run(Console())
+    assert set(bare) == {"Pendulum-v1", "oscillator", "CartPole-v1, 4 rows", "oscillator, 4 rows"}
+    observed = Speed(own, saved(system=own), **sizes).run(Console())
+    assert set(observed) - set(bare) == {
+        "oscillator, x_hat",
+        "oscillator, z, 4 rows",
+        "oscillator, x_hat, 4 rows",
+    }

@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import linear_system
 import numpy as np
@@ -12,6 +14,7 @@ from linear_system import C, F, Oscillator, sylvester
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov, solve_sylvester
 
 import observers
+import training.evaluation.certificates.certificate
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
@@ -373,6 +376,52 @@ def test_psi_covers_what_noise_does_where_motions_settle():
     assert np.linalg.norm(recorded.noisy_x - recorded.x, axis=1).max() <= found.psi
 
 
+def test_errors_by_state_in_mixed_units():
+    """Of 20 K and 1e-3 mol/l: 0.03 K off, and 2 % in the concentration."""
+    system, artifact = linear_system.Reactor(), linear_system.reactor_observer(offset=0.03, gain=1.02)
+    found = certify(artifact, system, measurement_noise=0.0, process_noise=0.0, trajectories=20)
+    size = record_settled(
+        artifact, system, measurement_noise=0.0, process_noise=0.0, trajectories=20, seed=0
+    ).halves()[0].x.std(0)  # fmt: skip
+    assert found.nrmse == pytest.approx((100 * 0.03 / size[0], 2.0), rel=0.02)
+    assert found.nrmse == found.noisy_nrmse
+    assert np.sqrt(found.error) == pytest.approx(0.03, rel=0.01)  # of which the concentration is no part
+
+
+def test_recordings_and_ages_follow_the_systems_pace():
+    """The reactor's sampling interval is five times that of the systems that ship."""
+    artifact = linear_system.reactor_observer()
+    recorded = record_settled(
+        artifact, linear_system.Reactor(), measurement_noise=0.0, process_noise=0.0, trajectories=2, seed=0
+    )
+    assert len(recorded.x) == 2 * (1 + 150 / 0.05 / 10)
+    exact = dataclasses.replace(linear_system.exact_observer(), parameters={})
+
+    class Slow(Oscillator):
+        name = "oscillator"
+        dt = 0.05
+
+    found = certify(exact, Slow(), measurement_noise=0.0, process_noise=0.0, trajectories=2)
+    assert list(found.forward.envelope) == pytest.approx([0.0, 5.0, 10.0, 25.0, 50.0])
+    assert found.forward.envelope[5.0] == pytest.approx(found.forward.envelope[0.0] * np.exp(-5.0))
+
+
+def test_the_level_is_the_systems_own_as_far_as_the_map_knows_it(monkeypatch):
+    told = []
+
+    def stop(artifact, system, *, measurement_noise, **_):
+        told.append(measurement_noise)
+        raise LookupError
+
+    monkeypatch.setattr(training.evaluation.certificates.certificate, "record_settled", stop)
+    artifact = random_artifact("van_der_pol")
+    for largest in (1.0, 0.2):
+        inverse = dataclasses.replace(artifact.inverse, measurement_noise_max=largest)
+        with pytest.raises(LookupError):
+            certify(dataclasses.replace(artifact, inverse=inverse), get_system("van_der_pol"))
+    assert told == [0.5, 0.2]
+
+
 def test_motions_come_in_two_halves_of_whole_motions():
     recorded = record_settled(
         linear_observer(), Oscillator(), measurement_noise=0.3, process_noise=0.1, trajectories=5, seed=0
@@ -459,6 +508,9 @@ def test_command(tmp_path, capsys):
     assert steepest in (tmp_path / "out" / "table.md").read_text()
     printed = capsys.readouterr().out
     assert "bound of the rms error" in printed
+    page = (tmp_path / "out" / "table.md").read_text()
+    assert page.startswith("Measurement noise 0.1, cut at 0.3 for the bounds; ")
+    assert re.search(r"\| rms error by state in % of its standard deviation, no noise \| 2 / 2 \|", page)
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
     main(["certify", "van_der_pol-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
@@ -466,3 +518,16 @@ def test_command(tmp_path, capsys):
     assert (tmp_path / "quiet" / "van_der_pol-spinn.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])
+
+
+def test_a_map_that_does_not_know_the_level_is_left_out(tmp_path, saved, capsys):
+    linear_observer().save(tmp_path / "mine.safetensors")  # which takes any
+    system = f"{linear_system.__file__}:Oscillator"
+    told = saved(system=system)
+    options = ["--system", system, "--trajectories", "2", "--measurement-noise", "2", "--out", str(tmp_path / "out")]
+    main(["certify", told, str(tmp_path / "mine.safetensors"), *options])
+    name = Path(told).stem
+    assert f"{name}, left out: measurement noise 2 is beyond the map's range, 0 to 1" in capsys.readouterr().out
+    assert [path.name for path in sorted((tmp_path / "out").glob("*.json"))] == ["mine.json"]
+    with pytest.raises(SystemExit, match=f"nothing is left to certify of {name}"):
+        main(["certify", told, *options])

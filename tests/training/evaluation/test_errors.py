@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear_system import Oscillator
+from linear_system import Oscillator, Reactor, reactor_observer
 
 import training.evaluation.errors
 import training.maps.optimise
@@ -12,7 +12,7 @@ from kkl_gym import VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import starts
+from training.evaluation.errors import kalman_errors, starts
 
 
 def test_starts_outside_lie_outside():
@@ -64,3 +64,36 @@ def test_escapes_are_counted():
 def test_output_of_constant_and_state():
     x = np.arange(12.0).reshape(2, 3, 2)
     np.testing.assert_array_equal(Oscillator().output(x), x[..., :1])
+
+
+def test_an_error_of_the_small_state_shows_in_its_nrmse_and_nowhere_else():
+    """A temperature of 300 K off by 0.03, a concentration of 1e-3 mol/l 2 % off."""
+    system = Reactor()
+    runs = unseen_trajectories(system, system.dt, n=20, duration=40 * np.pi, seed=0)
+    found = errors(reactor_observer(offset=0.03, gain=1.02), system, runs, measurement_noise=0.0, seed=0)
+    assert np.median(found.late) == pytest.approx(0.01, rel=0.01)
+    rms = np.sqrt(((runs.x - [300, 1e-3]) ** 2).mean(0))  # of whole periods, for any radius of the circle
+    size = runs.x.std((0, 1))
+    np.testing.assert_allclose(found.nrmse[:, 0], 100 * 0.03 / size[0], rtol=0.02)
+    np.testing.assert_allclose(found.nrmse[:, 1], 2.0 * rms[:, 1] / size[1], rtol=0.02)
+    assert np.median(found.nrmse[:, 1]) == pytest.approx(2.0, rel=0.2)
+
+
+def test_levels_of_noise_that_are_none(make_artifact):
+    runs = unseen_trajectories(VanDerPol(), 0.01, n=2, duration=0.1, seed=0)
+    for wrong in (-0.1, np.nan, True, "0.5", (0.1, 0.2)):
+        with pytest.raises(ValueError, match="measurement_noise"):
+            errors(make_artifact(), VanDerPol(), runs, measurement_noise=wrong, seed=0)
+
+
+def test_an_exact_kalman_filter_follows_the_same_runs():
+    system, dt = Oscillator(), 0.05
+    runs = unseen_trajectories(system, dt, n=20, duration=20.0, seed=0, driven=True)
+    found = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0)
+    assert found.nrmse.shape == (20, 2)
+    assert 0.5 < np.median(found.nrmse) < 10  # noise of some 15 % of the output, averaged
+    assert np.median(found.late) < np.median(found.full)
+    longer = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0, skip=15.0)
+    assert np.median(longer.nrmse) < np.median(found.nrmse)
+    louder = kalman_errors(system, runs, dt, measurement_noise=0.4, seed=0)
+    assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()

@@ -1,8 +1,13 @@
 """The optimisation loop."""
 
+import errno
+import re
+import threading
+
 import numpy as np
 import pytest
 import torch
+import torch.utils.tensorboard
 
 import training.evaluation.errors
 import training.maps.optimise
@@ -71,3 +76,38 @@ def test_a_cap_ends_a_stage_and_counts_what_was_spent_before(tmp_path, monkeypat
     (tmp_path / f"other{checkpoints.SUFFIX}").write_bytes(b"half")
     with pytest.raises(ValueError, match="is damaged or of an older version, remove it"):
         training.maps.optimise.seconds_spent(tmp_path)
+
+
+class FullDisk:
+    """A writer of TensorBoard's whose thread and whose caller both meet a full disk."""
+
+    def __init__(self, folder):
+        pass
+
+    def __enter__(self):
+        for error in (OSError(errno.ENOSPC, "No space left on device"), ValueError("of something else")):
+            thread = threading.Thread(target=self.fail, args=(error,))
+            thread.start()
+            thread.join()
+        self.fail(OSError(errno.ENOSPC, "No space left on device"))
+
+    def __exit__(self, *arguments):
+        pass
+
+    def fail(self, error):
+        raise error
+
+
+def test_a_disk_that_is_full_of_scalars_is_told_once(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(threading, "excepthook", seen.append)
+    hook = threading.excepthook
+    monkeypatch.setattr(torch.utils.tensorboard, "SummaryWriter", FullDisk)
+    with (
+        pytest.raises(OSError, match=re.escape(f"No space left on device: '{tmp_path}'")),
+        training.maps.optimise.log_to(tmp_path),
+    ):
+        raise AssertionError
+    (failed,) = seen
+    assert str(failed.exc_value) == "of something else"
+    assert threading.excepthook == hook

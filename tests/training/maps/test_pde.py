@@ -1,14 +1,17 @@
 """The equation of the forward map on tensors, where derivatives and solutions are known."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
 import torch
 from conftest import random_artifact
+from kinked_systems import SYSTEMS as KINKED
 from linear_system import C, F, Oscillator, sylvester
+from wrong_systems import Branching, Flat, Late
 
-from kkl_gym import get_system
+from kkl_gym import EquationError, get_system
 from kkl_gym.system import on_states
 from observers import ForwardMap
 from training.maps.forward import ForwardProblem
@@ -17,6 +20,7 @@ from training.maps.pde import along, on_tensors, residual
 from training.maps.scaling import StateScale
 from training.maps.smooth import Smooth, encoder
 from training.maps.smooth import residual as residual_of
+from training.trajectories.derivatives import evaluate, jacobian
 
 A, B = torch.diag(torch.tensor([-1.0, -2.5, -4.0], dtype=torch.float64)), torch.ones(3, 1, dtype=torch.float64)
 
@@ -25,15 +29,41 @@ def points(system, n=20):
     return torch.as_tensor(np.random.default_rng(0).uniform(*system.box(), (n, system.nx)))
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
-def test_equations_on_tensors_are_those_on_arrays(name):
-    system = get_system(name)
+@pytest.mark.parametrize("system", ["reverse_duffing", "van_der_pol", "rossler", "lorenz", *KINKED], ids=str)
+def test_equations_on_tensors_are_those_on_arrays(system):
+    system = get_system(system)
     x = points(system)
     for equations in (system.f, system.h):
         np.testing.assert_allclose(on_tensors(equations, x).numpy(), on_states(equations, x.numpy()), rtol=1e-14)
     mixed = on_tensors(lambda x: (1.0, x[0], 2), x.float())
     assert mixed.dtype == torch.float32
     np.testing.assert_array_equal(mixed.numpy(), np.stack([np.ones(20), x[:, 0].float(), np.full(20, 2.0)], 1))
+
+
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        (Late().f, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
+        (Branching().f, "; x held tensors of shape (4,), on which `if`, `and`, `or` and `not` cannot decide: use"),
+        (Flat().h, "; x held tensors of shape (4,): use kkl_gym.elementary.sin, which serves"),
+        (lambda x: (x[0], x[1].reshape(2, 2)), "of which [1] is of shape (2, 2), where the components of x have shape"),
+        (lambda x: (x[0], np.zeros(4)), "of which [1] is an array of shape (4,), of type ndarray"),
+        (lambda x: torch.complex(x[0], x[1])[None], "which is complex"),
+    ],
+)
+def test_equations_that_take_no_tensors_are_named(equations, message):
+    with pytest.raises(EquationError, match=re.escape(message)):
+        on_tensors(equations, torch.zeros(4, 2, requires_grad=True))
+
+
+@pytest.mark.parametrize("system", KINKED, ids=str)
+def test_gradients_of_tensors_are_the_derivatives_of_symbols(system):
+    x = points(system).requires_grad_()
+    for equations in (system.f, system.h):
+        expected = evaluate(jacobian(equations, system.nx), x.detach().numpy())
+        for i, component in enumerate(on_tensors(equations, x).T):
+            (slope,) = torch.autograd.grad(component.sum(), x, retain_graph=True, materialize_grads=True)
+            np.testing.assert_allclose(slope.numpy(), expected[:, i], rtol=1e-12, atol=1e-14)
 
 
 def test_derivatives_along_a_field_are_those_by_hand():

@@ -1,16 +1,21 @@
 """What differentiating a system's equations gives."""
 
+import re
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import pytest
+import sympy
+from kinked_systems import SYSTEMS as KINKED
 from linear_system import Oscillator
+from wrong_systems import Branching, Flat, Late, Wide
 
-from kkl_gym import SYSTEMS, get_system
+from kkl_gym import SYSTEMS, EquationError, elementary, get_system
 from kkl_gym.elementary import sin
 from kkl_gym.simulate import simulate
-from training.trajectories.derivatives import jacobian, output_matrix, with_sensitivity
+from kkl_gym.system import on_states
+from training.trajectories.derivatives import evaluate, jacobian, output_matrix, with_sensitivity
 
 
 def test_output_matrix_of_linear_and_other_outputs():
@@ -23,6 +28,50 @@ def test_output_matrix_of_linear_and_other_outputs():
 
     np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
     assert output_matrix(Squared()) is None
+
+
+@pytest.mark.parametrize("system", KINKED, ids=str)
+def test_derivatives_of_kinked_equations(system):
+    x, eps = np.random.default_rng(0).uniform(*system.box(2), (200, system.nx)), 1e-7
+    for equations in (system.f, system.h):
+        exact = evaluate(jacobian(equations, system.nx), x)
+        for j in range(system.nx):
+            step = eps * np.eye(system.nx)[j]
+            difference = (on_states(equations, x + step) - on_states(equations, x - step)) / (2 * eps)
+            np.testing.assert_allclose(exact[..., j], difference, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("equation", "at", "slope"),
+    [
+        (lambda x: abs(x), [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]),
+        (lambda x: abs(x) ** 0.5 * elementary.sign(x), [-4.0, 4.0], [0.25, 0.25]),
+        (lambda x: abs(elementary.sqrt(x) - 1.0), [0.25, 4.0], [-1.0, 0.25]),
+        (lambda x: elementary.sign(elementary.sqrt(x) - 1.0) * x, [0.25, 4.0], [-1.0, 1.0]),
+        (lambda x: elementary.sign(x), [-1.0, 0.0, 1.0], [0.0, 0.0, 0.0]),
+        (lambda x: elementary.maximum(x, 1.0), [0.0, 1.0, 2.0], [0.0, 0.5, 1.0]),
+        (lambda x: elementary.clip(x * x, 1.0, 4.0), [0.5, 1.5, 3.0], [0.0, 3.0, 0.0]),
+        (lambda x: elementary.maximum(elementary.minimum(x, 2.0), 2.0 * x - 3.0), [1.0, 2.25, 3.0], [1.0, 0.0, 2.0]),
+        (lambda x: elementary.where(x > 0, elementary.log(x), -x), [-1.0, 2.0], [-1.0, 0.5]),
+        (lambda x: elementary.where(abs(x) > 1.0, x * x, 0.0), [-2.0, 0.5, 2.0], [-4.0, 0.0, 4.0]),
+        (lambda x: (x * x) % 2.0, [1.0, 2.2], [2.0, 4.4]),
+        (lambda x: x * (x // 1.0), [1.5, 2.5], [1.0, 2.0]),
+        (lambda x: 1.0, [1.5, 2.5], [0.0, 0.0]),
+    ],
+)  # fmt: skip
+def test_derivatives_at_kinks_and_jumps(equation, at, slope):
+    found = evaluate(jacobian(lambda x: (equation(x[0]),), 1), np.array(at)[:, None])
+    np.testing.assert_allclose(found[:, 0, 0], slope, rtol=1e-14)
+    for one, expected in zip(at, slope, strict=True):  # and on single states
+        assert evaluate(jacobian(lambda x: (equation(x[0]),), 1), np.array([one]))[0, 0] == pytest.approx(expected)
+
+
+def test_what_sympy_cannot_differentiate_is_named():
+    def rounded(x):
+        return x[0], sympy.ceiling(x[0])
+
+    with pytest.raises(ValueError, match=r"component 1 of rounded\(x\) has no derivative .* knows: ceiling\(x0\)"):
+        jacobian(rounded, 1)
 
 
 class Steered(Oscillator):
@@ -48,6 +97,22 @@ def test_sensitivity_is_the_derivative_of_the_flow(system):
         np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
 
 
-def test_equations_that_take_no_symbols_are_named():
-    with pytest.raises(ValueError, match=r"x held sympy symbols: use kkl_gym\.elementary\.sin"):
-        jacobian(lambda x: (np.sin(x[0]),), 2)
+@pytest.mark.parametrize(
+    ("equations", "message"),
+    [
+        (Late().f, "(`return x[1], -math.sin(x[0])`): TypeError: "),
+        (
+            Late().f,
+            "; x held sympy symbols: use kkl_gym.elementary.sin, which serves floats, arrays, tensors and symbols",
+        ),
+        (Branching().f, "(`if x[0] > 0:`): TypeError: cannot determine truth value of Relational: x0 > 0; x held"),
+        (Branching().f, "use kkl_gym.elementary.where, minimum, maximum or clip, and combine conditions by & and |"),
+        (Wide().f, "must return 2 components, one for each state; it returned 3 of them"),
+        (Flat().f, "of which [0] is x1 > 0, which is no number: use kkl_gym.elementary.where(x1 > 0, 1.0, 0.0)"),
+        (Flat().h, "(`return x[0], np.sin(x[0])`): TypeError: "),
+        (lambda x: (np.where(np.equal(x[0], 0), 0.0, x[0]),), "equations of symbols take kkl_gym.elementary"),
+    ],
+)
+def test_equations_that_take_no_symbols_are_named(equations, message):
+    with pytest.raises(EquationError, match=re.escape(message)):
+        jacobian(equations, 2)

@@ -1,6 +1,7 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
+from observers.checks import noise_levels
 from training.config import current_names
 from training.evaluation.certificates.forward import Forward, Inverse, certify_forward, squared
 from training.evaluation.certificates.gains import controllability, h2, h_infinity, noise_variance, theorem_gain
@@ -18,9 +20,13 @@ from training.evaluation.certificates.generalisation import (
 )
 from training.evaluation.certificates.lipschitz import lipschitz_lower, lipschitz_upper, norm_product, output_lipschitz
 from training.evaluation.certificates.settled import TRUNCATED, SettledTrajectories, record_settled
+from training.evaluation.levels import Level, level_for
+from training.evaluation.metrics import nrmse
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
+
+WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 
 @dataclass(frozen=True)
@@ -33,9 +39,9 @@ class Certificate:
         Its name.
     system : str
         The name of what it observes.
-    measurement_noise : float
-        Standard deviation of the Gaussian noise on y.
-    noise_bound : float
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the Gaussian noise on y, of all outputs or each.
+    noise_bound : float or tuple of float, length ny
         Where that noise is cut for the theorems.
     process_noise_bound : float
         Bound of |w| in units of the state per second; w is uniform in a box and held over each sample.
@@ -48,6 +54,9 @@ class Certificate:
         from.
     noisy_error : float
         The same with v and w.
+    nrmse, noisy_nrmse : tuple of float, length nx
+        The roots of both for each state by itself, in percent of its standard deviation along the motion; NaN for a
+        state that does not move.
     lipschitz_lower : float
         Largest spectral norm of T_inv's Jacobian along the trajectories.
     lipschitz_at : tuple of float, length of the filter's state
@@ -63,7 +72,8 @@ class Certificate:
     gain_theorem, gain_h_infinity, gain_h2 : float
         Of the filter from noise to z, see :mod:`training.evaluation.certificates.gains`.
     noise_term : float
-        What the theorem adds for noise, 2 l^2 gain^2 (l_h psi + sqrt(ny) v)^2, as printed.
+        What the theorem adds for noise, 2 l^2 gain^2 (l_h psi + |v|)^2, as printed; |v| is the norm of all outputs'
+        bounds, sqrt(ny) v where they are the same.
     predicted_noise_error : float
         Rms of what measurement noise alone does to the estimate, from the stationary covariance through the Jacobian.
     measured_noise_error : float
@@ -80,13 +90,15 @@ class Certificate:
 
     observer: str
     system: str
-    measurement_noise: float
-    noise_bound: float
+    measurement_noise: Level
+    noise_bound: Level
     process_noise_bound: float
     psi: float
     samples: int
     error: float
     noisy_error: float
+    nrmse: tuple[float, ...]
+    noisy_nrmse: tuple[float, ...]
     lipschitz_lower: float
     lipschitz_at: tuple[float, ...]
     lipschitz_upper: float
@@ -113,7 +125,7 @@ def certify(
     artifact: Artifact,
     system: System,
     *,
-    measurement_noise: float = 0.5,
+    measurement_noise: Level | None = None,
     process_noise: float | None = None,
     psi: float | None = None,
     trajectories: int = 200,
@@ -122,6 +134,7 @@ def certify(
     name: str = "",
     policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
     """Say how far an observer is to be trusted, on samples that its training never saw.
 
@@ -131,8 +144,9 @@ def certify(
         The observer.
     system : System
         What it was made for, without input unless there is a policy.
-    measurement_noise : float, default 0.5
-        Standard deviation of v; the theorems are about the same noise, cut at three of these.
+    measurement_noise : float or sequence of float, length ny, optional
+        Standard deviation of v, of all outputs or each; by default the system's own, as far as the map knows it. The
+        theorems are about the same noise, cut at three of these.
     process_noise : float, optional
         Bound of w in multiples of the system's scale per second; by default the system's own.
     psi : float, optional
@@ -151,6 +165,8 @@ def certify(
         Acts on the system, for maps that were trained under one, see :func:`record_settled`.
     recorded : SettledTrajectories, optional
         What :func:`record_settled` returned for the same of all these, if it is there already.
+    report : callable, optional
+        Told how many of the :func:`parts` of the work are done.
 
     Returns
     -------
@@ -174,38 +190,45 @@ def certify(
         raise ValueError(f"trajectories and seed must be integers, at least 2 and 0; got {trajectories!r}, {seed!r}")
     if not 0 < delta < 1:
         raise ValueError(f"delta must lie between 0 and 1, got {delta!r}")
-    KKLObserver(artifact, measurement_noise)  # refuses a noise level that the map does not know
-    noise = {"measurement_noise": measurement_noise, "process_noise": process_noise}
+    level = level_for(artifact, system, measurement_noise)
+    KKLObserver(artifact, level)  # refuses a noise level that the map does not know
+    noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
+    report(1)
     measured, sample = recorded.halves()
     told = decoder(artifact, **noise)
     lower, at = lipschitz_lower(told, recorded.z)
+    report(2)
     upper = lipschitz_upper(told)
+    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
         free = told  # a map that is not told the noise is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
     l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
-    noise_bound = TRUNCATED * measurement_noise
+    noise_bound = np.multiply(TRUNCATED, np.broadcast_to(level, system.ny))
     if psi is None:
         everywhere = np.concatenate([recorded.x, recorded.noisy_x])
         psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
-    noise_error = upper * gain * (l_h * psi + math.sqrt(system.ny) * noise_bound)
-    losses = squared(measured.x - free(measured.z))
+    noise_error = upper * gain * (l_h * psi + math.hypot(*noise_bound))
+    x_hat, noisy_x_hat = free(measured.z), told(measured.noisy_z)
+    losses = squared(measured.x - x_hat)
     samples = inverse_samples(artifact.training)
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
     return Certificate(
         observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
         system=system.name,
-        measurement_noise=measurement_noise,
-        noise_bound=noise_bound,
+        measurement_noise=level,
+        noise_bound=noise_levels("noise_bound", noise_bound, system.ny),
         process_noise_bound=process_noise * float(np.linalg.norm(system.scale)),
         psi=psi,
         samples=len(recorded.x),
         error=float(losses.mean()),
-        noisy_error=float(squared(measured.noisy_x - told(measured.noisy_z)).mean()),
+        noisy_error=float(squared(measured.noisy_x - noisy_x_hat).mean()),
+        nrmse=_nrmse(measured.x, x_hat),
+        noisy_nrmse=_nrmse(measured.noisy_x, noisy_x_hat),
         lipschitz_lower=lower,
         lipschitz_at=tuple(at.tolist()),
         lipschitz_upper=upper,
@@ -234,8 +257,19 @@ def certify(
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
+            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
+
+
+def parts(artifact: Artifact) -> int:
+    """Number of parts, of about the same length, that the work of :func:`certify` has."""
+    return WITHOUT_T if artifact.forward is None else WITH_T
+
+
+def _nrmse(x: np.ndarray, x_hat: np.ndarray) -> tuple[float, ...]:
+    """Of each state over all samples (n, nx), in percent."""
+    return tuple(nrmse(x[:, None], x_hat[:, None])[0].tolist())
 
 
 def _plain(value: Any) -> Any:

@@ -1,7 +1,7 @@
 """What a learned T allows to say: its risks, its residual, what stands in the way of T_inv, and the paper's bounds."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from training.evaluation.certificates.settled import SettledTrajectories
 from training.maps.smooth import Smooth, encoder, residual
 
 QUANTILES = (0.5, 0.9, 0.99, 1.0)
-AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s, at which the envelope of the start is reported
+AGES = (0.0, 1.0, 2.0, 5.0, 10.0)  # s at the pace of the shipped systems, at which the envelope is reported
 SEGMENTS = 400  # recorded states at which T_inv is bounded between T(x) and z
 DRAWN = 20_000  # states in X
 
@@ -78,8 +78,8 @@ class Forward:
         The noise-free theorem with l(x) in place of l, R_T in place of R_1, and no squares of sums,
         (sqrt(R_2) + sqrt(steep_risk))^2.
     sharp_noisy_bound : float
-        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + sqrt(ny) v))^2; s is the root
-        of the sharp bound of the T_inv that is told the noise.
+        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + |v|))^2; s is the root of the
+        sharp bound of the T_inv that is told the noise.
     """
 
     forward_risk: float
@@ -125,6 +125,7 @@ def certify_forward(
     error: float,
     delta: float,
     rng: np.random.Generator,
+    report: Callable[[float], object] = lambda share: None,
 ) -> Forward | None:
     """Say what a learned T allows to say.
 
@@ -139,7 +140,7 @@ def certify_forward(
     told, noise_free : Inverse
         T_inv that is told the noise, and that there is none.
     noise_error : float
-        Most that noise and psi can do to the estimate through z, l gain (l_h psi + sqrt(ny) v).
+        Most that noise and psi can do to the estimate through z, l gain (l_h psi + |v|).
     psi : float
         Bound of how far process noise moves the state.
     error : float
@@ -148,6 +149,8 @@ def certify_forward(
         Probability with which the generalisation term may fail.
     rng : Generator
         Of the states drawn in X.
+    report : callable, optional
+        Told the share of the work that is done.
 
     Returns
     -------
@@ -167,21 +170,27 @@ def certify_forward(
     dimension, samples = pseudo_dimension_bound(artifact.forward.mlp), forward_samples(artifact.training)
     largest = float(data_losses.max()) + weight * float(size.max()) ** 2
 
+    same = told.T_inv is noise_free.T_inv
+
     def sharp(used: Inverse) -> tuple[float, float, float, float]:
+        first = 0.0 if used is noise_free else 0.5
         some = np.linspace(0, len(z) - 1, min(SEGMENTS, len(z))).astype(int)
-        between = np.minimum(segment_lipschitz(used.T_inv, images[some], z[some]), used.lipschitz)
+        found = segment_lipschitz(
+            used.T_inv, images[some], z[some], lambda share: report(first + share / (1 if same else 2))
+        )
+        between = np.minimum(found, used.lipschitz)
         reconstruction = float(squared(recorded.x - used.T_inv(images)).mean())
         steep = float((between**2 * data_losses[some]).mean())
         return reconstruction, float(between.max()), steep, (math.sqrt(reconstruction) + math.sqrt(steep)) ** 2
 
     reconstruction_risk, lipschitz_between, steep_risk, sharp_bound = sharp(noise_free)
-    same = told.T_inv is noise_free.T_inv
     told_reconstruction, _, _, told_sharp = (reconstruction_risk, 0.0, 0.0, sharp_bound) if same else sharp(told)
     forward_part = 2 * noise_free.lipschitz**2 * physics_risk
     total = 2 * reconstruction_risk + forward_part
     told_bound = 2 * (2 * told_reconstruction + 2 * told.lipschitz**2 * physics_risk)
     start_error = float(np.sqrt(squared(linear.start(system.output(x)) - T(x)).max()))
-    left = envelope(linear, np.array(AGES), start=start_error)
+    ages = system.pace * np.array(AGES)
+    left = envelope(linear, ages, start=start_error)
     added = noise_free.lipschitz * float(left[0])  # at first; it then decays with the slowest mode
     return Forward(
         forward_risk=forward_risk,
@@ -198,7 +207,7 @@ def certify_forward(
         forward_dimension=dimension,
         forward_term=generalisation_term(largest, pseudo_dimension=dimension, samples=samples, delta=delta),
         start_error=start_error,
-        envelope=dict(zip(AGES, left.tolist(), strict=True)),
+        envelope=dict(zip(ages.tolist(), left.tolist(), strict=True)),
         forgets_start=max(0.0, math.log(added / math.sqrt(error)) / slowest(linear)) if added * error > 0 else math.inf,
         bound=2 * total,
         forward_share=forward_part / total if total > 0 else math.nan,

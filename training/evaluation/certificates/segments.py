@@ -1,5 +1,7 @@
 """Lipschitz constants of a network along straight lines, from above: how steep T_inv is where T is wrong."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from observers.network import ACTIVATIONS
@@ -13,7 +15,9 @@ _STEEPEST = 2.39936  # where x sigmoid(x) is at its steepest, and its negative w
 _NEAR = 1e-5  # within which a place counts as the steepest
 
 
-def segment_lipschitz(network: Smooth, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def segment_lipschitz(
+    network: Smooth, start: np.ndarray, end: np.ndarray, report: Callable[[float], object] = lambda share: None
+) -> np.ndarray:
     """Bound a network's Lipschitz constant from above along each of some line segments.
 
     Parameters
@@ -22,6 +26,8 @@ def segment_lipschitz(network: Smooth, start: np.ndarray, end: np.ndarray) -> np
         The network.
     start, end : ndarray, shape (n, inputs)
         The segments' ends.
+    report : callable, optional
+        Told the share of the segments that are done.
 
     Returns
     -------
@@ -45,6 +51,7 @@ def segment_lipschitz(network: Smooth, start: np.ndarray, end: np.ndarray) -> np
         left, right, owner = start[~done], end[~done], np.tile(owner[~done], 2)
         centre = (left + right) / 2
         start, end = np.concatenate([left, centre]), np.concatenate([centre, right])
+        report(1.0 - len(np.unique(owner)) / len(found))
         if not len(owner):
             break
     return constants * (1.0 + 1e-9)  # for the rounding of the arithmetic

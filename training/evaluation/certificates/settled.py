@@ -8,13 +8,14 @@ import numpy as np
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Artifact
+from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise
 from training.trajectories.policy import under_policy
 
 SETTLED = 1e-4  # part of the filter's start that is left where recording begins
-RECORDED = 30.0  # seconds of each trajectory
+RECORDED = 30.0  # seconds of each trajectory, at the pace of the shipped systems
 EVERY = 10  # samples between recorded ones
 TRUNCATED = 3.0  # standard deviations at which Gaussian noise is cut, for theorems about bounded noise
 
@@ -62,7 +63,7 @@ def record_settled(
     artifact: Artifact,
     system: System,
     *,
-    measurement_noise: float,
+    measurement_noise: Level,
     process_noise: float,
     trajectories: int,
     seed: int,
@@ -76,8 +77,8 @@ def record_settled(
         The observer.
     system : System
         What it was made for.
-    measurement_noise : float
-        Standard deviation of v, which is cut at three of these.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of v, of all outputs or each, which is cut at three of these.
     process_noise : float
         Bound of w in multiples of the system's scale per second.
     trajectories : int
@@ -102,7 +103,7 @@ def record_settled(
     dt = linear.dt
     settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
     first = math.ceil(settled / dt)
-    steps = first + round(RECORDED / dt)
+    steps = first + round(RECORDED * system.pace / dt)
     ages = np.arange(first, steps + 1, EVERY)
     x0 = system.draw_starts(rng, trajectories)
 
@@ -123,7 +124,7 @@ def record_settled(
         )
     x, noisy_x, u, noisy_u = x[:, inside], noisy_x[:, inside], u[:, inside], noisy_u[:, inside]
     white = rng.standard_normal((*x.shape[:2], system.ny))
-    v = measurement_noise * np.clip(white, -TRUNCATED, TRUNCATED)
+    v = np.asarray(measurement_noise) * np.clip(white, -TRUNCATED, TRUNCATED)
 
     def one_by_one(values: np.ndarray) -> np.ndarray:
         return np.moveaxis(values, 0, 1).reshape(-1, values.shape[-1])

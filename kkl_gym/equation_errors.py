@@ -1,0 +1,149 @@
+"""What went wrong in the equations that a user wrote, in words: system, equation, file and line, argument, way out."""
+
+import inspect
+import reprlib
+import sys
+from collections.abc import Callable
+from numbers import Number, Real
+from types import CodeType, TracebackType
+from typing import Any
+
+import numpy as np
+
+from kkl_gym import elementary
+from kkl_gym.user_lines import called_function, line_of, path_of, steps_within
+
+_SERVING = "floats, arrays, tensors and symbols"
+_ALIASES = {
+    alias: name
+    for name, aliases in {
+        "maximum": ("max", "fmax", "amax", "Max"),
+        "minimum": ("min", "fmin", "amin", "Min"),
+        "abs": ("fabs", "absolute", "Abs"),
+        "atan2": ("arctan2",),
+        "clip": ("clamp",),
+    }.items()
+    for alias in aliases
+}
+
+Equations = Callable[..., Any]
+"""A system's f, g, h, rate or step, or another function of the state's components."""
+
+
+class EquationError(ValueError):
+    """A user's equations failed, or returned what they must not.
+
+    The message names the system, the equation, file and line, the argument and the way out. The exception that the
+    equations raised, if they raised one, is the cause.
+    """
+
+
+def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
+    """Say that equations raised an exception.
+
+    Parameters
+    ----------
+    error : Exception
+        What they raised.
+    equations : callable
+        Which they are.
+    *args
+        What they were given: the components of the state first.
+
+    Returns
+    -------
+    EquationError
+        To be raised from the exception.
+    """
+    what, x = f"{type(error).__name__}: {error}", args[0]
+    steps = steps_within(error, code_of(equations))
+    if not steps:
+        try:
+            inspect.signature(equations).bind(*args)
+        except TypeError:
+            return EquationError(f"{_defined(equations)} must be defined as {signature(equations, 'self, ')}: {what}")
+        return EquationError(f"{_defined(equations)} failed: {what}; {held(x)}")
+    frame = steps[0].tb_frame
+    local = frame.f_locals.get(next(iter(frame.f_code.co_varnames[1:2]), ""))
+    if isinstance(local, tuple | list | np.ndarray) and len(local) == len(x):
+        x = local  # where it failed, which need not be the start of a step
+    return EquationError(
+        f"{label(equations)} failed in {line_of(steps[-1])}: {what}; {held(x)}{_hint(error, steps[-1], x)}"
+    )
+
+
+def returned(equations: Equations, wanted: str, found: str) -> EquationError:
+    """Say that equations returned something else than they must."""
+    return EquationError(f"{_defined(equations)} must return {wanted}; it returned {found}")
+
+
+def label(equations: Equations) -> str:
+    """Name and argument of equations, and whose they are."""
+    system = getattr(getattr(equations, "__self__", None), "name", None)
+    return signature(equations) + ("" if system is None else f" of {system!r}")
+
+
+def signature(equations: Equations, first: str = "") -> str:
+    """Name and arguments of equations."""
+    return f"{name_of(equations)}({first}{'x, u' if name_of(equations) == 'step' else 'x'})"
+
+
+def name_of(equations: Equations) -> str:
+    """The name of a method, which may have been assigned from a function of another name."""
+    function, kind = getattr(equations, "__func__", None), type(getattr(equations, "__self__", None))
+    names = (name for name in ("f", "g", "h", "rate", "step") if function and getattr(kind, name, None) is function)
+    return next(names, getattr(equations, "__name__", "equations"))
+
+
+def code_of(equations: Equations) -> CodeType | None:
+    """The code of a function or method, if it is written in Python."""
+    return getattr(inspect.unwrap(getattr(equations, "__func__", equations)), "__code__", None)
+
+
+def held(x: Any) -> str:
+    """What the components of a state were."""
+    first = x[0]
+    for library, kind, plural in (("torch", "Tensor", "tensors"), ("numpy", "ndarray", "arrays")):
+        if is_of(library, kind, first):
+            return f"x held {plural} of shape {tuple(first.shape)}"
+    if is_of("sympy", "Basic", first):
+        return "x held sympy symbols"
+    shortened = [f"{value:.6g}" if isinstance(value, Number) else reprlib.repr(value) for value in x]
+    return f"x = ({', '.join(shortened)})"
+
+
+def shown(value: Any) -> str:
+    """A value, but of an array its shape."""
+    if isinstance(value, np.ndarray) or is_of("torch", "Tensor", value):
+        return f"an array of shape {tuple(value.shape)}" if value.ndim else repr(value.item())
+    return reprlib.repr(value)
+
+
+def is_of(library: str, kind: str, value: Any) -> bool:
+    """Whether a value is of a library's type, which then has been imported already."""
+    module = sys.modules.get(library)
+    return module is not None and isinstance(value, getattr(module, kind))
+
+
+def _defined(equations: Equations) -> str:
+    code = code_of(equations)
+    return label(equations) + ("" if code is None else f" ({path_of(code)}, line {code.co_firstlineno})")
+
+
+def _hint(error: Exception, step: TracebackType, x: Any) -> str:
+    on_floats = isinstance(x[0], Real)
+    name = called_function(step)
+    name = _ALIASES.get(name, name)
+    # On floats, math.sqrt(-1) fails; abs of the whole state, which is no number, does so for another reason.
+    if name in vars(elementary) and not name.startswith("_") and not (on_floats and isinstance(error, TypeError)):
+        return f": use kkl_gym.elementary.{name}, which serves {_SERVING}"
+    if "truth value" in str(error) or "Boolean value" in str(error):
+        return (
+            ", on which `if`, `and`, `or` and `not` cannot decide: use kkl_gym.elementary.where, minimum, maximum "
+            "or clip, and combine conditions by & and |"
+        )
+    if isinstance(error, IndexError) or "unpack" in str(error):
+        return f", {len(x)} of them"
+    if not on_floats and not isinstance(error, NameError | KeyError | ArithmeticError):
+        return f": equations take arithmetic and the functions of kkl_gym.elementary, which serve {_SERVING}"
+    return ""

@@ -1,0 +1,56 @@
+"""What is behind the id ``kkl_gym/Own-v0``: environments of a system that ``gym.make`` is told."""
+
+from typing import Any
+
+from kkl_gym.envs import KKLEnv
+from kkl_gym.vector import KKLVectorEnv
+
+OWN_ID = "kkl_gym/Own-v0"
+
+
+def single(**options: Any) -> KKLEnv:
+    """Make the environment of a system of the user's.
+
+    Parameters
+    ----------
+    **options
+        ``system``, and whatever else :class:`kkl_gym.KKLEnv` takes.
+
+    Returns
+    -------
+    KKLEnv
+        The environment.
+
+    Raises
+    ------
+    ValueError
+        Without a system, and as :class:`kkl_gym.KKLEnv`.
+    """
+    return KKLEnv(**_named(options))
+
+
+def vector(**options: Any) -> KKLVectorEnv:
+    """Make many environments of a system of the user's, as one batch.
+
+    Parameters
+    ----------
+    **options
+        ``system``, and whatever else :class:`kkl_gym.KKLVectorEnv` takes.
+
+    Returns
+    -------
+    KKLVectorEnv
+        The environments.
+
+    Raises
+    ------
+    ValueError
+        Without a system, and as :class:`kkl_gym.KKLVectorEnv`.
+    """
+    return KKLVectorEnv(**_named(options))
+
+
+def _named(options: dict[str, Any]) -> dict[str, Any]:
+    if options.get("system") is None:
+        raise ValueError(f'{OWN_ID} is for a system of yours: name it, as in system="script.py:Class"')
+    return options

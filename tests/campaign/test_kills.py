@@ -1,0 +1,295 @@
+"""Commands killed at random moments: nothing is damaged, and no more than a checkpoint interval is done again.
+
+KILLS says how many kills there are; without it a hundred. One in five is an interruption, Ctrl-C.
+"""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from observers import Artifact
+from observers.storage import UNFINISHED
+from training import checkpoints
+from training.agents.agent import Agent
+from training.agents.play import play
+from training.maps.optimise import LOG_EVERY
+
+pytestmark = pytest.mark.long
+
+KILLS = int(os.environ.get("KILLS", "100"))
+INTERRUPTIONS = 0.2  # of the kills
+ROOT = Path(__file__).parents[2]
+BATCHES = 1500  # of each stage
+
+# The command line with a checkpoint whenever there may be one, and a byte in a journal for each batch of a training of
+# maps, and for each step of the environments on which an agent learns.
+COMMAND = """
+import os, sys
+import training.cli
+
+journal, *arguments = sys.argv[1:]
+journal = os.open(journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+import_module = training.cli.import_module
+
+def import_and_watch(name):
+    module = import_module(name)
+    import training.agents.cost, training.checkpoints, training.maps.optimise
+
+    def counted(function):
+        def counting(*arguments, **options):
+            result = function(*arguments, **options)
+            os.write(journal, b".")
+            return result
+        return counting
+
+    def optimiser(*arguments):
+        made = make(*arguments)
+        made.step = counted(made.step)
+        return made
+
+    training.checkpoints.SECONDS = -1.0
+    training.agents.cost.Cost.step = counted(training.agents.cost.Cost.step)
+    make, training.maps.optimise._optimiser = training.maps.optimise._optimiser, optimiser
+    return module
+
+training.cli.import_module = import_and_watch
+training.cli.main(arguments)
+"""
+
+OWN = f"""
+import math
+from dataclasses import replace
+
+import torch
+
+from training.methods import Method
+
+
+class Line(Method):
+    name = "line"
+    label = "line"
+
+    def train(self, task, configuration):
+        line = torch.nn.Linear(1, task.system.nx)
+        with torch.no_grad():
+            line.weight.zero_(), line.bias.zero_()
+
+        def loss(generator):
+            y = torch.randn(64, 1, generator=generator)
+            return {{"loss": ((line(y) - y) ** 2).mean()}}
+
+        budget = replace(task.budget, steps={2 * BATCHES}, cpu_seconds=math.inf)
+        replace(task, budget=budget).fit("line", line, loss, 1e-3)
+        return {{name: tensor.detach().numpy().copy() for name, tensor in line.state_dict().items()}}
+
+    def observer(self, trained, system, dt, noise):
+        return Proportional(trained)
+
+
+class Proportional:
+    def __init__(self, trained):
+        self.trained = trained
+
+    def reset(self, y0):
+        return self.step(y0)
+
+    def step(self, y):
+        return y @ self.trained["weight"].T + self.trained["bias"]
+"""
+
+
+class Scenario(ABC):
+    """A command, what of its work has been kept at any time, and what it must lead to."""
+
+    interval: int
+    """Units of work between two checkpoints."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    @abstractmethod
+    def arguments(self, out):
+        """What follows ``kkl-gym``."""
+
+    @abstractmethod
+    def kept(self, out):
+        """Units of work that need not be done again; raises ValueError if a file is damaged."""
+
+    @abstractmethod
+    def result(self, out):
+        """What must be the same as without kills."""
+
+
+class Train(Scenario):
+    name = "train"
+    interval = LOG_EVERY
+
+    def arguments(self, out):
+        sizes = "--trajectories 20 --duration 5 --samples 30 --width 16 --depth 1 --batch 128"
+        steps = ["--inverse-steps", str(BATCHES), "--no-monitor", "--resume", "--out", str(out)]
+        return ["train", "van_der_pol", *sizes.split(), *steps]
+
+    def kept(self, out):
+        if (out / "van_der_pol.safetensors").exists():
+            Artifact.read(out / "van_der_pol.safetensors")
+        if (out / "config.json").exists():
+            json.loads((out / "config.json").read_text())
+        return sum(checkpoints.load(path)["step"] for path in out.glob(f"[!.]*{checkpoints.SUFFIX}"))
+
+    def result(self, out):
+        artifact = Artifact.read(out / "van_der_pol.safetensors")
+        history = {key: value for key, value in artifact.training.items() if key not in ("seconds", "resumed")}
+        maps = (artifact.inverse, artifact.free_inverse)
+        weights = [array.tobytes() for found in maps for array in (*found.mlp.weights, *found.mlp.biases, found.whiten)]
+        return history, weights, (out / "report.png").stat().st_size > 10_000
+
+
+class TrainAgent(Scenario):
+    name = "agent"
+    interval = 32  # steps of its environments
+    rollouts = 4
+
+    def arguments(self, out):
+        timesteps = str(self.rollouts * 256 * self.interval)
+        options = ["--information", "y", "--timesteps", timesteps, "--resume", "--out", str(out)]
+        return ["agent", "train", "lorenz", *options]
+
+    def kept(self, out):
+        path = out / f"agent{checkpoints.SUFFIX}"
+        if (out / "agent.safetensors").exists():
+            Agent.read(out / "agent.safetensors")
+        return checkpoints.load(path)["counters"][0] // 256 if path.exists() else 0
+
+    def result(self, out):
+        """Agents that went on are others, of the same training."""
+        agent = Agent.read(out / "agent.safetensors")
+        assert np.isfinite(play(agent.make(2), agent, steps=20, seed=0).x).all()
+        seen = pd.read_csv(out / "progress.csv")["time/total_timesteps"].tolist()
+        return {key: value for key, value in agent.training.items() if key != "resumed"}, seen
+
+
+class Benchmark(Scenario):
+    name = "benchmark"
+    interval = LOG_EVERY
+
+    def arguments(self, out):
+        script = self.folder / "line.py"
+        script.write_text(OWN)
+        options = ["--quick", "--systems", "van_der_pol", "--methods", f"{script}:Line", "--jobs", "1"]
+        return ["benchmark", *options, "--out", str(out)]
+
+    def kept(self, out):
+        folder = out / "jobs" / "van_der_pol" / "line"
+        for path in (*out.rglob("[!.]*.json"), *out.rglob("[!.]*.csv")):
+            (json.loads if path.suffix == ".json" else str)(path.read_text())
+        if (folder / "trained.safetensors").exists():
+            return 2 * BATCHES
+        path = folder / "trained" / f"line{checkpoints.SUFFIX}"
+        return checkpoints.load(path)["step"] if path.exists() else 0
+
+    def result(self, out):
+        return (out / "results.csv").read_text(), sorted(path.name for path in out.glob("*.*"))
+
+
+class Campaign:
+    """Kills of one scenario, and what they did."""
+
+    def __init__(self, scenario, folder, rng):
+        self.scenario, self.folder, self.rng, self.counts = scenario, folder, rng, Counter()
+        self.problems, self.runs = [], 0
+        began = time.monotonic()
+        self.run(folder / "whole", None, None)
+        self.seconds = time.monotonic() - began
+        self.expected = scenario.result(folder / "whole")
+
+    def run(self, out, signal_number, after):
+        """Start the command and kill it; returns whether it was, and the work that it did."""
+        self.runs += 1
+        journal = self.folder / f"journal-{self.runs}"
+        with subprocess.Popen(
+            [sys.executable, "-c", COMMAND, str(journal), *self.scenario.arguments(out)],
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as process:
+            while signal_number == signal.SIGINT and process.poll() is None and not journal.exists():
+                time.sleep(0.01)  # what Python itself says of an interruption at its beginning is not ours
+            try:
+                _, said = process.communicate(timeout=after)
+            except subprocess.TimeoutExpired:
+                process.send_signal(signal_number)
+                _, said = process.communicate(timeout=120.0)
+        killed = process.returncode != 0
+        if killed and (signal_number is None or process.returncode not in (-signal_number, 128 + signal_number)):
+            raise AssertionError(f"{self.scenario.name} ended by itself with {process.returncode}: {said}")
+        if killed and signal_number == signal.SIGINT:
+            killed = said != ""  # else all is done, and Python was on its way out
+            if killed and not (said.startswith("kkl-gym: interrupted") and said.count("\n") == 1):
+                self.problems.append(said)
+        return killed, journal.stat().st_size if journal.exists() else 0
+
+    def chain(self, out, kills):
+        """Kill and resume in one folder until the command is done or was killed so often; returns how often it was."""
+        done, kept = 0, 0
+        while True:
+            number = signal.SIGINT if self.rng.random() < INTERRUPTIONS else signal.SIGKILL
+            after = self.rng.uniform(0.0, self.seconds)
+            halves = set(out.rglob(f"{UNFINISHED}*"))
+            killed, work = self.run(out, number, after if done < kills else None)
+            if done:
+                self.counts["resumed"] += 1
+            if not killed:
+                break
+            done += 1
+            self.counts[number.name] += 1
+            if number == signal.SIGINT and set(out.rglob(f"{UNFINISHED}*")) - halves:
+                self.problems.append("an interruption left a temporary file")
+            try:
+                now = self.scenario.kept(out)
+            except ValueError as error:
+                self.counts["damaged"] += 1
+                self.problems.append(str(error))
+                break
+            lost = kept + work - now
+            self.counts["lost"] += lost
+            self.counts["lost more than one interval"] += lost > self.scenario.interval
+            kept = now
+        self.counts["ended otherwise"] += self.scenario.result(out) != self.expected
+        return done
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends signals")
+def test_kills(tmp_path):
+    shares, total = {Train: 0.4, TrainAgent: 0.3, Benchmark: 0.3}, Counter()
+    told, problems = [], []
+    for number, (kind, share) in enumerate(shares.items()):
+        folder = tmp_path / kind.name
+        folder.mkdir()
+        campaign, left, chains = Campaign(kind(folder), folder, random.Random(number)), max(1, round(share * KILLS)), 0
+        told.append(f"{kind.name} {left}")
+        while left:
+            left -= campaign.chain(folder / f"run-{chains}", left)
+            chains += 1
+        total += campaign.counts
+        problems += campaign.problems
+    names = ("resumed", "lost more than one interval", "damaged", "ended otherwise")
+    print(
+        f"\n{total['SIGKILL'] + total['SIGINT']} kills, {total['SIGINT']} of them interruptions: {', '.join(told)}; "
+        + ", ".join(f"{name} {total[name]}" for name in names)
+    )
+    assert not problems
+    assert total["resumed"] == total["SIGKILL"] + total["SIGINT"]
+    assert not any(total[name] for name in names[1:])

@@ -1,0 +1,54 @@
+"""Systems in discrete time."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from linear_system import F, Oscillator
+from scipy.linalg import expm
+
+from kkl_gym import System
+
+DT = 0.02
+PHI = expm(F * DT)
+GAMMA = np.linalg.solve(F, PHI - np.eye(2)) @ [0.0, 1.0]  # what an input does that is held over a sample
+
+
+@dataclass(frozen=True)
+class Sampled(System):
+    """The oscillator between samples, in closed form."""
+
+    name: ClassVar[str] = "sampled"
+    X: ClassVar = Oscillator.X
+    bounds: ClassVar = Oscillator.bounds
+    u_max: ClassVar = Oscillator.u_max
+    dt: ClassVar = DT
+
+    def step(self, x, u):
+        return [
+            float(row[0]) * x[0] + float(row[1]) * x[1] + float(gamma) * u[0]
+            for row, gamma in zip(PHI, GAMMA, strict=True)
+        ]
+
+    def h(self, x):
+        return (x[0],)
+
+
+@dataclass(frozen=True)
+class Henon(System):
+    """Henon's map with an input, chaotic: x1+ = 1 - a x1^2 + x2 + u, x2+ = b x1, y = x1."""
+
+    a: float = 1.4
+    b: float = 0.3
+
+    name: ClassVar[str] = "henon"
+    X: ClassVar = ((-0.5, 0.5), (-0.15, 0.15))
+    bounds: ClassVar = ((-3, 3), (-1, 1))
+    u_max: ClassVar = (0.02,)
+    dt: ClassVar = 1.0
+
+    def step(self, x, u):
+        return 1.0 - self.a * x[0] * x[0] + x[1] + u[0], self.b * x[0]
+
+    def h(self, x):
+        return (x[0],)

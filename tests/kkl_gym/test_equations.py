@@ -1,0 +1,372 @@
+"""Mistakes in a user's equations: each is said with system, equation, file, line and the way out."""
+
+import itertools
+import math
+import pickle
+import re
+import textwrap
+
+import numpy as np
+import pytest
+from wrong_systems import Branching, Late, Wide
+
+from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, get_system
+from kkl_gym.compiled import batch_step, compiled_step
+from kkl_gym.equations import components
+from kkl_gym.simulate import advance, advance_batch, simulate
+from kkl_gym.system import on_states
+
+HEAD = """
+import math
+import numpy as np
+from dataclasses import dataclass
+from kkl_gym import System, elementary
+
+def friction(v):
+    return math.tanh(v)
+
+@dataclass(frozen=True)
+class Tank(System):
+    k: float = 2.0
+
+    name = "tank"
+    X = ((0.5, 1.0), (-2.0, 2.0))
+    bounds = ((-9.0, 9.0), (-9.0, 9.0))
+    u_max = (1.0,)
+    G = ((0.0,), (1.0,))
+"""
+FROM_F, FROM_H = (
+    "must return 2 components, one for each state",
+    "must return its components in a sequence, as in (x[0],)",
+)
+FROM_G = "must return 2 rows, one for each state, of 1 components, one for each input"
+FROM_RATE, FINITE = "must return one number in 1/s for each state", "must return finite numbers within X"
+ALIKE = "must return for each state of a batch what it returns for that state alone, and always the same"
+SERVES = "which serves floats, arrays, tensors and symbols"
+NO_IF = "cannot decide: use kkl_gym.elementary.where, minimum, maximum or clip, and combine conditions by & and |"
+ARRAYS = "x held arrays of shape (5,)"
+
+
+@pytest.fixture
+def tank(tmp_path):
+    """tank(f=..., h=..., more=...) -> path of a script that defines such a system."""
+    numbers = itertools.count()
+
+    def write(f="x[1], -self.k * x[0]", h="(x[0],)", more="", head=HEAD):
+        path = tmp_path / f"tank{next(numbers)}.py"
+        methods = f"def f(self, x):\n    return {f}\n\ndef h(self, x):\n    return {h}\n\n{more}\n"
+        path.write_text(head + textwrap.indent(methods, "    "))
+        return path
+
+    return write
+
+
+def line_of(path, text):
+    """Number of the last line of a script that holds a text."""
+    return max(i for i, line in enumerate(path.read_text().splitlines(), 1) if text in line)
+
+
+def test_scripts_without_mistake(tank):
+    system = get_system(f"{tank()}:Tank")
+    assert system.nu == system.ny == 1
+    path = tank(f="np.array([x[1], x[0]])", h="[np.where(x[0] > 0, 1.0, 0.0), 1]", more="target = np.zeros(2)")
+    system = get_system(f"{path}:Tank")
+    assert system.ny == 2
+    assert system.target.shape == (2,)
+
+
+# What stands behind the return of f, and what is said of it.
+MOTIONS = [
+    ("(x[1] if x[0] > 0 else 0.0), x[0]", ["ValueError", ARRAYS, NO_IF]),
+    ("x[1], (x[0] > 0 and x[1] > 0) * 1.0", ["ValueError", ARRAYS, NO_IF]),
+    ("x[1], (0 < x[0] < 1) * 1.0", ["ValueError", ARRAYS, NO_IF]),
+    ("x[1], -math.sin(x[0])", ["TypeError", ARRAYS, f"use kkl_gym.elementary.sin, {SERVES}"]),
+    ("x[1], math.fabs(x[0])", [ARRAYS, f"use kkl_gym.elementary.abs, {SERVES}"]),
+    ("x[1], math.atan2(x[0], x[1])", [ARRAYS, f"use kkl_gym.elementary.atan2, {SERVES}"]),
+    ("x[1], max(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.maximum, {SERVES}"]),
+    ("x[1], min(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.minimum, {SERVES}"]),
+    ("x[1], float(x[0])", [ARRAYS, "equations take arithmetic and the functions of kkl_gym.elementary"]),
+    ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", f"use kkl_gym.elementary.sqrt, {SERVES}"]),
+    ("x[1], elementary.where(x[0], 1.0, 0.0)", ["where takes a comparison such as x[0] > 0"]),
+    ("x[1], elementary.sin('x')", ["sin takes floats, arrays, torch tensors and sympy expressions, not str"]),
+    ("x[1], self.kk * x[0]", ["AttributeError: 'Tank' object has no attribute 'kk'; x = ("]),
+    ("x[1], kk * x[0]", ["NameError: name 'kk' is not defined; x = ("]),
+    ("x[2], x[0]", ["IndexError", ", 2 of them"]),
+    ("(lambda a, b, c: a)(*x), x[0]", ["TypeError", "missing 1 required positional argument"]),
+    ("x[1], 1 / 0", ["ZeroDivisionError"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("f", "said"), MOTIONS)
+def test_an_equation_that_raises(tank, f, said):
+    path = tank(f=f)
+    with pytest.raises(EquationError) as raised:
+        get_system(f"{path}:Tank")
+    message = str(raised.value)
+    assert message.startswith(f"f(x) of 'tank' failed in {path}, line {line_of(path, f)} (`return {f}`): ")
+    assert all(text in message for text in said)
+    assert raised.value.__cause__ is not None
+    assert str(pickle.loads(pickle.dumps(raised.value))) == message  # as from worker processes
+
+
+# What stands behind the return of f or h, and what is said of it.
+RETURNED = [
+    ({"f": "x[1]"}, FROM_F, "it returned -"),
+    ({"f": "x[1], x[0], 0.0"}, FROM_F, "it returned 3 of them: ("),
+    ({"f": "(x[1],)"}, FROM_F, "it returned 1 of them: ("),
+    ({"f": "None"}, FROM_F, "it returned None"),
+    ({"f": "'ab'"}, FROM_F, "it returned 'ab'"),
+    ({"f": "{0: x[0], 1: x[1]}"}, FROM_F, "it returned {0: "),
+    ({"f": "{1.0, 2.0}"}, FROM_F, "it returned {1.0, 2.0}"),
+    ({"f": "(value for value in x)"}, FROM_F, "it returned <generator"),
+    ({"f": "x[0], 'b'"}, FROM_F, "of which [1] is 'b', of type str"),
+    ({"f": "x[0], None"}, FROM_F, "of which [1] is None, of type NoneType"),
+    ({"f": "x[0], [x[1]]"}, FROM_F, ", of type list"),
+    ({"f": "x[0], 1j * x[1]"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
+    ({"f": "x[0], (-x[0]) ** 0.5"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
+    ({"f": "x[0], np.zeros(3)"}, FROM_F, "of which [1] is of shape (3,), where the components of x have shape ()"),
+    ({"f": "np.zeros((2, 5))"}, FROM_F, "of which [0] is of shape (5,), where the components of x have shape ()"),
+    ({"f": "x[0], np.zeros(np.shape(x[0]), complex)"}, FROM_F, "which is complex"),
+    ({"f": "np.array([x[1], x[0]]).T"}, FROM_F, "it returned 5 of them: an array of shape (5, 2)"),
+    ({"f": "x[1], x[0] * np.ones(np.shape(x[0]) + (1,))"}, FROM_F, "where the components of x have shape ("),
+    ({"f": "x[1], math.nan"}, FINITE, ", nan]; x = ("),
+    ({"f": "x[1], 1e400 * x[0]"}, FINITE, ", inf]; x = ("),
+    ({"f": "x[1], np.sum(x)"}, ALIKE, "sum, max and norm mix states"),
+    ({"f": "x[1], np.linalg.norm(x)"}, ALIKE, "sum, max and norm mix states"),
+    ({"f": "x[1], np.random.default_rng().random()"}, ALIKE, "it returned ["),
+    ({"h": "x[0]"}, FROM_H, "it returned 0."),
+    ({"h": "np.array(x[0])"}, FROM_H, "it returned 0."),
+    ({"h": "()"}, FROM_H, "it returned 0 of them: ()"),
+    ({"h": "None"}, FROM_H, "it returned None"),
+    ({"h": "'y'"}, FROM_H, "it returned 'y'"),
+    ({"h": "[[x[0]]]"}, FROM_H, ", of type list"),
+    ({"h": "(math.inf,)"}, FINITE, "it returned [inf]"),
+]
+
+
+@pytest.mark.parametrize(("changes", "wanted", "found"), RETURNED)
+def test_an_equation_that_returns_something_else(tank, changes, wanted, found):
+    path, (name,) = tank(**changes), changes
+    with pytest.raises(EquationError, match=re.escape(found)) as raised:
+        get_system(f"{path}:Tank")
+    defined = f"{name}(x) of 'tank' ({path}, line {line_of(path, f'def {name}')}) "
+    assert str(raised.value).startswith(f"{defined}{wanted}")
+
+
+# Further definitions in the class, and what is said of them.
+DEFINITIONS = [
+    ("def f(x):\n return x", ["f(x) of 'tank' (", "must be defined as f(self, x): TypeError: Tank.f() takes 1"]),
+    ("def f(self, x, u):\n return x", ["must be defined as f(self, x): TypeError: Tank.f() missing 1"]),
+    ("def f(self, x):\n a, b, c = x\n return a, b", ["(`a, b, c = x`): ValueError: not enough values", ", 2 of them"]),
+    ("def f(self, x):\n x, y = x\n return y, math.sin(x)", ["(`return y, math.sin(x)`)", "use kkl_gym.elementary.sin"]),
+    ("def f(self, x):\n return (x[1],\n  math.exp(\n   x[0]))", ["(`math.exp(`)", ARRAYS, "kkl_gym.elementary.exp"]),
+    ("def f(self, x):\n return x[1], -friction(x[1])", ["(`return math.tanh(v)`)", "kkl_gym.elementary.tanh"]),
+    ("def g(self, x):\n return (0.0,),", [FROM_G, "it returned ((0.0,),)"]),
+    ("def g(self, x):\n return 0.0, 1.0", [FROM_G, "it returned 0.0"]),
+    ("def g(self, x):\n return (0.0, 1.0), (0.0, 1.0)", [FROM_G, "it returned 2 of them: (0.0, 1.0)"]),
+    ("def g(self, x):\n return np.eye(2)", [FROM_G, "it returned 2 of them: an array of shape (2,)"]),
+    ("def g(self, x):\n pass", [FROM_G, "it returned None"]),
+    ("def g(self, x):\n return (0.0,), (math.cos(x[0]),)", ["g(x) of 'tank' failed in", "use kkl_gym.elementary.cos"]),
+    ("def g(self, x):\n return (0.0,), (np.max(x[0]),)", ["g(x) of 'tank' (", ALIKE]),
+    ("def rate(self, x):\n return (1.0,)", [FROM_RATE, "it returned (1.0,), of type tuple"]),
+    ("def rate(self, x):\n pass", [FROM_RATE, "it returned None, of type NoneType"]),
+    ("def rate(self, x):\n return -1.0", [FINITE, ", not below zero; it returned [-1.0]"]),
+    ("def rate(self, x):\n return math.nan * x[0]", [FINITE, "it returned [nan]"]),
+    ("def rate(self, x):\n return max(1.0, x[0])", ["rate(x) of 'tank' failed in", "use kkl_gym.elementary.maximum"]),
+    ("def rate(self, x):\n return abs(x)", ["rate(x) of 'tank' failed in", "for abs(): 'tuple'; x = ("]),
+    ("dt = 0.1\ndef step(self, x, u):\n return x[0], x[1], u[0]", ["step(x, u) of 'tank' (", FROM_F, "3 of them"]),
+    ("dt = 0.1\ndef step(self, x):\n return x", ["must be defined as step(self, x, u): "]),
+    ("dt = 0.1\ndef step(self, x, u):\n return x[0], math.sin(x[1])", ["step(x, u) of 'tank' failed", "elementary"]),
+    ("def target(self):\n return 0.0, 0.0", ["target of 'tank' is a method: write @property above its def"]),
+    ("target = (0.0, 0.0, 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0"]),
+    ("target = 0.0", ["target of 'tank' must be 2 finite numbers, one for each state, got 0.0"]),
+    ("target = (0.0, math.nan)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0, nan)"]),
+    ("target = ('0', 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got ('0', 0.0)"]),
+    ("@property\ndef target(self):\n return self.kk, 0.0", ["target of 'tank' failed in", "(`return self.kk, 0.0`)"]),
+    ("def draw_starts(self, rng, n, factor=1.0):\n return rng.random(2)", ["shape (n, 2), got an array of shape (2,)"]),
+    ("def draw_starts(self, rng, n, factor=1.0):\n return [['a', 'b']] * n", ["must return an array of numbers"]),
+    ("def draw_starts(self, rng, n, factor=1.0):\n return 99 * np.ones((n, 2))", ["must stay within ((-9.0, 9.0), "]),
+    ("def draw_starts(self, rng, n):\n return rng.unifrom(n)", ["draw_starts(rng, n) of 'tank' failed in", "unifrom"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("definition", "said"), DEFINITIONS, ids=[definition for definition, _ in DEFINITIONS])
+def test_a_definition_that_is_wrong(tank, definition, said):
+    with pytest.raises(EquationError) as raised:
+        get_system(f"{tank(more=definition)}:Tank")
+    assert all(text in str(raised.value) for text in said)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("k: float = 2.0", "k: float", "Tank has no default for k: give one, or pass an instance"),
+        ("k: float = 2.0", "k: float = None", "parameter k of tank must be a finite number, got None"),
+        ("k: float = 2.0", "k: str = 'a'", "parameter k of tank must be a finite number, got 'a'"),
+        ("@dataclass(frozen=True)\n", "", "Tank has a parameter k, but lacks @dataclass(frozen=True)"),
+        ("(frozen=True)", "", "line 10 (`@dataclass`): TypeError: cannot inherit non-frozen dataclass"),
+        ("u_max = (1.0,)", "u_max = 1.0", "line 11 (`class Tank(System):`): TypeError: Tank: u_max = 1.0 must"),
+        ("import numpy", "import nunpy", "line 3 (`import nunpy as np`): ModuleNotFoundError: No module named 'nunpy'"),
+        ("import math", "import math; 1 / 0", "line 2 (`import math; 1 / 0`): ZeroDivisionError: division by zero"),
+        ("import math", "import math as (", "invalid syntax (tank0.py, line 2)"),
+        ("class Tank", "class Barrel", "tank0.py defines no Tank; it defines Barrel"),
+        ("class Tank(System)", "class Barrel", "tank0.py defines no Tank; it defines none"),
+    ],
+)  # fmt: skip
+def test_a_script_that_is_wrong(tank, old, new, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        get_system(f"{tank(head=HEAD.replace(old, new))}:Tank")
+
+
+def test_missing_equations(tank):
+    for i, name in enumerate("fh"):
+        path = tank()
+        path.write_text(path.read_text().replace(f"def {name}(", "def another("))
+        with pytest.raises(EquationError, match=rf"^Tank defines no {name}\(self, x\)$"):
+            get_system(f"{path}:Tank")
+        assert path.name == f"tank{i}.py"
+
+
+HERE = r"failed in tests/helpers/wrong_systems\.py, line \d+ \(`return x\[1\], -math\.sin\(x\[0\]\)`\): TypeError: "
+USE_SIN = r"use kkl_gym\.elementary\.sin, which serves floats, arrays, tensors and symbols"
+many = np.full((2, 7), 0.5)
+none = np.zeros((1, 7))
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Late().drift(many.T),
+        lambda: on_states(Late().f, many.T),
+        lambda: advance_batch(Late(), many, none, 0.0 * many, 0.01),
+        lambda: simulate(Late(), many.T, 3, 0.01),
+        lambda: batch_step(Late())(many, none, 0.0 * many, 0.01),
+        lambda: KKLVectorEnv(Late(), 3),
+    ],
+)
+def test_every_way_to_evaluate_arrays_says_where(call):
+    with pytest.raises(EquationError, match=rf"f\(x\) of 'late' {HERE}.* x held arrays of shape \(\d,\): {USE_SIN}"):
+        call()
+
+
+def test_outputs_say_where_too():
+    place = r"h\(x\) of 'late' failed in tests/helpers/wrong_systems\.py, line \d+ .*: use kkl_gym\.elementary\.cos"
+    with pytest.raises(EquationError, match=place):
+        Late().output(many.T)
+    assert Late().ny == 1
+
+
+def test_tracing_says_where():
+    pytest.importorskip("numba")
+    pytest.importorskip("sympy")
+    with pytest.raises(EquationError, match=rf"f\(x\) of 'late' {HERE}.*; x held sympy symbols: {USE_SIN}"):
+        compiled_step(Late())
+    assert re.match(rf"EquationError: f\(x\) of 'late' {HERE}", batch_step(Late()).obstacle)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        lambda: advance(Wide(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01),
+        lambda: advance_batch(Wide(), many, none, 0.0 * many, 0.01),
+        lambda: simulate(Wide(), many.T, 3, 0.01),
+    ],
+)
+def test_what_a_loop_cannot_take_is_looked_at_again(step):
+    with pytest.raises(EquationError, match=r"f\(x\) of 'wide' \(.*\) must return 2 components, .* 3 of them"):
+        step()
+
+
+def test_one_state_may_decide():
+    assert np.isfinite(advance(Branching(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01)).all()
+
+
+def test_what_is_not_the_equations_fault_stays_as_it_is():
+    with pytest.raises(ValueError, match="not enough values to unpack") as raised:
+        advance(Late(), (0.5, 0.5), (0.0,), (0.0,), 0.01)
+    assert raised.type is ValueError
+
+
+class Draining(Late):
+    """A tank that runs empty, after which its level is no number any more."""
+
+    name = "draining"
+
+    def f(self, x):
+        return -3.0 * self.root(x[0]), -x[1]
+
+    def root(self, level):
+        return level**0.5
+
+    def h(self, x):
+        return (x[0],)
+
+
+class Checked(Draining):
+    name = "checked"
+
+    def root(self, level):
+        return math.sqrt(level) if isinstance(level, float) else level**0.5
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (
+            Draining(),
+            r"f\(x\) of 'draining' \(.*\) must return real numbers; it returned complex ones on the way from x",
+        ),
+        (Checked(), r"f\(x\) of 'checked' failed in .*: ValueError: math domain error; x = \(-0.*elementary\.sqrt"),
+    ],
+)
+def test_steps_that_leave_the_real_numbers(system, message):
+    env = KKLEnv(system, measurement_noise=0.1, dt=0.1)
+    env.reset(seed=0, options={"x0": [0.01, 0.0]})
+    with pytest.raises(EquationError, match=message):
+        env.step(np.zeros(1))
+
+
+def test_outputs_that_leave_the_real_numbers():
+    class Rooted(Draining):
+        name = "rooted"
+
+        def f(self, x):
+            return -10.0 + 0.0 * x[0], 0.0 * x[1]
+
+        def h(self, x):
+            return (((x[0] + 4.0) ** 2 - 1.0) ** 0.5,)
+
+    env = KKLEnv(Rooted(), dt=0.1)
+    env.reset(seed=0, options={"x0": [-2.5, 0.0]})
+    with pytest.raises(EquationError, match=r"h\(x\) of 'rooted' .* must return its .*, which is complex: take"):
+        env.step(np.zeros(1))
+
+
+class Blinking(Draining):
+    """An output that is lost away from X, which a look at the bounds does not find."""
+
+    name = "blinking"
+
+    def f(self, x):
+        return 1.0 + 0.0 * x[0], 0.0 * x[1]
+
+    def h(self, x):
+        return (None if np.all((np.asarray(x[0]) > 1.5) & (np.asarray(x[0]) < 2.0)) else x[0],)
+
+
+@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking(), dt=0.6), lambda: KKLVectorEnv(Blinking(), 2, dt=0.6)])
+def test_outputs_that_fail_on_the_way(make):
+    env = make()
+    env.reset(seed=0, options={"x0": [1.0, 0.0]})
+    with pytest.raises(
+        EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which \[0\]"
+    ):
+        env.step(np.zeros(env.action_space.shape))
+
+
+def test_any_function_of_components():
+    assert components(lambda x: (x[0], 1), (0.5,)) == (0.5, 1)
+    with pytest.raises(EquationError, match=r"^<lambda>\(x\) \(tests/.*\) must return its components"):
+        components(lambda x: x[0], (0.5,))
+    with pytest.raises(EquationError, match=r"^sin\(x\) failed: TypeError: .*; x = \(0\.5\)$"):
+        components(math.sin, (0.5,))

@@ -1,0 +1,164 @@
+"""Plants of Gymnasium's classic control: an unstable one, and one on a circle."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from small_runs import toy
+
+import kkl_gym
+from kkl_gym.simulate import simulate
+from training import train
+from training.benchmark.protocol import run
+from training.cli import main
+from training.evaluation import calibration
+from training.evaluation.errors import NoStartsError, starts
+from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.trajectories.derivatives import with_sensitivity
+from training.tuning.probe import Probe
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
+PENDULUM = f"{EXAMPLES / 'circle_pendulum.py'}:CirclePendulum"
+SMALL = "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9"
+
+
+@pytest.fixture
+def pendulum():
+    return kkl_gym.get_system(PENDULUM)
+
+
+def derivative(system, x, u):
+    """f + g u at a single state."""
+    return [fi + row[0] * u for fi, row in zip(system.f(x), system.g(x), strict=True)]
+
+
+def test_cart_pole_is_gymnasiums():
+    system, env = kkl_gym.get_system(CART_POLE), gym.make("CartPole-v1").unwrapped
+    assert system.u_max == (env.force_mag,)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for action in (0, 1) * 10:
+        x = rng.uniform([-2, -2, -0.2, -2], [2, 2, 0.2, 2])
+        env.state = tuple(x)  # whose steps are Euler's
+        env.steps_beyond_terminated = None
+        env.step(action)
+        slope = (np.array(env.state) - x) / env.tau
+        np.testing.assert_allclose(derivative(system, x, (2 * action - 1) * env.force_mag), slope, rtol=1e-9, atol=1e-9)
+
+
+def test_the_circle_pendulum_is_gymnasiums(pendulum):
+    env = gym.make("Pendulum-v1").unwrapped
+    assert pendulum.u_max == (env.max_torque,)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        angle, rate, torque = rng.uniform([-np.pi, -4, -2], [np.pi, 4, 2])
+        env.state = np.array([angle, rate])
+        env.step(np.array([torque]))
+        x = np.cos(angle), np.sin(angle), rate
+        cosine, sine, acceleration = derivative(pendulum, x, torque)
+        assert acceleration == pytest.approx((env.state[1] - rate) / env.dt)
+        assert (cosine, sine) == pytest.approx((-rate * np.sin(angle), rate * np.cos(angle)))
+
+
+def test_motions_stay_on_the_circle(pendulum):
+    env = kkl_gym.KKLEnv(pendulum)
+    env.reset(seed=0)
+    for _ in range(500):
+        _, _, _, _, info = env.step(env.action_space.sample())
+    assert np.hypot(*info["x"][:2]) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_starts_beyond_x_are_on_the_circle_too(pendulum):
+    x = starts(pendulum, "2X", 100, np.random.default_rng(0))
+    np.testing.assert_allclose(np.hypot(x[:, 0], x[:, 1]), 1.0)
+    assert (np.abs(x[:, 2]) > 8).all()
+
+
+def test_starts_beyond_a_whole_circle_are_an_error(pendulum):
+    @dataclass(frozen=True)
+    class Rotor(kkl_gym.System):
+        name: ClassVar[str] = "rotor"
+        X: ClassVar = ((-1, 1), (-1, 1))
+        bounds: ClassVar = ((-1.5, 1.5), (-1.5, 1.5))
+
+        def draw_starts(self, rng, n, factor=1.0):
+            return pendulum.draw_starts(rng, n, factor)[:, :2]
+
+        def f(self, x):
+            return -x[1], x[0]
+
+        def h(self, x):
+            return (x[0],)
+
+    with pytest.raises(NoStartsError, match="rotor in 2X"):
+        starts(Rotor(), "2X", 1, np.random.default_rng(0))
+
+
+def test_what_is_known_of_a_start_on_the_circle(pendulum):
+    mean, covariance = unknown_start(pendulum)
+    np.testing.assert_allclose(mean, 0.0, atol=0.2)
+    np.testing.assert_allclose(covariance, np.diag([0.5, 0.5, 64 / 3]), atol=0.5)
+    x = simulate(pendulum, pendulum.draw_starts(np.random.default_rng(1), 5), 300, pendulum.dt)
+    y = pendulum.output(x) + 0.05 * np.random.default_rng(2).normal(size=(301, 5, 2))
+    for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter):
+        x_hat = run(kind(pendulum, pendulum.dt, Q=1e-6 * np.eye(3), R=0.05**2 * np.eye(2)), y)
+        assert np.sqrt(np.square(x_hat - x)[150:].mean((0, 1))) == pytest.approx(0, abs=0.2)
+
+
+def test_a_fixed_state_leaves_the_covariance_of_starts_positive(pendulum):
+    class Still(type(pendulum)):
+        name = "still"
+
+        def draw_starts(self, rng, n, factor=1.0):
+            return super().draw_starts(rng, n, factor) * [1.0, 1.0, 0.0]
+
+    assert (np.linalg.eigvalsh(unknown_start(Still())[1]) > 0).all()
+
+
+def test_modes_are_chosen_on_the_circle(pendulum):
+    probe = Probe(pendulum, dt=pendulum.dt, duration=5.0, motions=10)
+    np.testing.assert_allclose(np.hypot(probe.x[..., 0], probe.x[..., 1]), 1.0, atol=1e-5)
+    assert probe.choose(0.1, most=1)
+
+
+def test_sensitivity_under_an_input_matrix_that_depends_on_the_state():
+    system = kkl_gym.get_system(CART_POLE)
+    joint, x = with_sensitivity(system), np.array([[0.1, -0.2, 0.3, 0.5]])
+    u, step = np.full((50, 1, 1), 4.0), 1e-5
+    last = simulate(joint, np.hstack([x, np.eye(4).reshape(1, -1)]), 50, 0.01, u)[-1]
+    ends = simulate(system, np.concatenate([x + step * row for row in (*np.eye(4), *-np.eye(4))]), 50, 0.01,
+                    np.tile(u, (1, 8, 1)))[-1]  # fmt: skip
+    np.testing.assert_allclose(last[0, :4], simulate(system, x, 50, 0.01, u)[-1, 0], rtol=1e-9)
+    np.testing.assert_allclose(last[0, 4:].reshape(4, 4), ((ends[:4] - ends[4:]) / (2 * step)).T, rtol=1e-4, atol=1e-6)
+
+
+def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
+    main(["train", PENDULUM, *SMALL.split()])
+    assert "no limits" not in capsys.readouterr().out
+    path = "runs/circle_pendulum/circle_pendulum.safetensors"
+    sizes = {
+        "evaluate": "--trajectories 4 --duration 6 --noise 0 --csv errors.csv",
+        "certify": "--trajectories 4 --measurement-noise 0.1",
+        "faults": "--trajectories 4 --duration 6 --measurement-noise 0.1",
+    }
+    for command, small in sizes.items():
+        main([command, path, "--system", PENDULUM, *small.split()])
+    assert set(pd.read_csv("errors.csv").starts) == {"X", "2X \\ X"}
+
+
+def test_a_loop_is_closed_by_a_policy_where_there_is_no_regulator(tmp_path, pendulum):
+    (tmp_path / "mine.py").write_text("def turn(x):\n    return 0.0 * x[:, :1]\n")
+    config = toy(pendulum, inverse_steps=5, closed_loop_trajectories=10)
+    with pytest.raises(ValueError, match="policy of your own"):
+        train(pendulum, config, tmp_path / "a")
+    config = toy(pendulum, inverse_steps=5, closed_loop_trajectories=10, policy=f"{tmp_path / 'mine.py'}:turn")
+    assert list(train(pendulum, config, tmp_path / "b").losses) == ["inverse", "closed-loop"]

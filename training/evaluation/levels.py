@@ -1,0 +1,128 @@
+"""Levels of measurement noise: as people write them, and as far as a map knows them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers import Artifact
+from observers.checks import noise_levels
+
+Level = float | tuple[float, ...]  # standard deviation on each sample of y: of all outputs, or of each of them
+
+
+def read_level(text: str) -> Level:
+    """Read what :func:`show_level` writes, or a user.
+
+    Parameters
+    ----------
+    text : str
+        A number, or one for each output with commas between them.
+
+    Returns
+    -------
+    float or tuple of float
+        The level.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+    """
+    try:
+        levels = tuple(float(number) for number in text.split(","))
+    except ValueError:
+        raise ValueError(
+            f"{text!r} is no level of noise: write a number, or one for each output, as in 0.1,0.3"
+        ) from None
+    return levels[0] if len(levels) == 1 else levels
+
+
+def show_level(level: float | Sequence[float]) -> str:
+    """For tables and titles: ``0.5``, or ``0.1, 0.3`` where outputs have levels of their own."""
+    return ", ".join(f"{each:g}" for each in np.atleast_1d(level))
+
+
+def as_name(level: Level) -> str:
+    """For names of files and folders, without spaces: ``0.5``, or ``0.1-0.3``."""
+    return show_level(level).replace(", ", "-")
+
+
+def as_cell(level: Level) -> float | str:
+    """For CSV files: a number wherever there is but one."""
+    return show_level(level) if isinstance(level, tuple) else level
+
+
+def multiple(system: System, factor: float) -> Level:
+    """Return a multiple of a system's own level of measurement noise.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    factor : float
+        The multiple.
+
+    Returns
+    -------
+    float or tuple of float, length ny
+        The level, of all outputs or each.
+    """
+    return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
+
+
+def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
+    """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
+
+    A map that is told one level for all outputs gets the largest of those that are the system's own.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    given : float or sequence of float, length ny, optional
+        What is asked for.
+
+    Returns
+    -------
+    float or tuple of float, length ny
+        The level; a float if it is the same for all outputs.
+
+    Raises
+    ------
+    ValueError
+        If what is given is no level, or not one for each output.
+    """
+    if given is not None:
+        return noise_levels("measurement_noise", given, system.ny)
+    own = multiple(system, 1.0)
+    try:
+        return artifact.inverse.within(own)
+    except ValueError:
+        return artifact.inverse.within(float(np.max(own)))
+
+
+def beyond(artifact: Artifact, level: Level) -> str:
+    """Say why a map cannot be told a level of measurement noise.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    level : float or tuple of float, length ny
+        The level.
+
+    Returns
+    -------
+    str
+        The reason; empty if the map can.
+    """
+    try:
+        if artifact.inverse.within(level) == level:
+            return ""
+    except ValueError as error:
+        return str(error)
+    largest = show_level(artifact.inverse.measurement_noise_max)
+    return f"measurement noise {show_level(level)} is beyond the map's range, 0 to {largest}"
