@@ -20,6 +20,7 @@ from typing import Any, NoReturn
 
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
+    "check": ("check", "Check"),
     "train": ("train", "Train"),
     "evaluate": ("evaluate", "Evaluate"),
     "benchmark": ("benchmark", "Benchmark"),
