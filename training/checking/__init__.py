@@ -5,8 +5,9 @@ from typing import Any
 
 from numpy.linalg import LinAlgError
 
-from kkl_gym.simulate import RATE_STEP, SubstepsError, check_dt, check_duration, check_interval
+from kkl_gym.simulate import RATE_STEP, SubstepsError, check_duration, check_interval
 from kkl_gym.system import System
+from observers.checks import check_dt
 from training.checking import dynamics, equations, levels, observability
 from training.checking.finding import Finding, Verdict
 from training.checking.subject import Subject

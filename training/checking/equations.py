@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym import EquationError
 from kkl_gym.compiled import batch_step
-from kkl_gym.equations import EquationError, components, input_matrix, rate
+from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
 from training.checking.finding import Finding, Verdict, number, percent
 from training.checking.subject import Subject, of_bounds, of_X
@@ -169,7 +170,7 @@ def _everything(system: System) -> Evaluation:
         if system.discrete:
             return [*components(step, x), *components(system.h, x)]
         rows = [gij for row in input_matrix(system, x) for gij in row]
-        return [*components(system.f, x), *rows, *components(system.h, x), rate(system, x)]
+        return [*components(system.f, x), *rows, *components(system.h, x), rate_at(system, x)]
 
     return evaluation
 
