@@ -82,7 +82,7 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     assert [make.close() for make in (env, envs)] == [None, None]
 
 
-def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
+def test_unstable_plants_as_the_page_says(tmp_path, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
@@ -92,7 +92,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
         main([command, *rest, *SMALL[command].split(), *extra])
     with pytest.raises(SystemExit, match="--policy"):
         main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])
-    assert "runs/balance/report.png" in capsys.readouterr().out
+    assert Path("runs/balance/report.png").exists()
 
 
 def test_cart_pole(tmp_path, capsys):
