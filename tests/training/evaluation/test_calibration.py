@@ -7,7 +7,7 @@ import pytest
 from linear_system import Oscillator, exact_observer
 
 from observers import ArtifactError, KKLObserver
-from training.evaluation.calibration import WARM_UP, calibrate, sound_trajectories
+from training.evaluation.calibration import PARTS, WARM_UP, calibrate, sound_trajectories
 
 
 class Noiseless(Oscillator):
@@ -18,8 +18,9 @@ class Noiseless(Oscillator):
 
 
 def test_calibration_keeps_its_promise():
-    system = Noiseless()
-    calibrated = calibrate(exact_observer(), system, trajectories=600, duration=20.0)
+    system, told = Noiseless(), []
+    calibrated = calibrate(exact_observer(), system, trajectories=600, duration=20.0, report=told.append)
+    assert told == list(range(1, PARTS))
     found = calibrated.limits
     assert (np.diff(found.mean[1:, 0]) > 0).all()  # more noise, wider limits
     assert found.low[0] == 0.0
