@@ -1,6 +1,7 @@
 """Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if installed)."""
 
 from observers.artifact import Artifact, ArtifactError, ForwardMap, InverseMap, shipped
+from observers.expression import Expression
 from observers.filter import LinearFilter
 from observers.monitor import Limits, Monitor
 from observers.network import MLP
@@ -10,6 +11,7 @@ __all__ = [
     "MLP",
     "Artifact",
     "ArtifactError",
+    "Expression",
     "ForwardMap",
     "InverseMap",
     "KKLObserver",

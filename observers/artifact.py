@@ -15,14 +15,18 @@ from typing import Any
 import numpy as np
 
 from observers import storage
-from observers.checks import is_finite, shown
+from observers.checks import is_finite, noise_levels, shown
+from observers.expression import Expression
 from observers.filter import LinearFilter
 from observers.monitor import Limits
 from observers.network import MLP
 
-FORMATS = (1, 2)  # the second has maps that are told the process noise; the others are still written as the first
+# The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
+# each of several outputs; the others are still written as the first.
+FORMATS = (1, 2, 3)
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
+USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
 _HOLDS = {"y": "first-order", "u": "zero-order"}  # what the filter takes signals for between samples
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
@@ -98,12 +102,15 @@ class InverseMap:
 
     - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
       data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
-    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit);
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), for each output that has a level of its own;
     - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), the level being that of the
       environments, a multiple of the system's scale per second;
     - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
 
     The output is x_offset + x_scale * mlp(inputs).
+
+    A map for several outputs may be told a level for each: ``noise_gain`` then has a row for each output, whose squares
+    add up, and unit and largest level of the measurement noise are tuples. Other maps are told one level for all.
 
     Parameters
     ----------
@@ -115,14 +122,14 @@ class InverseMap:
         Mean of the filter's state.
     whiten : ndarray, shape (modes, size)
         The coordinates of the filter's state that the network sees.
-    noise_gain : ndarray, shape (modes,)
-        Standard deviation of each of them per unit of sigma_v.
+    noise_gain : ndarray, shape (modes,) or (ny, modes)
+        Standard deviation of each of them per unit of sigma_v, or of that of each of several outputs.
     x_offset, x_scale : ndarray, shape (nx,)
         Scaling of the estimate.
-    measurement_noise_unit : float, default 1
-        Standard deviation that counts as one.
-    measurement_noise_max : float, default inf
-        The largest sigma_v in training. A map without the feature takes any.
+    measurement_noise_unit : float or tuple of float, length ny, default 1
+        Standard deviation that counts as one; a tuple where ``noise_gain`` has rows, which a number becomes.
+    measurement_noise_max : float or tuple of float, length ny, default inf
+        The largest sigma_v in training, likewise. A map without the feature takes any.
     process_noise_unit : float, default 1
         Level of process noise that counts as one.
     process_noise_max : float, default inf
@@ -146,8 +153,8 @@ class InverseMap:
     noise_gain: np.ndarray
     x_offset: np.ndarray
     x_scale: np.ndarray
-    measurement_noise_unit: float = 1.0
-    measurement_noise_max: float = math.inf
+    measurement_noise_unit: float | tuple[float, ...] = 1.0
+    measurement_noise_max: float | tuple[float, ...] = math.inf
     process_noise_unit: float = 1.0
     process_noise_max: float = math.inf
     age_unit: float = 1.0
@@ -158,18 +165,25 @@ class InverseMap:
             raise ArtifactError(f"inverse features {self.features} are not an ordered selection of {FEATURES}")
         if self.features[0] != "z_y":
             raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
-        for name in _CONDITIONS:
-            unit, end = getattr(self, f"{name}_unit"), getattr(self, f"{name}_max")
-            if not is_finite(unit) or unit <= 0:
-                raise ArtifactError(f"{name}_unit must be a positive, finite number, got {unit!r}")
-            if name in self.features and (not is_finite(end) or end <= 0):
-                raise ArtifactError(f"{name}_max must be a positive, finite number for a map that is told, got {end!r}")
-            if end != math.inf and (not is_finite(end) or end < 0):
-                raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
         if self.whiten.ndim != 2:
             raise ArtifactError(f"whiten must have shape (modes, size), got {self.whiten.shape}")
         modes, size = self.whiten.shape
+        outputs = len(self.noise_gain) if self.noise_gain.ndim == 2 else 1
+        _check_shapes(self, {"noise_gain": (outputs, modes) if outputs > 1 else (modes,)})
+        for name in _CONDITIONS:
+            for unit in self._each(f"{name}_unit"):
+                if not is_finite(unit) or unit <= 0:
+                    raise ArtifactError(f"{name}_unit must be a positive, finite number, got {unit!r}")
+            for end in self._each(f"{name}_max"):
+                if name in self.features and (not is_finite(end) or end <= 0):
+                    raise ArtifactError(
+                        f"{name}_max must be a positive, finite number for a map that is told, got {end!r}"
+                    )
+                if end != math.inf and (not is_finite(end) or end < 0):
+                    raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
         conditions = sum(name in self.features for name in _CONDITIONS)
+        if "measurement_noise" in self.features:
+            conditions += outputs - 1
         if self.mlp.inputs != modes + conditions:
             raise ArtifactError(
                 f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
@@ -177,34 +191,71 @@ class InverseMap:
         nx = self.mlp.outputs
         if not nx:
             raise ArtifactError("a map must estimate one state at least, its network has no outputs")
-        _check_shapes(self, {"z_offset": (size,), "noise_gain": (modes,), "x_offset": (nx,), "x_scale": (nx,)})
+        _check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
 
-    def gain(self, measurement_noise: float) -> np.ndarray:
-        """What the whitened modes are multiplied with at this standard deviation of the noise, shape (modes,)."""
-        return 1.0 / (1.0 + (measurement_noise * self.noise_gain) ** 2)
+    def _each(self, name: str) -> tuple[Any, ...]:
+        """A unit or an end: of each output where noise_gain has rows, else the only one there is."""
+        value = getattr(self, name)
+        if self.noise_gain.ndim != 2 or not name.startswith("measurement_noise"):
+            return (value,)
+        if not isinstance(value, tuple):
+            value = (value,) * len(self.noise_gain)
+            object.__setattr__(self, name, value)
+        if len(value) != len(self.noise_gain):
+            raise ArtifactError(f"{name} = {value} does not fit a noise_gain of shape {self.noise_gain.shape}")
+        return value
 
-    def measurement_noise_feature(self, measurement_noise: Any) -> Any:
-        """The network's input for a standard deviation of the noise; for an array, as many inputs."""
-        return np.log1p(measurement_noise / self.measurement_noise_unit)
+    def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        """Cut levels of measurement noise at the largest that the map is told.
 
-    def noise_features(self, measurement_noise: float, process_noise: float) -> list[float]:
+        Parameters
+        ----------
+        measurement_noise : float or tuple of float, length ny
+            Standard deviations of the noise, of all outputs or each.
+
+        Returns
+        -------
+        float or tuple of float, length ny
+            The levels, those beyond the range at its end; a float if all are the same.
+
+        Raises
+        ------
+        ValueError
+            If the levels differ and the map is told one for all outputs.
+        """
+        if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
+            raise ValueError(
+                f"this map is told one level of measurement noise for all outputs, got {measurement_noise}: pass one "
+                "number, or train it again, which makes a map that is told a level for each"
+            )
+        if "measurement_noise" not in self.features:
+            return measurement_noise
+        levels = np.minimum(measurement_noise, self.measurement_noise_max).tolist()
+        return levels if isinstance(levels, float) else levels[0] if len({*levels}) == 1 else tuple(levels)
+
+    def gain(self, measurement_noise: float | tuple[float, ...]) -> np.ndarray:
+        """What the whitened modes are multiplied with at these standard deviations of the noise, shape (modes,)."""
+        sigma = np.reshape(measurement_noise, (-1, 1))
+        return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
+
+    def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return what the network is told of noise.
 
         Parameters
         ----------
-        measurement_noise : float
-            Standard deviation.
+        measurement_noise : float or tuple of float, length ny
+            Standard deviations, of all outputs or each.
         process_noise : float
             Level in multiples of the system's scale per second.
 
         Returns
         -------
         list of float
-            None, one or both of the features, in order.
+            What there is of the features, in order.
         """
         told = []
         if "measurement_noise" in self.features:
-            told.append(float(self.measurement_noise_feature(measurement_noise)))
+            told += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
         if "process_noise" in self.features:
             told.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
         return told
@@ -234,11 +285,16 @@ class Artifact:
         T, where one was learned.
     C : ndarray, shape (ny, nx), optional
         Where the output is linear, h(x) = C x: what coasting and monitoring need.
+    h : Expression, optional
+        The output h(x), where it is not linear.
     limits : Limits, optional
-        Limits of the residual y - C x_hat in sound operation, where they were found.
+        Limits of the residual y - h(x_hat) in sound operation, where they were found.
     free_inverse : InverseMap, optional
         T_inv of z_y alone, in use as long as no input has acted since reset. Motions without input keep to far fewer
         states than driven ones, which a map that knows of no input can rely on.
+    measurement_noise : float or tuple of float, length ny, default 0.5
+        Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
+        they are told nothing else. It is cut at the largest that the maps are told.
     training : mapping, optional
         How it was made: method, preset, configuration, seed, measures.
     versions : mapping of str to str, optional
@@ -248,6 +304,9 @@ class Artifact:
     ------
     ArtifactError
         If the parts do not fit together, or a parameter is no finite number.
+    ValueError
+        If the usual measurement noise is no number, or not one for each output, or the map cannot be told levels that
+        differ.
     """
 
     filter: LinearFilter
@@ -256,8 +315,10 @@ class Artifact:
     parameters: Mapping[str, float]
     forward: ForwardMap | None = None
     C: np.ndarray | None = None
+    h: Expression | None = None
     limits: Limits | None = None
     free_inverse: InverseMap | None = None
+    measurement_noise: float | tuple[float, ...] = USUAL_NOISE
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -275,6 +336,11 @@ class Artifact:
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
                 f"a filter of {self.filter.size} values and {self.filter.nu} inputs"
             )
+        gain = self.inverse.noise_gain
+        if gain.ndim == 2 and len(gain) != self.ny:
+            raise ArtifactError(f"a noise_gain of {len(gain)} outputs does not fit {self.ny}")
+        usual = noise_levels("measurement_noise", self.measurement_noise, self.ny)
+        object.__setattr__(self, "measurement_noise", self.inverse.within(usual))
         free, nz = self.free_inverse, len(self.filter.A)
         if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
@@ -291,8 +357,13 @@ class Artifact:
             )
         if self.C is not None and self.C.shape != (self.ny, self.nx):
             raise ArtifactError(f"C must have shape {(self.ny, self.nx)}, got {self.C.shape}")
-        if self.limits is not None and (self.C is None or self.limits.mean.shape[1] != self.ny):
-            raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C with as many outputs")
+        if self.h is not None and (self.C is not None or len(self.h.components) != self.ny or self.h.states > self.nx):
+            raise ArtifactError(
+                f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
+                f"outputs and {self.nx} states, or there is a C beside it"
+            )
+        if self.limits is not None and (not self.knows_output or self.limits.mean.shape[1] != self.ny):
+            raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
 
     @property
     def nx(self) -> int:
@@ -308,6 +379,58 @@ class Artifact:
     def nu(self) -> int:
         """Number of inputs that the observer takes into account."""
         return self.filter.nu
+
+    @property
+    def knows_output(self) -> bool:
+        """Whether the artifact holds the output h(x), which :meth:`output` and :meth:`residual` need."""
+        return self.C is not None or self.h is not None
+
+    def output(self, x: np.ndarray) -> np.ndarray:
+        """Evaluate the output h(x).
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., nx)
+            States.
+
+        Returns
+        -------
+        ndarray, shape (..., ny)
+            Outputs without noise; NaN or infinite where h is not defined, such as the root of a negative number.
+
+        Raises
+        ------
+        ArtifactError
+            If the artifact holds no h.
+        """
+        if self.C is not None:
+            return x @ self.C.T
+        if self.h is None:
+            raise ArtifactError(f"this artifact for {self.system!r} holds no output h(x)")
+        return self.h(x)
+
+    def residual(self, y: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
+        """Compare samples with estimates.
+
+        Parameters
+        ----------
+        y : ndarray, shape (..., ny)
+            Samples.
+        x_hat : ndarray, shape (..., nx)
+            Estimates.
+
+        Returns
+        -------
+        ndarray, shape (..., ny)
+            y - h(x_hat); 0, as if they fitted, where h is not defined.
+
+        Raises
+        ------
+        ArtifactError
+            As :meth:`output`.
+        """
+        apart = y - self.output(x_hat)
+        return apart if self.C is not None else np.where(np.isfinite(apart), apart, 0.0)
 
     def require_forward(self) -> ForwardMap:
         """Return T.
@@ -391,8 +514,9 @@ class Artifact:
             If JSON cannot hold ``training``, ``versions`` or a number.
         """
         tensors = {"A": self.filter.A, "B": self.filter.B}
+        per_output = self.inverse.noise_gain.ndim == 2
         described: dict[str, Any] = {
-            "format": FORMATS[0] if self.process_noise_max is None else FORMATS[1],
+            "format": FORMATS[2] if per_output else FORMATS[0] if self.process_noise_max is None else FORMATS[1],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
@@ -403,8 +527,12 @@ class Artifact:
         }
         if self.free_inverse is not None:
             described["free"] = _put_inverse(tensors, "free", self.free_inverse)
+        if self.measurement_noise != self.inverse.within(USUAL_NOISE):
+            described["measurement_noise"] = self.measurement_noise
         if self.C is not None:
             tensors["C"] = np.asarray(self.C, dtype=float)
+        if self.h is not None:
+            described["h"] = self.h.components
         if self.forward is not None:
             storage.put_mlp(tensors, "forward.", self.forward.mlp)
             tensors |= {f"forward.{n}": np.asarray(getattr(self.forward, n), dtype=float) for n in _FORWARD_ARRAYS}
@@ -465,8 +593,10 @@ class Artifact:
             parameters=described["system"]["parameters"],
             forward=forward,
             C=tensors.get("C"),
+            h=Expression(described["h"]) if "h" in described else None,
             limits=limits,
             free_inverse=free_inverse,
+            measurement_noise=described.get("measurement_noise", USUAL_NOISE),
             training=described["training"],
             versions=described["versions"],
         )
@@ -494,7 +624,7 @@ def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMa
     return {
         "features": list(inverse.features),
         "activation": inverse.mlp.activation,
-        **{name: value for name, value in scalars.items() if math.isfinite(value)},
+        **{name: value for name, value in scalars.items() if np.isfinite(value).all()},
     }
 
 
@@ -510,6 +640,7 @@ def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapp
     mlp = storage.get_mlp(tensors, f"{prefix}.", described["activation"])
     arrays: dict[str, Any] = {name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}
     scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
+    scalars = {name: tuple(value) if isinstance(value, list) else value for name, value in scalars.items()}
     return InverseMap(mlp, features, **arrays, **scalars)
 
 

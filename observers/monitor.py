@@ -4,14 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from observers.checks import check_dt, is_finite, noise_level, real_array, shown
+from observers.checks import check_dt, is_finite, noise_levels, real_array, shown
 
 _LARGEST = 1e30  # of limits and levels; their squares are within the range of floats
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far the residual y - C x_hat strays in sound operation, by noise level.
+    """How far the residual y - h(x_hat) strays in sound operation, by noise level.
 
     Found by simulation (:func:`training.calibrate`): under white noise of a level, the process noise of the
     environments and random inputs, a run of ``duration`` seconds exceeds one of the limits with probability
@@ -19,8 +19,9 @@ class Limits:
 
     Parameters
     ----------
-    levels : ndarray, shape (k,)
-        Standard deviations of the measurement noise, rising from 0. Limits are interpolated between them.
+    levels : ndarray, shape (k,) or (k, ny)
+        Standard deviations of the measurement noise, of all outputs or each, rising from 0. Limits are interpolated
+        between them. Row by row, all outputs have the same part of their largest level.
     mean : ndarray, shape (k, ny)
         Limits of the absolute running mean of the residual.
     low, high : ndarray, shape (k, ny)
@@ -52,11 +53,13 @@ class Limits:
     def __post_init__(self) -> None:
         for name in ("levels", "mean", "low", "high"):
             object.__setattr__(self, name, real_array(f"the limits' {name}", getattr(self, name)))
-        k = self.levels.size
-        if self.levels.ndim != 1 or k < 1 or self.levels[0] != 0 or not (np.diff(self.levels) > 0).all():
+        shape = self.mean.shape
+        if len(shape) != 2 or not shape[0] or not shape == self.low.shape == self.high.shape:
+            raise ValueError(f"limits must be (levels, ny), got {shape}, {self.low.shape}, {self.high.shape}")
+        if self.levels.shape not in (shape[:1], shape):
+            raise ValueError(f"levels must have shape {shape[:1]} or {shape} as the limits, got {self.levels.shape}")
+        if self.levels[0].any() or not (np.diff(self.levels, axis=0) > 0).all():
             raise ValueError(f"levels must rise from 0, got {self.levels}")
-        if not self.mean.shape == self.low.shape == self.high.shape == (k, *self.mean.shape[1:]) or self.mean.ndim != 2:
-            raise ValueError(f"limits must be (levels, ny), got {self.mean.shape}, {self.low.shape}, {self.high.shape}")
         if not ((self.mean > 0) & (self.low >= 0) & (self.high > self.low)).all():
             raise ValueError("limits must be positive, the low ones below the high ones")
         if not all((limit <= _LARGEST).all() for limit in (self.levels, self.mean, self.high)):
@@ -71,13 +74,16 @@ class Limits:
                 f"{self.window}, {self.warm_up}, {self.duration} and {self.false_alarms}"
             )
 
-    def at(self, level: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def at(self, level: float | tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the limits at a noise level.
+
+        Where some outputs are noisier than others, relative to the last levels, their noise reaches the estimate and so
+        the residuals of all. The upper limits are then those at the noisiest output's part of the last levels.
 
         Parameters
         ----------
-        level : float
-            Standard deviation of the measurement noise.
+        level : float or tuple of float, length ny
+            Standard deviation of the measurement noise, of all outputs or each.
 
         Returns
         -------
@@ -89,14 +95,20 @@ class Limits:
         ValueError
             If the level is no number, negative or beyond the last one.
         """
-        level = noise_level("the noise level", level)
-        if level > self.levels[-1]:
-            raise ValueError(f"no limits beyond noise {self.levels[-1]:g}, got {level:g}: calibrate for it")
+        ny = self.mean.shape[1]
+        level = noise_levels("the noise level", level, ny)
+        levels = np.broadcast_to(self.levels.reshape(len(self.levels), -1), self.mean.shape)
+        own, last = np.broadcast_to(level, (ny,)), levels[-1]
+        if (own > last).any():
+            raise ValueError(f"no limits beyond noise {self.levels[-1].tolist()}, got {level}: calibrate for it")
+        part = np.divide(own, last, out=np.zeros(ny), where=last > 0)
+        noisiest = np.where(part == part.max(), own, part.max() * last)
 
-        def between(squares: np.ndarray) -> np.ndarray:  # as variances add up
-            return np.array([np.interp(level**2, self.levels**2, column) for column in squares.T])
+        def between(sigma: np.ndarray, limits: np.ndarray) -> np.ndarray:  # as variances add up
+            each = zip(sigma, levels.T, limits.T, strict=True)
+            return np.array([np.interp(one**2, known**2, squares) for one, known, squares in each])
 
-        return np.sqrt(between(self.mean**2)), between(self.low), between(self.high)
+        return np.sqrt(between(noisiest, self.mean**2)), between(own, self.low), between(noisiest, self.high)
 
 
 class Monitor:
@@ -109,8 +121,8 @@ class Monitor:
     ----------
     limits : Limits
         The limits of sound operation.
-    level : float
-        Standard deviation of the measurement noise.
+    level : float or tuple of float, length ny
+        Standard deviation of the measurement noise, of all outputs or each.
     dt : float
         Sampling interval in seconds.
 
@@ -120,14 +132,14 @@ class Monitor:
         If there are no limits for the level, or dt is not positive and finite.
     """
 
-    def __init__(self, limits: Limits, level: float, dt: float) -> None:
+    def __init__(self, limits: Limits, level: float | tuple[float, ...], dt: float) -> None:
         if not isinstance(limits, Limits):
             raise ValueError(f"limits must be observers.Limits, got {shown(limits)}")
-        level, dt = noise_level("the noise level", level), check_dt(dt)
+        dt = check_dt(dt)
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
         self._silent = np.round(limits.warm_up / dt)
-        self._sound = np.maximum(level**2, self._limits[1])  # where the running mean square begins
+        self._sound = np.maximum(np.square(level), self._limits[1])  # where the running mean square begins
 
     def reset(self, batch: tuple[int, ...]) -> None:
         """Begin anew.
@@ -152,20 +164,20 @@ class Monitor:
         """
         self._mean[rows], self._square[rows], self._age[rows] = 0.0, self._sound, 0
 
-    def update(self, residual: np.ndarray, rows: np.ndarray | None = None) -> None:
-        """Take in residuals y - C x_hat.
+    def update(self, residual: np.ndarray, seen: np.ndarray | None = None) -> None:
+        """Take in residuals y - h(x_hat).
 
         Parameters
         ----------
         residual : ndarray, shape (..., ny)
             The residuals.
-        rows : ndarray of bool, shape (...,), optional
-            The rows whose residuals count; by default all.
+        seen : ndarray of bool, shape (..., ny) or (..., 1), optional
+            The residuals that count; by default all.
         """
-        share = self._share if rows is None else self._share * rows[..., None]
+        share = self._share if seen is None else self._share * seen
         self._mean += share * (residual - self._mean)
         self._square += share * (residual**2 - self._square)
-        self._age += 1 if rows is None else rows
+        self._age += 1 if seen is None else seen.any(-1)
 
     @property
     def score(self) -> np.ndarray:

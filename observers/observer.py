@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
-from observers.checks import bool_array, flag, noise_level, real_array, shown
+from observers.checks import bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.monitor import Monitor
 
 _LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
@@ -30,8 +30,9 @@ class KKLObserver:
     ----------
     artifact : Artifact
         What was learned.
-    measurement_noise : float, default 0.5
-        Standard deviation of the noise on each sample of the output, for maps that ask for it.
+    measurement_noise : float or sequence of float, length ny, optional
+        Standard deviation of the noise on each sample, of all outputs or each, for maps that ask for it. None is what
+        is usual, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
         environments, for maps that ask for it. What lies beyond their training counts as its end. So does None: it is
@@ -42,14 +43,15 @@ class KKLObserver:
     Raises
     ------
     ValueError
-        If a noise level is no number, negative or not finite, the measurement noise is beyond what the map was trained
-        for, or the artifact holds no limits for a monitor.
+        If ``artifact`` is none or ``monitor`` no bool, a noise level is no number, negative or beyond 1e12, the
+        measurement noise is beyond what the map was trained for or differs between outputs where the map is told one
+        level for all, or the artifact holds no limits for a monitor.
     """
 
     def __init__(
         self,
         artifact: Artifact,
-        measurement_noise: float | Sequence[float] = 0.5,
+        measurement_noise: float | Sequence[float] | None = None,
         *,
         process_noise: float | None = None,
         monitor: bool = False,
@@ -59,27 +61,32 @@ class KKLObserver:
                 f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names"
             )
         if flag("monitor", monitor) and artifact.limits is None:
-            raise ValueError("this artifact holds no limits to monitor by; training.calibrate(...) finds them")
+            found = "them" if artifact.knows_output else "them, and the output h(x), which this artifact lacks as well"
+            raise ValueError(
+                f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
+                f"system) finds {found}, and returns an artifact that does"
+            )
         self.artifact = artifact
         self._monitored = bool(monitor)
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._process_noise = self._level(process_noise)
-        self.measurement_noise = measurement_noise
+        self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
 
     @property
-    def measurement_noise(self) -> float:
-        """Standard deviation sigma_v of the measurement noise that the estimate assumes."""
+    def measurement_noise(self) -> float | tuple[float, ...]:
+        """Standard deviation sigma_v of the measurement noise that the estimate assumes, of all outputs or each."""
         return self._measurement_noise
 
     @measurement_noise.setter
-    def measurement_noise(self, level: float | Sequence[float]) -> None:
-        inverse, level = self.artifact.inverse, noise_level("measurement_noise", level)
-        if "measurement_noise" in inverse.features and level > inverse.measurement_noise_max:
+    def measurement_noise(self, levels: float | Sequence[float]) -> None:
+        inverse = self.artifact.inverse
+        level = noise_levels("measurement_noise", levels, self.artifact.ny)
+        if level != (within := inverse.within(level)):
             raise ValueError(
                 f"measurement_noise = {level} is beyond the map's range, 0 to {inverse.measurement_noise_max}; "
-                f"pass measurement_noise={inverse.measurement_noise_max} to use it all the same"
+                f"pass measurement_noise={within} to use it all the same"
             )
         limits = self.artifact.limits
         monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
@@ -140,7 +147,7 @@ class KKLObserver:
             the observer is then as it was.
         """
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
-        self._check_output(y0, y0.shape[:-1])
+        self._check_output(y0, y0.shape[:-1], first=True)
         z0, age = self._start(y0, x0)
         self._z, self._y, self._age, self._x_hat = z0, y0, age, None
         if self._monitor is not None:
@@ -151,9 +158,10 @@ class KKLObserver:
     def score(self) -> np.ndarray:
         """How well the samples since reset fit the estimates, shape (...,): above 1 something is wrong.
 
-        The running mean and mean square of y - C x_hat over their limits in sound operation. The score is 0 right after
-        reset, and stays as it was while samples are missing. A sensor's bias, freezing or dropping out raise it, and so
-        do states that the map was not made for. See :class:`observers.Limits` for what a score above 1 is worth.
+        The running mean and mean square of y - h(x_hat) over their limits in sound operation. The score is 0 right
+        after reset, and outputs that are missing leave it as it was. A sensor's bias, freezing or dropping out raise
+        it, and so do states that the map was not made for. See :class:`observers.Limits` for what a score above 1 is
+        worth.
 
         Raises
         ------
@@ -212,7 +220,7 @@ class KKLObserver:
         z = self.z
         rows = bool_array("rows", rows, z.shape[:-1])
         y0 = real_array("y", y0)
-        self._check_output(y0, (int(rows.sum()),))
+        self._check_output(y0, (int(rows.sum()),), first=True)
         z[rows], age = self._start(y0, x0)
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
@@ -224,14 +232,15 @@ class KKLObserver:
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the next sample.
 
-        Without a sample the observer coasts on its own prediction of the output, C x_hat, which makes
-        z' = A z + B C T_inv(z) a model of the system. Where the output is not linear (the artifact holds no C) it
-        takes the last sample as still valid.
+        Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes
+        z' = A z + B h(T_inv(z)) a model of the system. With several outputs, some may be missing where others are not,
+        such as those of slower sensors: it then coasts on these alone. Where the artifact holds no h, the last value of
+        what is missing is taken as still valid.
 
         Parameters
         ----------
         y : array_like, shape (..., ny), or None
-            The sample; None if it is missing.
+            The sample; None if it is missing. Entries of one of several outputs are NaN where they are missing.
         u : array_like, shape (..., nu), optional
             The input that led to it, by default zero.
 
@@ -243,8 +252,8 @@ class KKLObserver:
         Raises
         ------
         ValueError
-            If a shape is wrong, there is anything but finite real numbers, or an input that the map does not know of
-            is not zero; the observer is then as it was.
+            If a shape is wrong, there is anything but finite real numbers (and NaN as described), or an input that the
+            map does not know of is not zero; the observer is then as it was.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -257,7 +266,7 @@ class KKLObserver:
         Parameters
         ----------
         y : array_like, shape (..., ny), or None
-            The sample; None if it is missing.
+            The sample, as for :meth:`step`.
         u : array_like, shape (..., nu), optional
             The input that led to it, by default zero.
         rows : array_like of bool, shape (...,), optional
@@ -274,12 +283,14 @@ class KKLObserver:
         if rows is not None:
             rows = bool_array("rows", rows, batch)
         u = self._input(u, batch)
-        missing = y is None
+        gaps, missing = None, y is None
         if y is None:
-            y = self._predicted_output(self._z, u)
+            y, gaps = self._y, np.ones(self._y.shape, dtype=bool)
         else:
             y = real_array("y", y).copy()  # as in reset
-            self._check_output(y, batch)
+            gaps = self._check_output(y, batch)
+        if gaps is not None:
+            y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
         z = self.artifact.filter.advance(self._z, self._y, u, y)
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
@@ -291,7 +302,10 @@ class KKLObserver:
         self._x_hat = None
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
-            self._monitor.update(self._y - self._x_hat @ self.artifact.C.T, rows)  # type: ignore[union-attr]
+            seen = None if rows is None else rows[..., None]
+            if gaps is not None:
+                seen = ~gaps if seen is None else ~gaps & seen
+            self._monitor.update(self.artifact.residual(self._y, self._x_hat), seen)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the estimate T_inv(z) as things stand: the network's half of :meth:`step`.
@@ -323,14 +337,23 @@ class KKLObserver:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
         return self._invert(z, age * self.artifact.filter.dt)
 
-    def _predicted_output(self, z: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """The next output by the observer's own estimate: predicted as it is now, corrected once."""
-        C, linear = self.artifact.C, self.artifact.filter
-        if C is None:
-            return self._y
-        y = self._invert(z, self._age * linear.dt) @ C.T
-        z_next = linear.advance(z, self._y, u, y)
-        return self._invert(z_next, (self._age + 1) * linear.dt) @ C.T
+    def _filled(
+        self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, *, z: np.ndarray, before: np.ndarray, age: Any
+    ) -> np.ndarray:
+        """Samples y with gaps filled by the observer's own prediction; z and ``before`` are of the sample before."""
+        artifact, linear, rows = self.artifact, self.artifact.filter, gaps.any(-1)
+        if not artifact.knows_output:
+            return np.where(gaps, before, y)
+        if rows.ndim and not rows.all():  # the network says nothing of rows where all is there
+            y, age = y.copy(), np.broadcast_to(age, rows.shape)[rows]
+            y[rows] = self._filled(y[rows], gaps[rows], u[rows], z=z[rows], before=before[rows], age=age)
+            return y
+
+        def predicted(z: np.ndarray, age: Any) -> np.ndarray:
+            h = artifact.output(self._invert(z, age * linear.dt))
+            return np.where(gaps, np.where(np.isfinite(h), h, before), y)
+
+        return predicted(linear.advance(z, before, u, predicted(z, age)), age + 1)  # as it is now, corrected once
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
@@ -340,7 +363,7 @@ class KKLObserver:
         Parameters
         ----------
         y : array_like, shape (steps, ..., ny)
-            Outputs; the first row is y_0.
+            Outputs; the first row is y_0. Entries of one of several outputs are NaN where they are missing.
         u : array_like, shape (steps - 1, ..., nu), optional
             The input held after each row but the last, by default zero. A last row more is ignored.
         x0 : array_like, shape (..., nx), optional
@@ -359,7 +382,10 @@ class KKLObserver:
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
-        self._check_output(y, y.shape[:-1])
+        gaps = self._check_output(y, y.shape[:-1])
+        if gaps is not None:
+            self._check_output(y[0], y.shape[1:-1], first=True)
+            y = y.copy()  # in which they are filled
         steps, batch = len(y), y.shape[1:-1]
         if u is not None:
             u = real_array("u", u)
@@ -374,7 +400,10 @@ class KKLObserver:
             record = np.empty((count, *z.shape))
             for i, k in enumerate(range(first, first + count)):
                 if k > 0:
-                    z = linear.advance(z, y[k - 1], self._input(None if u is None else u[k - 1], batch), y[k])
+                    held = self._input(None if u is None else u[k - 1], batch)
+                    if gaps is not None and gaps[k].any():
+                        y[k] = self._filled(y[k], gaps[k], held, z=z, before=y[k - 1], age=age0 + k - 1)
+                    z = linear.advance(z, y[k - 1], held, y[k])
                 record[i] = z
             age = (age0 + np.arange(first, first + count)) * linear.dt
             out[first : first + count] = self._invert(record, age.reshape(count, *(1 for _ in batch)))
@@ -410,11 +439,21 @@ class KKLObserver:
         z0[..., : T.mlp.outputs] = T(x0)
         return z0, math.inf  # which every map takes for its age_max
 
-    def _check_output(self, y: np.ndarray, batch: tuple[int, ...]) -> None:
-        if y.shape != (*batch, self.artifact.ny):
-            raise ValueError(f"y must have shape {(*batch, self.artifact.ny)}, got {y.shape}")
-        if not _finite(y):
+    def _check_output(self, y: np.ndarray, batch: tuple[int, ...], first: bool = False) -> np.ndarray | None:
+        """Raise an error unless samples can be taken in; returns where entries are missing, None if none are."""
+        ny = self.artifact.ny
+        if y.shape != (*batch, ny):
+            raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
+        if _finite(y):
+            return None
+        if ny == 1:
             raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
+        gaps = np.isnan(y)
+        if not _finite(np.where(gaps, 0.0, y)):
+            raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")
+        if first:
+            raise ValueError("y holds NaN: outputs may be missing later, but the first sample must be whole")
+        return gaps
 
     def _input(self, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
         nu = self.artifact.nu
@@ -440,7 +479,7 @@ class KKLObserver:
 class _Decoder:
     """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
-    def __init__(self, inverse: InverseMap, measurement_noise: float, process_noise: float) -> None:
+    def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
         self._inverse = inverse
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
@@ -471,7 +510,7 @@ def _finite(values: np.ndarray) -> bool:
 
 def load(
     name_or_path: str | os.PathLike[str],
-    measurement_noise: float | Sequence[float] = 0.5,
+    measurement_noise: float | Sequence[float] | None = None,
     *,
     process_noise: float | None = None,
     monitor: bool = False,
@@ -483,7 +522,7 @@ def load(
     name_or_path : str or PathLike
         A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file. A name without a version is
         the newest; ``"van_der_pol-v1"`` is that version for good.
-    measurement_noise : float, default 0.5
+    measurement_noise : float or sequence of float, length ny, optional
         As for :class:`KKLObserver`.
     process_noise : float, optional
         As for :class:`KKLObserver`.

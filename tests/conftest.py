@@ -28,15 +28,16 @@ def random_artifact(
     forward=False,
     free_inverse=False,
     process=False,
+    outputs=1,
 ):
-    """A whole observer for a system with weights that nobody trained."""
+    """A whole observer for a system with weights that nobody trained; of several outputs each has a level of noise."""
     system = get_system(system)
     rng = np.random.default_rng(0)
     nz = 2 * system.nx + 1
     A = -np.diag(np.linspace(1.0, 6.0, nz))
     if pair:
         A[:2, :2] = [[-1.0, 4.0], [-4.0, -1.0]]
-    linear = LinearFilter(A, rng.normal(size=(nz, system.ny)), dt, system.nu if inputs else 0)
+    linear = LinearFilter(A, rng.normal(size=(nz, outputs)), dt, system.nu if inputs else 0)
     modes = linear.size - 1
     told = (
         "z_y",
@@ -46,16 +47,17 @@ def random_artifact(
         *(["age"] if age else []),
     )
     levels = {"process_noise_unit": 0.01, "process_noise_max": 0.2} if process else {}
+    each, largest = (outputs,) * (outputs > 1), tuple(range(1, outputs + 1)) if outputs > 1 else 1.0
     inverse = InverseMap(
-        mlp=random_mlp(rng, modes + noise + process + age, system.nx),
+        mlp=random_mlp(rng, modes + noise * outputs + process + age, system.nx),
         features=told,
         z_offset=rng.normal(size=linear.size),
         whiten=rng.normal(size=(modes, linear.size)),
-        noise_gain=rng.uniform(0.1, 1.0, modes),
+        noise_gain=rng.uniform(0.1, 1.0, (*each, modes)),
         x_offset=rng.normal(size=system.nx),
         x_scale=np.array(system.scale),
         measurement_noise_unit=0.1,
-        measurement_noise_max=1.0 if noise else np.inf,
+        measurement_noise_max=largest if noise else np.inf,
         **levels,
         age_unit=0.05,
         age_max=2.0 if age else 0.0,
@@ -72,11 +74,11 @@ def random_artifact(
         if forward
         else None,
         free_inverse=InverseMap(
-            mlp=random_mlp(rng, nz + noise + process, system.nx),
+            mlp=random_mlp(rng, nz + noise * outputs + process, system.nx),
             features=tuple(name for name in told if name not in ("z_u", "age")),
             z_offset=rng.normal(size=nz),
             whiten=rng.normal(size=(nz, nz)),
-            noise_gain=rng.uniform(0.1, 1.0, nz),
+            noise_gain=rng.uniform(0.1, 1.0, (*each, nz)),
             x_offset=rng.normal(size=system.nx),
             x_scale=np.array(system.scale),
             measurement_noise_unit=0.2,

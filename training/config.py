@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import ConfigDict, Discriminator, Field, Tag, TypeAdapter, ValidationError, model_validator
 from pydantic.dataclasses import dataclass
 
 Pipeline = Literal["input-aware", "spinn"]
@@ -20,6 +20,11 @@ Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=1)]
+# One for all outputs, or one for each. The names appear in error messages.
+Levels = Annotated[
+    Annotated[Positive, Tag("all")] | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("each")],
+    Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all"),
+]
 
 # What settings were called before; files and artifacts that say it so are still read.
 FORMER_NAMES = {
@@ -113,7 +118,7 @@ class Config:
     """What acts on the system while motions are simulated for an input-aware map: "controller" for the system's own
     (a linear-quadratic regulator at the target by default), or a function of yours, as script.py:function or
     module:function, that turns states (n, nx) into actions (n, nu) in [-1, 1]. It acts on states with an error and
-    explores; a quarter of the trajectories are its own. There are no free motions then, and no second inverse for
+    explores; one trajectory in twelve is its own. There are no free motions then, and no second inverse for
     them. For plants that no random input would hold within their bounds."""
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted. Never under a
@@ -124,8 +129,9 @@ class Config:
     process_noise_share: Share = 0.35
     """Share of an input-aware map's trajectories with process noise. Each has a level of its own, up to the system's.
     The map is told the level unless the share is 0."""
-    measurement_noise_max: Positive = 1.0
-    """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too)."""
+    measurement_noise_max: Levels = 1.0
+    """Largest standard deviation of the measurement noise that a map is trained for (spinn with transients too), of all
+    outputs or of each."""
     noise_free_share: Share = 0.2
     """Share of the samples without measurement noise, where a map is told its level."""
     high_noise_emphasis: Positive = 2.0
@@ -234,7 +240,8 @@ def read_changes(path: Path) -> dict[str, Any]:
     except ValueError as error:  # that of JSON, or of a text in another encoding
         raise ValueError(f"{path} is no JSON: {error}") from None
     types = setting_types()
-    del types["pipeline"], types["closed_loop_trajectories"]
+    # A file of settings must not name code to run: a policy is given on the command line.
+    del types["pipeline"], types["closed_loop_trajectories"], types["policy"]
     found = current_names(found) if isinstance(found, dict) else found
     if not isinstance(found, dict) or not set(found) <= set(types):
         unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__

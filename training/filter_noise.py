@@ -1,5 +1,7 @@
 """What measurement noise becomes in the filter, in closed form."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import scipy
 
@@ -7,7 +9,7 @@ from observers import LinearFilter
 
 
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
-    """Covariance of the filter's error due to unit white noise on the output, by the number of samples since reset.
+    """Covariances of the filter's error due to unit white noise on each output, by the number of samples since reset.
 
     Parameters
     ----------
@@ -18,8 +20,9 @@ def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
 
     Returns
     -------
-    ndarray, shape (n, size, size)
-        For a standard deviation of 1; the covariance is proportional to its square.
+    ndarray, shape (n, ny, size, size)
+        For a standard deviation of 1 on one output alone; a covariance is proportional to its square, and those of
+        several outputs add up.
 
     Notes
     -----
@@ -28,28 +31,38 @@ def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
     with v_k is s_k = e_k - late v_k, for which s_k+1 = Phi s_k + (Phi late + early) v_k; that recursion is summed
     exactly. Many samples after reset the covariance is the solution of its discrete Lyapunov equation.
     """
-    phi, late = linear.transition, linear.late_y
-    drive = phi @ late + linear.early_y
-    after_first = phi @ linear.equilibrium + linear.early_y  # s_1 = after_first v_0
-    own = late @ late.T
-    out = np.empty((len(ages), linear.size, linear.size))
-    covariance, at = after_first @ after_first.T, 1
-    for i, age in enumerate(ages):
-        if age == 0:
-            out[i] = linear.equilibrium @ linear.equilibrium.T
-            continue
-        for _ in range(int(age) - at):
-            covariance = phi @ covariance @ phi.T + drive @ drive.T
-        at = int(age)
-        out[i] = covariance + own
+    phi = linear.transition
+    out = np.empty((len(ages), linear.B.shape[1], linear.size, linear.size))
+    for j, (early, late, equilibrium) in enumerate(_columns(linear)):
+        drive = phi @ late + early
+        after_first = phi @ equilibrium + early  # s_1 = after_first v_0
+        own = late @ late.T
+        covariance, at = after_first @ after_first.T, 1
+        for i, age in enumerate(ages):
+            if age == 0:
+                out[i, j] = equilibrium @ equilibrium.T
+                continue
+            for _ in range(int(age) - at):
+                covariance = phi @ covariance @ phi.T + drive @ drive.T
+            at = int(age)
+            out[i, j] = covariance + own
     return out
 
 
 def stationary_covariance(linear: LinearFilter) -> np.ndarray:
-    """Limit of :func:`noise_covariance` at great ages, (size, size)."""
-    phi, late = linear.transition, linear.late_y
-    drive = phi @ late + linear.early_y
-    return np.asarray(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
+    """Limit of :func:`noise_covariance` at great ages, (ny, size, size)."""
+    phi = linear.transition
+    out = []
+    for early, late, _ in _columns(linear):
+        drive = phi @ late + early
+        out.append(scipy.linalg.solve_discrete_lyapunov(phi, drive @ drive.T) + late @ late.T)
+    return np.array(out)
+
+
+def _columns(linear: LinearFilter) -> Iterator[tuple[np.ndarray, ...]]:
+    """What each output acts through: its columns of early_y, late_y and equilibrium, each (size, 1)."""
+    for j in range(linear.B.shape[1]):
+        yield tuple(matrix[:, j : j + 1] for matrix in (linear.early_y, linear.late_y, linear.equilibrium))
 
 
 def root(covariance: np.ndarray) -> np.ndarray:

@@ -19,7 +19,8 @@ from rich.console import Console
 
 import kkl_gym
 from kkl_gym.system import System
-from observers import Artifact, ForwardMap, InverseMap, LinearFilter
+from observers import Artifact, Expression, ForwardMap, InverseMap, LinearFilter
+from observers.checks import noise_levels
 from training.config import Config
 from training.jobs import claimed_run, describe
 from training.maps.forward import ForwardProblem, transients, truncation_step
@@ -37,6 +38,7 @@ from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
+from training.trajectories.expression import output_expression
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -172,6 +174,7 @@ class _Run:
 
     def __post_init__(self) -> None:
         system, config = self.system, self.config
+        noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
         self.started = time.monotonic()
         self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
         torch.manual_seed(config.seed)
@@ -213,6 +216,7 @@ class _Run:
                 measurement_noise_max=config.measurement_noise_max,
                 batch=config.batch,
                 device=self.device,
+                measurement_noise=self.system.measurement_noise,
                 noise_free_share=config.noise_free_share,
                 high_noise_emphasis=config.high_noise_emphasis,
                 process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
@@ -338,14 +342,17 @@ class _Run:
 
     def artifact(self, inverse: InverseMap, forward: ForwardMap | None, free: InverseMap | None) -> Artifact:
         """The observer, with how it was made."""
+        C = output_matrix(self.system)
         return Artifact(
             filter=self.linear,
             inverse=inverse,
             system=self.system.name,
             parameters=self.system.parameters,
             forward=forward,
-            C=output_matrix(self.system),
+            C=C,
+            h=self.output_expression() if C is None else None,
             free_inverse=free,
+            measurement_noise=self.system.measurement_noise,
             training={
                 **dataclasses.asdict(self.config),
                 **self.samples,
@@ -361,6 +368,13 @@ class _Run:
                 "numpy": np.__version__,
             },
         )
+
+    def output_expression(self) -> Expression | None:
+        """The output h(x) as data, None where the system's equations cannot be told from outside."""
+        try:
+            return output_expression(self.system)
+        except ValueError:  # whoever asks for a monitor will learn why
+            return None
 
 
 def shares(config: Config, nu: int) -> dict[str, float]:

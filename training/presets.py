@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from kkl_gym.system import System
+from kkl_gym.system import NOISE_SHARE, System
 from training.config import Config, Pipeline, override
 from training.smoothness import smooth_spectrum
 from training.spectrum import evenly_spaced, papers_spectrum
@@ -69,7 +69,7 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
     sizes: dict[str, Any] = {
         "dt": system.dt,
         "duration": system.duration,
-        "measurement_noise_max": float(np.max(NOISE_RANGE * np.asarray(system.measurement_noise))),
+        "measurement_noise_max": _largest_noise(system),
     }
     if pipeline == "input-aware":
         spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
@@ -130,6 +130,13 @@ def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     fastest = min(1.5 * system.typical_rate, (FASTEST_OF_STEPS if system.discrete else FASTEST_MODE) / dt)
     spaced = evenly_spaced(4 * system.nx + 3, -fastest / 22.5, -fastest)
     return tuple(float(f"{value:.6g}") for value in spaced)
+
+
+def _largest_noise(system: System) -> float | tuple[float, ...]:
+    """Of all outputs or each: a multiple of what is usual, or of what would be where the system says that none is."""
+    usual = zip(np.broadcast_to(system.measurement_noise, system.ny).tolist(), system.output_range, strict=True)
+    levels = [NOISE_RANGE * (level or NOISE_SHARE * size) for level, size in usual]
+    return levels[0] if len(set(levels)) == 1 else tuple(levels)
 
 
 def _rounded(eigenvalues: Sequence[float]) -> tuple[float, ...]:

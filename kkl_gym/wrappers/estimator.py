@@ -1,7 +1,7 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import gymnasium as gym
@@ -106,8 +106,8 @@ class KKLEstimator:
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the plant's system.
     estimate : {"x", "z"}
         Whether the state estimate is shown, or the filter's state.
-    measurement_noise : float or None
-        The noise level that the observer assumes; None takes the plant's.
+    measurement_noise : float, sequence of float or None
+        The noise level that the observer assumes, of all outputs or each; None takes the plant's.
     ignore_input : bool
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
@@ -127,7 +127,8 @@ class KKLEstimator:
     Raises
     ------
     ValueError
-        If ``estimate`` is unknown, no map ships for the system, or the noise level is beyond the map's range.
+        If ``estimate`` is unknown, a flag is no bool, no map ships for the system, or the noise level is beyond the
+        map's range.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for.
@@ -139,7 +140,7 @@ class KKLEstimator:
         observer: str | os.PathLike[str] | None,
         *,
         estimate: str,
-        measurement_noise: float | None,
+        measurement_noise: float | Sequence[float] | None,
         ignore_input: bool,
         monitor: bool,
         known_start: bool,

@@ -2,6 +2,7 @@
 
 import os
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -35,9 +36,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     estimate : {"x", "z"}
         "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
         within the bounds that bounded outputs and inputs imply.
-    measurement_noise : float, optional
-        The noise level that the observer assumes; None takes the environment's. (Process noise is always taken from
-        the environment, by maps that ask for it.)
+    measurement_noise : float or sequence of float, length ny, optional
+        The noise level that the observer assumes, of all outputs or each; None takes the environment's. (Process noise
+        is always taken from the environment, by maps that ask for it.)
     ignore_input : bool
         Whether to use a map that knows no inputs (the paper's) although the agent acts.
     monitor : bool
@@ -56,9 +57,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Raises
     ------
     ValueError
-        If the environment is not one of ours, ``estimate`` is unknown, no map ships for the system, or the noise level
-        is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and ``ignore_input`` is
-        false, or a wrapper inside hides samples from the observer.
+        If the environment is not one of ours, ``estimate`` is unknown, a flag is no bool, no map ships for the system,
+        or the noise level is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and
+        ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for. It is a ValueError.
@@ -83,7 +84,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer: str | os.PathLike[str] | None = None,
         *,
         estimate: Literal["x", "z"] = "x",
-        measurement_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,
@@ -261,6 +262,13 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
             if terminated or truncated:
                 break
         return obs, total, terminated, truncated, info
+
+
+def _plain(level: Any) -> Any:
+    """A level of noise, or one for each output, without NumPy's types and in a tuple; the rest is left to others."""
+    if isinstance(level, np.ndarray | np.floating):
+        level = level.tolist()
+    return tuple(map(_plain, level)) if isinstance(level, list | tuple) else level
 
 
 __all__ = ["ActionRepeat", "KKLObservation"]

@@ -210,8 +210,8 @@ class KKLVectorObservation(VectorEstimate):
         As for :class:`kkl_gym.KKLObservation`.
     estimate : {"x", "z"}
         As for :class:`kkl_gym.KKLObservation`; with "z" the network is not evaluated, unless there is a monitor.
-    measurement_noise : float, optional
-        The noise level that the observer assumes; None takes the environment's.
+    measurement_noise : float or sequence of float, length ny, optional
+        The noise level that the observer assumes, of all outputs or each; None takes the environment's.
     ignore_input : bool
         Whether to use a map that knows no inputs although the agent acts.
     monitor : bool
@@ -252,7 +252,7 @@ class KKLVectorObservation(VectorEstimate):
         observer: str | os.PathLike[str] | None = None,
         *,
         estimate: Literal["x", "z"] = "x",
-        measurement_noise: float | None = None,
+        measurement_noise: float | Sequence[float] | None = None,
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,

@@ -8,6 +8,7 @@ from scipy.linalg import solve_sylvester
 
 from kkl_gym import System
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+from training.filter_noise import stationary_covariance
 
 F = np.array([[0.0, 1.0], [-1.0, 0.0]])
 C = np.array([[1.0, 0.0]])
@@ -67,7 +68,17 @@ class Reactor(System):
         return (x[0],)
 
 
-def sylvester(A, B):
+@dataclass(frozen=True)
+class TwoUnits(Oscillator):
+    """The oscillator with an output in another unit, and one that is not linear: y = [1000 x1, x1 + x2^2 / 2]."""
+
+    name: ClassVar[str] = "two-units"
+
+    def h(self, x):
+        return 1000.0 * x[0], x[0] + 0.5 * x[1] ** 2
+
+
+def sylvester(A, B, C=C):
     """M with T(x) = M x: M F = A M + B C."""
     return solve_sylvester(-A, F, B @ C)
 
@@ -93,16 +104,25 @@ def reactor_observer(dt=0.05, offset=0.0, gain=1.0):
     return Artifact(linear, inverse, "reactor", {}, C=C)
 
 
-def exact_observer(dt=0.05):
-    """An artifact for the oscillator with T(x) = M x and T_inv(z) = M^+ z, exact but for float32."""
-    linear = LinearFilter(np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1)), dt)
-    M = sylvester(linear.A, linear.B)
+def exact_observer(dt=0.05, C=C, name="oscillator"):
+    """An artifact for the oscillator with y = C x, T(x) = M x and T_inv(z) = L z with L M = 1, exact but for float32.
+
+    L is the pseudo-inverse of M for one output; for several it is the left inverse that passes least noise on.
+    """
+    ny = len(C)
+    linear = LinearFilter(np.kron(np.eye(ny), np.diag([-1.0, -2.5, -4.0])), np.kron(np.eye(ny), np.ones((3, 1))), dt)
+    M, nz = sylvester(linear.A, linear.B, C), 3 * ny
     zeros, ones = np.zeros, np.ones
 
     def network(matrix):
         return MLP([matrix.astype(np.float32)], [zeros(len(matrix), np.float32)], "tanh")
 
-    inverse = InverseMap(network(np.linalg.pinv(M)), ("z_y",), zeros(3), np.eye(3), zeros(3), zeros(2), ones(2))
-    scale = np.array([0.5, 0.2, 0.1])
-    forward = ForwardMap(network(M / scale[:, None]), zeros(2), ones(2), zeros(3), scale)
-    return Artifact(linear, inverse, "oscillator", {}, forward=forward, C=C)
+    root = np.eye(nz)
+    if ny > 1:
+        noise = stationary_covariance(linear).sum(0)
+        root = np.linalg.inv(np.linalg.cholesky(noise + 1e-6 * np.trace(noise) * np.eye(nz)))
+    L = np.linalg.pinv(root @ M) @ root
+    inverse = InverseMap(network(L), ("z_y",), zeros(nz), np.eye(nz), zeros(nz), zeros(2), ones(2))
+    scale = np.tile([0.5, 0.2, 0.1], ny)
+    forward = ForwardMap(network(M / scale[:, None]), zeros(2), ones(2), zeros(nz), scale)
+    return Artifact(linear, inverse, name, {}, forward=forward, C=C)

@@ -24,6 +24,8 @@ KINDS = [
     {"process": True, "free_inverse": True},
     {"free_inverse": True},
     {"free_inverse": True, "noise": False},
+    {"outputs": 2},
+    {"outputs": 3, "process": True, "free_inverse": True},
 ]
 
 
@@ -357,7 +359,7 @@ def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):
         dataclasses.replace(artifact, free_inverse=dataclasses.replace(artifact.free_inverse, process_noise_max=0.3))
 
 
-@pytest.mark.parametrize("number", [0, 3, "1", None])
+@pytest.mark.parametrize("number", [0, 4, "1", None])
 def test_other_formats(file, number):
     rewrite(file, lambda tensors, meta: meta.update(format=number))
     with raises_naming(file) as raised:
@@ -409,6 +411,17 @@ def test_every_missing_metadata_key_and_tensor(file):
     lambda t, m: t.update({"inverse.whiten": np.zeros((9, 9))}),
     lambda t, m: t.update({"inverse.1.weight": np.zeros((8, 7), np.float32)}),
     lambda t, m: t.update({"inverse.1.bias": np.zeros((8, 1), np.float32)}),
+    lambda t, m: m.update(measurement_noise=-0.1),
+    lambda t, m: m.update(measurement_noise="0.1"),
+    lambda t, m: m.update(measurement_noise=[0.1, 0.2]),
+    lambda t, m: m.update(measurement_noise=None),
+    lambda t, m: m.update(h=[]),
+    lambda t, m: m.update(h=[["x", 0], ["x", 1]]),
+    lambda t, m: m.update(h=[["x", 2]]),
+    lambda t, m: m.update(h=[["__import__", "os"]]),
+    lambda t, m: (m.update(h=[["x", 0]]), t.update(C=np.eye(2)[:1])),
+    lambda t, m: t.update({"inverse.noise_gain": np.zeros((2, 9))}),
+    lambda t, m: m["inverse"].update(noise_max=[1.0]),
 ])  # fmt: skip
 def test_contents_that_do_not_fit(file, change):
     rewrite(file, change)

@@ -50,7 +50,7 @@ def test_limits_between_levels_add_as_variances():
 @pytest.mark.parametrize("wrong", [
     {"levels": np.array([0.1, 1.0])}, {"levels": np.array([0.0, 0.0])}, {"levels": np.array([0.0])},
     {"mean": np.array([[0.3], [0.0]])}, {"low": np.array([[-1.0], [0.0]])}, {"high": np.array([[0.1], [0.3]])},
-    {"levels": np.array([[0.0], [1.0]])}, {"window": np.inf}, {"warm_up": np.inf}, {"duration": np.nan},
+    {"levels": np.array([[0.0, 0.0], [1.0, 1.0]])}, {"window": np.inf}, {"warm_up": np.inf}, {"duration": np.nan},
     {"window": 0.0}, {"warm_up": -1.0}, {"false_alarms": 1.0}, {"duration": 0.0}, {"warm_up": 50.0},
     {"levels": np.array([0.0, np.nan])}, {"high": np.array([[0.1], [np.inf]])}, {"window": True}, {"window": "0.1"},
     {"duration": None}, {"false_alarms": [0.01]},

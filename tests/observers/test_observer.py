@@ -330,20 +330,29 @@ def test_blind_map_refuses_inputs(make_artifact):
     observer.step([1.0], [0.0])
 
 
-NO_LEVELS = [
-    -0.1, math.nan, math.inf, 10**400, True, np.True_, "0.5", b"0.5", [0.5], np.array([0.5]), 0.5 + 0j, Decimal("0.5")
-]  # fmt: skip
+NO_LEVELS = [-0.1, math.nan, math.inf, 10**400, True, np.True_, "0.5", b"0.5", 0.5 + 0j, Decimal("0.5")]
 
 
-@pytest.mark.parametrize("level", [*NO_LEVELS, None], ids=lambda value: repr(value)[:9])
+@pytest.mark.parametrize("level", [*NO_LEVELS, *([level] for level in NO_LEVELS)], ids=lambda value: repr(value)[:9])
 @pytest.mark.parametrize("noise", [False, True])
 def test_wrong_noise_level_raises(level, noise, make_artifact):
     observer = KKLObserver(make_artifact(noise=noise), 0.2)
-    with pytest.raises(ValueError, match="measurement_noise must be a finite number, not negative, got "):
+    which = r"\[0\]" if isinstance(level, list) else ""
+    with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
         observer.measurement_noise = level
     assert observer.measurement_noise == 0.2
-    with pytest.raises(ValueError, match="measurement_noise must be a finite number, not negative, got "):
+    with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
         KKLObserver(make_artifact(noise=noise), level)
+
+
+def test_there_are_as_many_noise_levels_as_outputs(make_artifact):
+    observer = KKLObserver(make_artifact(), [0.2])
+    assert observer.measurement_noise == 0.2
+    for wrong in ([], [0.1, 0.3], np.zeros((0,))):
+        with pytest.raises(ValueError, match="one for each of 1 outputs"):
+            observer.measurement_noise = wrong
+    with pytest.raises(ValueError, match="measurement_noise must be a finite number"):
+        observer.measurement_noise = None  # which means what is usual where an observer is made, and only there
 
 
 @pytest.mark.parametrize("level", [0, 1, np.float32(0.5), np.int8(1), Fraction(1, 2)])
@@ -398,7 +407,7 @@ def test_process_noise_is_told_only_to_maps_that_ask(make_artifact):
     assert np.array_equal(KKLObserver(artifact, process_noise=0.1).reset([1.0]), KKLObserver(artifact).reset([1.0]))
 
 
-@pytest.mark.parametrize("level", NO_LEVELS, ids=lambda value: repr(value)[:9])
+@pytest.mark.parametrize("level", [*NO_LEVELS, [0.5], np.array([0.5])], ids=lambda value: repr(value)[:9])
 def test_wrong_process_noise_raises(level, make_artifact):
     with pytest.raises(ValueError, match="process_noise must be a finite number, not negative, got"):
         KKLObserver(make_artifact(), process_noise=level)
@@ -428,7 +437,7 @@ def test_all_but_the_measurement_noise_goes_by_name(call, saved, make_artifact):
         call(first, 0.3, True)
     kinds = [(name, p.kind.name, p.default) for name, p in inspect.signature(call).parameters.items()][1:]
     assert kinds == [
-        ("measurement_noise", "POSITIONAL_OR_KEYWORD", 0.5),
+        ("measurement_noise", "POSITIONAL_OR_KEYWORD", None),
         ("process_noise", "KEYWORD_ONLY", None),
         ("monitor", "KEYWORD_ONLY", False),
     ]

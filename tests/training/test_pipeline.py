@@ -53,6 +53,7 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
         "measurement_noise_max": 1.0,
         "batch": 1024,
         "device": CPU,
+        "measurement_noise": 0.5,
         "noise_free_share": 0.3,
         "high_noise_emphasis": 3.0,
         "error": None,

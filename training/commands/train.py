@@ -47,8 +47,8 @@ class Train:
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
     monitor: bool = True
-    """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where the
-    output is not linear."""
+    """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
+    takes no symbols."""
     resume: bool = False
     """Go on from the checkpoints in the run's folder, if there are any."""
     parameters: Parameters = field(default_factory=dict)
@@ -111,7 +111,7 @@ class Train:
                 progress.say(line)
             result = train(system, config, folder, resume=self.resume, device=device, console=progress)
             result.artifact.save(path)  # before anything else may fail
-            if self.monitor:
+            if self.monitor or not result.artifact.knows_output:  # which is to be said in any case
                 find_limits(path, result, system, policy=policy, progress=progress)
             with progress.phase("drawing the report"):
                 write_report(folder / "report.png", result, system, policy=policy)
@@ -150,9 +150,6 @@ def find_limits(
     from training.evaluation.calibration import PARTS, calibrate
 
     artifact = result.artifact
-    if artifact.C is None:
-        progress.say("no monitor: the output is not linear, so there is no C x_hat to compare it with")
-        return
     try:
         with progress.phase("finding the monitor's limits", PARTS) as report:
             calibrate(artifact, system, seed=artifact.training["seed"], policy=policy, report=report).save(path)

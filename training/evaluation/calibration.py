@@ -12,12 +12,13 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver, Limits
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
+from training.trajectories.expression import output_expression
 from training.trajectories.noise import draw_process_noise, noisy_output
 from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
-LARGEST = 1.0  # for maps that are not told the noise
+LARGEST = 2.0  # for maps that are not told the noise, in multiples of the usual
 WINDOW, WARM_UP = 0.5, 5.0  # seconds at the pace of the shipped systems
 TRIES = 8
 MARGIN = 1.05  # on limits found among finitely many trajectories
@@ -44,7 +45,7 @@ def calibrate(
     Parameters
     ----------
     artifact : Artifact
-        An observer of a linear output.
+        An observer. If it holds no h(x), it is given the system's.
     system : System
         What it was made for.
     trajectories : int, optional
@@ -69,12 +70,12 @@ def calibrate(
     Raises
     ------
     ValueError
-        If the output is not linear, a number makes no sense, or the trajectories are too few to tell such rare events;
-        :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
+        If h(x) cannot be written down, a number makes no sense, or the trajectories are too few to tell such rare
+        events; :class:`observers.ArtifactError` (a ValueError) if the observer was made for another system.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
-    if artifact.C is None:
-        raise ValueError(f"the output of {system.name!r} is not linear: there is no C x_hat to compare it with")
+    if not artifact.knows_output:
+        artifact = dataclasses.replace(artifact, h=output_expression(system))
     duration = system.duration if duration is None else duration
     window, warm_up = WINDOW * system.pace, WARM_UP * system.pace
     if not 0 < false_alarms < 1 or duration <= warm_up or seed < 0:
@@ -87,8 +88,10 @@ def calibrate(
         raise ValueError(f"{trajectories} trajectories are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng, policy=policy)
-    largest = artifact.inverse.measurement_noise_max
-    levels = np.array(LEVELS) * (largest if math.isfinite(largest) else LARGEST)
+    largest = np.asarray(artifact.inverse.measurement_noise_max)
+    if not np.isfinite(largest).all():
+        largest = LARGEST * np.asarray(artifact.measurement_noise)
+    levels = np.multiply.outer(LEVELS, largest)
     rows = []
     for done, level in enumerate(levels, 1):
         report(done)
@@ -168,20 +171,20 @@ def _limits(
     *,
     x: np.ndarray,
     u: np.ndarray,
-    level: float,
+    level: np.ndarray,
     share: float,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Limits of mean, low and high at one noise level, each (ny,)."""
-    dt = artifact.filter.dt
-    y = noisy_output(system, x, measurement_noise=level, rng=rng)
-    observer = KKLObserver(artifact, level, process_noise=system.process_noise)
-    residual = y - observer.estimate(y, u if artifact.nu else None) @ artifact.C.T  # type: ignore[union-attr]
+    """Limits of mean, low and high at one noise level, of all outputs () or each (ny,); each of the limits (ny,)."""
+    dt, levels = artifact.filter.dt, level.tolist()
+    y = noisy_output(system, x, measurement_noise=levels, rng=rng)
+    observer = KKLObserver(artifact, levels, process_noise=system.process_noise)
+    residual = artifact.residual(y, observer.estimate(y, u if artifact.nu else None))
     a = -np.expm1(-dt / (WINDOW * system.pace))
     late = slice(round(WARM_UP * system.pace / dt) + 1, None)
     means = np.abs(lfilter([a], [1.0, a - 1.0], residual, axis=0))[late]
     squares = lfilter([a], [1.0, a - 1.0], residual**2, axis=0)[late]
     mean = np.quantile(means.max(0), 1 - share, axis=0, method="weibull") * MARGIN
     high = np.quantile(squares.max(0), 1 - share, axis=0, method="weibull") * MARGIN
-    low = np.quantile(squares.min(0), share, axis=0, method="weibull") / MARGIN if level else np.zeros_like(high)
+    low = np.quantile(squares.min(0), share, axis=0, method="weibull") / MARGIN if level.any() else np.zeros_like(high)
     return mean, low, high

@@ -9,6 +9,7 @@ import pandas as pd
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.calibration import sound_trajectories
+from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.systems import profile
 from training.trajectories.controllers import Controller
@@ -30,7 +31,7 @@ def simulate_faults(
     *,
     trajectories: int,
     duration: float,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int,
     policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,
@@ -47,8 +48,8 @@ def simulate_faults(
         Number of trajectories; each has every fault once.
     duration : float
         Length of each in seconds.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int
         Seed of starts, inputs and noise.
     policy : callable, optional
@@ -77,7 +78,7 @@ def simulate_faults(
     dt, rng = artifact.filter.dt, generator(Stream.FAULTS, seed)
     x, u = sound_trajectories(artifact, system, n=trajectories, duration=duration, rng=rng, policy=policy)
     clean = system.output(x)
-    y = clean + measurement_noise * rng.standard_normal(clean.shape)
+    y = clean + np.asarray(measurement_noise) * rng.standard_normal(clean.shape)
     counted = slice(None) if policy else ~u.any((0, 2))  # random inputs would widen it
     width = np.ptp(clean[len(clean) // 2 :, counted], axis=(0, 1))
     at, within = len(y) // 2, round(allowed / dt)

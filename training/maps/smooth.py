@@ -37,15 +37,15 @@ class Smooth:
         return J
 
 
-def decoder(artifact: Artifact, measurement_noise: float, process_noise: float = 0.0) -> Smooth:
+def decoder(artifact: Artifact, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> Smooth:
     """T_inv of free motion long after reset, in physical units.
 
     Parameters
     ----------
     artifact : Artifact
         The observer.
-    measurement_noise : float
-        Standard deviation of v that the map is told.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of v that the map is told, of all outputs or each.
     process_noise : float, default 0
         Level of w that the map is told, in multiples of the system's scale per second.
 

@@ -44,8 +44,7 @@ class KKLMethod(Method[Artifact]):
 
     def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
         """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
-        level = min(measurement_noise, trained.inverse.measurement_noise_max)
-        return KKLObserver(trained, level, process_noise=0.0)
+        return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0)
 
     def save(self, trained: Artifact, path: Path) -> None:
         """As an artifact that ``observers.load`` reads."""

@@ -9,7 +9,7 @@ from kkl_gym.simulate import advance_batch, followed_rows
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
-from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
 from training.trajectories.record import Trajectories
 
 EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
@@ -23,7 +23,7 @@ class ClosedLoop(Trajectories):
 
     Parameters
     ----------
-    measurement_noise : ndarray, shape (n,)
+    measurement_noise : ndarray, shape (n, ny)
         Its standard deviation along each trajectory. The other parameters are those of
         :class:`training.trajectories.record.Trajectories`.
     """
@@ -91,14 +91,18 @@ def record_closed_loop(
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     u_max = np.array(system.u_max)
+    largest_levels = np.broadcast_to(artifact.inverse.measurement_noise_max, system.ny).tolist()
     xs, zs, levels, disturbances = [], [], [], []
     groups = np.array_split(np.arange(n), min(n, GROUPS))
     for i, group in enumerate(groups):
         count = len(group)
-        level, position = 0.0, (i + rng.random()) / len(groups) - noise_free_share
-        if position >= 0:  # over two decades, as in training.maps.samplers.TrajectorySampler
-            position = (position / (1 - noise_free_share)) ** (1 / high_noise_emphasis)
-            level = float(artifact.inverse.measurement_noise_max * 100 ** (position - 1))
+        positions = [(i + rng.random()) / len(groups)] * system.ny
+        if system.ny > 1 and rng.random() >= ALIKE:
+            positions[1:] = rng.random(system.ny - 1).tolist()
+        level = tuple(
+            largest * _part_of_largest(position - noise_free_share, noise_free_share, high_noise_emphasis)
+            for position, largest in zip(positions, largest_levels, strict=True)
+        )
         hold = int(rng.choice(HOLDS))
         amplitude = EXPLORATION * rng.random((count, 1))
         disturbance = 0.0
@@ -131,7 +135,7 @@ def record_closed_loop(
             x = np.where(inside, after, x)
         xs.append(x_rows[:, inside])
         zs.append(z_rows[:, inside])
-        levels.append(np.full(int(inside.sum()), level))
+        levels.append(np.tile(level, (int(inside.sum()), 1)))
         disturbances.append(np.full(int(inside.sum()), disturbance))
         report(int(group[-1]) + 1)
     kept = sum(map(len, levels))
@@ -142,3 +146,10 @@ def record_closed_loop(
         )
     parts = np.concatenate(xs, 1), np.concatenate(zs, 1), np.concatenate(disturbances), np.concatenate(levels)
     return ClosedLoop(ages, *parts)
+
+
+def _part_of_largest(position: float, noise_free_share: float, high_noise_emphasis: float) -> float:
+    """A level over two decades, as in :class:`training.maps.samplers.TrajectorySampler`; none at negative positions."""
+    if position < 0:
+        return 0.0
+    return float(100 ** ((position / (1 - noise_free_share)) ** (1 / high_noise_emphasis) - 1))

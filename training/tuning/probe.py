@@ -173,7 +173,7 @@ class Probe:
         signals = np.moveaxis(self.signal, -1, 2).reshape(steps, n * nx, ny)
         z = linear.run(self.y, np.zeros((steps - 1, n, 0)), self.ages)
         Z = linear.run(signals, np.zeros((steps - 1, n * nx, 0)), self.ages)
-        return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages)
+        return z, Z.reshape(len(self.ages), n, nx, linear.size), noise_covariance(linear, self.ages).sum(1)
 
     def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
         """Predict the error of the best decoder.

@@ -38,7 +38,11 @@ def test_two_agents_do_not_share_a_folder(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b'{"quiet": 0.1, "noise_free_share": 0.3}', "two names of one setting"), (b"\xff", "c.json is no JSON")],
+    [
+        (b'{"quiet": 0.1, "noise_free_share": 0.3}', "two names of one setting"),
+        (b"\xff", "c.json is no JSON"),
+        (b'{"policy": "evil.py:act"}', "it has .'policy'."),
+    ],
 )
 def test_files_of_settings(content, message, tmp_path):
     (tmp_path / "c.json").write_bytes(content)

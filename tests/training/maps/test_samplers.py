@@ -7,7 +7,7 @@ from small_runs import CPU, closed_loop, open_loop, untrained
 
 from observers import KKLObserver
 from training.filter_noise import noise_covariance
-from training.maps.samplers import AGE_UNIT, MEASUREMENT_NOISE_UNIT, TrajectorySampler
+from training.maps.samplers import AGE_UNIT, TrajectorySampler
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high
     )
     inputs, *_ = batches(torch.Generator().manual_seed(0))
     assert torch.isfinite(inputs).all()
-    level = (MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2].double())).numpy()
+    level = (0.02 * torch.expm1(inputs[:, -2].double())).numpy()
     assert (level == 0).mean() == pytest.approx(noise_free_share, abs=0.01)
     for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
         expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
@@ -63,11 +63,11 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
     monkeypatch.setattr(sampler, "_modes", zeros)  # what is left in the inputs is noise
     gain = sampler.coordinates.noise_gain
     whiten = sampler.coordinates.whiten
-    expected = whiten @ noise_covariance(linear, data.ages) @ whiten.T
+    expected = whiten @ noise_covariance(linear, data.ages)[:, 0] @ whiten.T
     sums, counts = np.zeros_like(expected), np.zeros(len(data.ages))
     for _ in range(150):
         inputs, _, _, _ = sampler(generator)
-        level = MEASUREMENT_NOISE_UNIT * torch.expm1(inputs[:, -2:-1]).double().numpy()
+        level = 0.02 * torch.expm1(inputs[:, -2:-1]).double().numpy()
         age = AGE_UNIT * linear.dt * np.expm1(inputs[:, -1].double().numpy())
         noise = inputs[:, :-2].double().numpy() * (1 + (level * gain) ** 2) / level
         slot = np.abs(age[:, None] - data.ages * linear.dt).argmin(1)
@@ -125,7 +125,7 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(process_noi
     for row in range(2048, 4096, 200):
         state = x[row].numpy() * inverse.x_scale + inverse.x_offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-        levels = float(data.measurement_noise[trajectory]), float(data.process_noise[trajectory])
+        levels = data.measurement_noise[trajectory], float(data.process_noise[trajectory])
         observer = KKLObserver(artifact, levels[0], process_noise=levels[1])
         shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset

@@ -17,11 +17,12 @@ def test_the_controller_acts_on_the_estimate_under_noise_of_every_level(process_
     assert data.x.shape == (len(data.ages), len(data.measurement_noise), 2)
     assert data.z.shape == (len(data.ages), len(data.measurement_noise), artifact.filter.size)
     assert 50 <= len(data.measurement_noise) <= 60
-    assert len(np.unique(data.measurement_noise)) >= 5
-    assert ((data.measurement_noise >= 0) & (data.measurement_noise <= 1.0)).all()
+    (level,) = data.measurement_noise.T
+    assert len(np.unique(level)) >= 5
+    assert ((level >= 0) & (level <= 1.0)).all()
     disturbed = (data.process_noise > 0).mean()
     assert 0.2 < disturbed < 0.8 if process_noise_share else disturbed == 0
-    noise_free = (data.measurement_noise == 0) & (data.process_noise == 0)
+    noise_free = (level == 0) & (data.process_noise == 0)
     start = KKLObserver(artifact, 0.0, process_noise=0.0).reset(data.x[0, noise_free, :1])
     assert noise_free.any()
     assert any(np.allclose(start[:1], x_hat[:1], atol=1e-6) for x_hat in seen)

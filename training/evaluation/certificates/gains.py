@@ -88,11 +88,11 @@ def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
 
 def h2(linear: LinearFilter) -> float:
     """H2 norm from v to z: the stationary rms of |z| under white noise of unit variance on every sample."""
-    return float(np.sqrt(np.trace(stationary_covariance(linear))))
+    return float(np.sqrt(np.trace(stationary_covariance(linear).sum(0))))
 
 
 def noise_variance(
-    artifact: Artifact, z: np.ndarray, *, measurement_noise: float, process_noise: float = 0.0
+    artifact: Artifact, z: np.ndarray, *, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0
 ) -> np.ndarray:
     """Variance of the estimate due to stationary measurement noise, to first order: trace(J P J^T).
 
@@ -104,7 +104,7 @@ def noise_variance(
         The observer.
     z : ndarray, shape (n, size)
         Filter states.
-    measurement_noise : float
+    measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
     process_noise : float, default 0
         What T_inv is told of process noise, in multiples of the system's scale per second.
@@ -115,7 +115,7 @@ def noise_variance(
         Sums of the variances of the states, each in its own unit squared.
     """
     J = decoder(artifact, measurement_noise, process_noise).jacobian(z)
-    P = measurement_noise**2 * stationary_covariance(artifact.filter)
+    P = (np.reshape(measurement_noise, (-1, 1, 1)) ** 2 * stationary_covariance(artifact.filter)).sum(0)
     return np.asarray(np.einsum("nij,jk,nik->n", J, P, J))
 
 

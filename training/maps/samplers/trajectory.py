@@ -13,15 +13,19 @@ from training.maps.coordinates import coordinates, settling_time
 from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
 from training.maps.scaling import StateScale
+from training.trajectories.noise import ALIKE
 from training.trajectories.record import Trajectories
 
-MEASUREMENT_NOISE_UNIT = 0.02  # in the noise feature log(1 + sigma_v / unit)
+MEASUREMENT_NOISE_UNIT = 0.04  # of the usual level, in the noise feature log(1 + sigma_v / unit)
 AGE_UNIT = 5  # samples, in the age feature log(1 + t / unit)
 PROCESS_NOISE_UNIT = 0.1  # of the highest level, in the process noise feature log(1 + level / unit)
 
 
 class TrajectorySampler:
     """Batches along trajectories: every age since reset, every noise level up to ``measurement_noise_max``.
+
+    With several outputs there is a level for each. In half of the samples these are the same part of their largest
+    ones; in the others they are drawn one by one, some of them zero.
 
     Noise is drawn from the covariance that the filter gives it at each age, and added to noise-free z. The network
     that fits such data in the mean square is the conditional mean of x.
@@ -36,12 +40,14 @@ class TrajectorySampler:
         Where states and noise-free z are from.
     linear : LinearFilter
         The filter that ran beside them.
-    measurement_noise_max : float
-        Largest standard deviation of measurement noise.
+    measurement_noise_max : float or tuple of float, length ny
+        Largest standard deviation of measurement noise, of all outputs or each.
     batch : int
         Samples in a batch.
     device : torch.device
         Where batches are made.
+    measurement_noise : float or tuple of float, length ny, default 0.5
+        Usual standard deviation of the noise, from which the unit of what the network is told of it follows.
     noise_free_share : float, default 0.2
         Share of the samples without measurement noise.
     high_noise_emphasis : float, default 2
@@ -59,8 +65,12 @@ class TrajectorySampler:
     ----------
     coordinates : Coordinates
         In which the network sees z.
+    noise_gain : ndarray, shape (modes,) or (ny, modes)
+        Standard deviation of each coordinate's noise where that of the output, or of each of several, is 1.
     scale : StateScale
         Of the states.
+    measurement_noise_max, measurement_noise_unit : ndarray, shape (ny,)
+        Largest standard deviation of each output's noise, and the one that counts as one.
     age_unit : float
         Seconds that count as one.
     age_max : float
@@ -79,9 +89,10 @@ class TrajectorySampler:
         data: Trajectories,
         linear: LinearFilter,
         *,
-        measurement_noise_max: float,
+        measurement_noise_max: float | tuple[float, ...],
         batch: int,
         device: torch.device,
+        measurement_noise: float | tuple[float, ...] = 0.5,
         noise_free_share: float = 0.2,
         high_noise_emphasis: float = 2.0,
         process_noise_max: float = 0.0,
@@ -89,11 +100,20 @@ class TrajectorySampler:
         scaling: Scaling = "relative",
     ) -> None:
         m, n, size = data.z.shape
+        ny = linear.B.shape[1]
+        largest = np.broadcast_to(np.asarray(measurement_noise_max, dtype=float), ny)
+        usual = np.where(measurement_noise, measurement_noise, largest / 2)
+        self.measurement_noise_max, self.measurement_noise_unit = largest, MEASUREMENT_NOISE_UNIT * usual
         rows = np.random.default_rng(0).permutation(m * n)[:100_000]
-        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], stationary_covariance(linear))
-        gain = self.coordinates.noise_gain
+        each = stationary_covariance(linear)
+        together = np.einsum("j,jab->ab", (largest / largest.max()) ** 2, each)
+        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], together)
+        gain, whiten = self.coordinates.noise_gain, self.coordinates.whiten
+        self.noise_gain = gain
+        if ny > 1:
+            self.noise_gain = np.sqrt(np.maximum(np.einsum("ma,jab,mb->jm", whiten, each, whiten), 0.0))
         self.scale = StateScale.of(data.x, scaling)
-        self.measurement_noise_max, self.process_noise_max = measurement_noise_max, process_noise_max
+        self.process_noise_max = process_noise_max
         self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
         self.age_unit = AGE_UNIT * linear.dt
@@ -103,13 +123,15 @@ class TrajectorySampler:
             self._modes[i] = tensor(self.coordinates(data.z[i]), device)
         self._x = tensor(self.scale(data.x), device)
         self._weight = tensor(self.scale.weight(data.x), device)
-        self._gain = tensor(gain, device)
+        self._gain, self._each_gain = tensor(gain, device), tensor(np.atleast_2d(self.noise_gain)[:, None], device)
+        self._level_max, self._level_unit = (
+            tensor(values[:, None], device) for values in (self.measurement_noise_max, self.measurement_noise_unit)
+        )
         # Noise in units of the stationary one, so that its covariances are well conditioned.
-        unit = self.coordinates.whiten / np.where(gain > 0, gain, 1.0)[:, None]
+        unit = whiten / np.where(gain > 0, gain, 1.0)[:, None]
         late = int(np.ceil(2 * settling_time(linear) / linear.dt))
         saturated = np.minimum(data.ages, late)
         self._noise_root = tensor(root(unit @ noise_covariance(linear, saturated) @ unit.T), device)
-        whiten = self.coordinates.whiten
         self._error_root = None if error is None else tensor(root(whiten @ error @ whiten.T), device)
         self._age = tensor(data.ages * linear.dt, device)
         self._oldest = data.ages[-1]
@@ -124,28 +146,23 @@ class TrajectorySampler:
         device = self._x.device
         m, n, _ = self._x.shape
         ages = torch.randint(m, (self.AGES_PER_BATCH, 1), generator=generator, device=device)
-        shape = (self.AGES_PER_BATCH, self._per_age)
+        shape, ny = (self.AGES_PER_BATCH, self._per_age), len(self._level_max)
         rows = torch.randint(n, shape, generator=generator, device=device)
-        position = (torch.rand(shape, generator=generator, device=device) - self._noise_free_share) / (
-            1 - self._noise_free_share
-        )
-        loud = position > 0
-        position = position.clamp(min=0.0) ** (1 / self._high_noise_emphasis)
-        level = self.measurement_noise_max * 100 ** (position - 1)  # over two decades
-        level = torch.where(loud, level, torch.zeros_like(level))[..., None]
-        white = torch.randn((*shape, self._noise_root.shape[-1]), generator=generator, device=device)
+        position, level = self._draw_levels(generator)
+        white = torch.randn((shape[0], ny, shape[1], self._noise_root.shape[-1]), generator=generator, device=device)
         noise = white @ self._noise_root[ages[:, 0]].mT
-        modes = self._modes[ages, rows] + level * self._gain * noise
+        modes = self._modes[ages, rows] + (level[..., None] * self._gain * noise).sum(1)
         if self._error_root is not None:
             modes = modes + torch.randn(modes.shape, generator=generator, device=device) @ self._error_root.mT
-        modes = modes / (1.0 + (level * self._gain) ** 2)
-        conditions = [torch.log1p(level / MEASUREMENT_NOISE_UNIT)]
+        modes = modes / (1.0 + ((level[..., None] * self._each_gain) ** 2).sum(1))
+        conditions = [torch.log1p(level / self._level_unit).mT]
         if self.process_noise_max:
             conditions.append(self._process[rows][..., None])
         age = torch.log1p(self._age[ages].clamp(max=self.age_max) / self.age_unit)
-        conditions.append(age[..., None].expand_as(level))
+        conditions.append(age[..., None].expand(*shape, 1))
         inputs = torch.cat([modes, *conditions], -1)
-        level_cell = torch.where(loud, 1 + (position * self.LEVELS).long().clamp(0, self.LEVELS - 1), 0)
+        level_cell = 1 + (position.mean(1) * self.LEVELS).long().clamp(0, self.LEVELS - 1)
+        level_cell = torch.where((level > 0).any(1), level_cell, 0)
         cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows])
         batch = self.AGES_PER_BATCH * self._per_age
         return Batch(
@@ -154,6 +171,20 @@ class TrajectorySampler:
             self._weight[ages, rows].reshape(batch),
             cell.reshape(batch),
         )
+
+    def _draw_levels(self, generator: torch.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Levels of measurement noise, (ages, ny, rows), and how far along their two decades they are, 0 to 1."""
+        shape = (self.AGES_PER_BATCH, len(self._level_max), self._per_age)
+        position = (torch.rand(shape, generator=generator, device=generator.device) - self._noise_free_share) / (
+            1 - self._noise_free_share
+        )
+        if shape[1] > 1:
+            alike = torch.rand(position[:, :1].shape, generator=generator, device=generator.device) < ALIKE
+            position = torch.where(alike, position[:, :1], position)
+        loud = position > 0
+        position = position.clamp(min=0.0) ** (1 / self._high_noise_emphasis)
+        level = self._level_max * 100 ** (position - 1)  # over two decades
+        return position, torch.where(loud, level, torch.zeros_like(level))
 
     def process_conditions(self, process_noise: np.ndarray, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
         """What the network is told of levels of process noise, (n,), and their parts in the number of the cell."""
@@ -184,13 +215,18 @@ class TrajectorySampler:
             ),
             z_offset=self.coordinates.offset,
             whiten=self.coordinates.whiten,
-            noise_gain=self.coordinates.noise_gain,
+            noise_gain=self.noise_gain,
             x_offset=self.scale.offset,
             x_scale=self.scale.scale,
-            measurement_noise_unit=MEASUREMENT_NOISE_UNIT,
-            measurement_noise_max=self.measurement_noise_max,
+            measurement_noise_unit=_float_or_tuple(self.measurement_noise_unit),
+            measurement_noise_max=_float_or_tuple(self.measurement_noise_max),
             process_noise_unit=PROCESS_NOISE_UNIT * self.process_noise_max or 1.0,
             process_noise_max=self.process_noise_max or math.inf,
             age_unit=self.age_unit,
             age_max=self.age_max,
         )
+
+
+def _float_or_tuple(values: np.ndarray) -> float | tuple[float, ...]:
+    """What an inverse map of one output is told, or of several."""
+    return tuple(values.tolist()) if len(values) > 1 else float(values[0])

@@ -1,0 +1,242 @@
+"""Levels of measurement noise, of all outputs or each."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from linear_system import exact_observer
+
+from observers import Artifact, ArtifactError, Expression, KKLObserver, Limits, Monitor, load
+from observers.artifact import resolve
+from observers.network import MLP
+
+
+def test_each_output_has_an_input_of_the_network_and_its_part_in_the_shrinkage(make_artifact):
+    artifact = make_artifact(outputs=2, process=True)
+    inverse, levels = artifact.inverse, (0.3, 1.2)
+    gain = 1 / (1 + sum((sigma * each) ** 2 for sigma, each in zip(levels, inverse.noise_gain, strict=True)))
+    np.testing.assert_allclose(inverse.gain(levels), gain)
+    told = [*(math.log1p(sigma / 0.1) for sigma in levels), math.log1p(0.1 / 0.01)]
+    np.testing.assert_allclose(inverse.noise_features(levels, 0.1), told)
+    np.testing.assert_array_equal(inverse.gain(0.3), inverse.gain((0.3, 0.3)))
+    assert inverse.noise_features(0.3, 0.1) == inverse.noise_features((0.3, 0.3), 0.1)
+    seen = []
+    heard = dataclasses.replace(inverse, mlp=Spy(inverse.mlp, seen))
+    KKLObserver(dataclasses.replace(artifact, inverse=heard), levels, process_noise=0.1).reset(np.zeros(2))
+    np.testing.assert_allclose(seen[0][-4:], [*told, 0.0], rtol=1e-6)
+
+
+class Spy(MLP):
+    def __init__(self, mlp, seen):
+        super().__init__(mlp.weights, mlp.biases, mlp.activation)
+        self.seen = seen
+
+    def __call__(self, inputs):
+        self.seen.append(inputs)
+        return super().__call__(inputs)
+
+
+def test_levels_change_the_estimate_output_by_output(make_artifact):
+    artifact = make_artifact(outputs=2)
+    y = np.random.default_rng(0).normal(size=(5, 2))
+    estimates = [KKLObserver(artifact, levels).estimate(y) for levels in ((0.1, 0.1), (0.3, 0.1), (0.1, 0.3))]
+    for i in range(3):
+        assert not np.allclose(estimates[i], estimates[i - 1], atol=1e-6)
+    np.testing.assert_array_equal(KKLObserver(artifact, 0.1).estimate(y), estimates[0])
+    for levels in ([0.3, 0.1], np.array([0.3, 0.1]), (np.float32(0.3), 0.1)):
+        observer = KKLObserver(artifact)
+        observer.measurement_noise = levels
+        np.testing.assert_allclose(observer.estimate(y), estimates[1], atol=1e-6)
+        assert observer.measurement_noise == pytest.approx((0.3, 0.1))
+
+
+def test_levels_beyond_the_range_of_an_output(make_artifact):
+    artifact = make_artifact(outputs=2)
+    for wrong, inside in (((0.5, 2.5), "(0.5, 2.0)"), (1.5, "(1.0, 1.5)"), ((3.0, 3.0), "(1.0, 2.0)")):
+        with pytest.raises(
+            ValueError, match=r"is beyond the map's range, 0 to \(1, 2\); pass measurement_noise"
+        ) as raised:
+            KKLObserver(artifact, wrong)
+        assert f"measurement_noise={inside} to use it all the same" in str(raised.value)
+    assert KKLObserver(artifact, (1.0, 2.0)).measurement_noise == (1.0, 2.0)
+    assert artifact.inverse.within((0.5, 7.0)) == (0.5, 2.0)
+    assert artifact.inverse.within(0.5) == 0.5
+    for wrong in ((0.1,), (0.1, 0.2, 0.3), [], np.zeros(3)):
+        with pytest.raises(ValueError, match="measurement_noise must be one number, or one for each of 2 outputs"):
+            KKLObserver(artifact, wrong)
+    for wrong in ((0.1, -0.2), (0.1, math.nan), (0.1, "0.2"), (0.1, True)):
+        with pytest.raises(ValueError, match=r"measurement_noise\[1\] must be a finite number"):
+            KKLObserver(artifact, wrong)
+
+
+def test_maps_of_several_outputs_that_are_told_one_level(make_artifact, tmp_path):
+    """Files from before there were levels for each."""
+    now = make_artifact(outputs=2, noise=False)
+    inverse = dataclasses.replace(
+        now.inverse, noise_gain=now.inverse.noise_gain[0], measurement_noise_unit=0.1, measurement_noise_max=1.0
+    )
+    artifact = dataclasses.replace(now, inverse=inverse)
+    artifact.save(tmp_path / "old.safetensors")
+    read = Artifact.read(tmp_path / "old.safetensors")
+    assert KKLObserver(read, 0.3).measurement_noise == KKLObserver(read, (0.3, 0.3)).measurement_noise == 0.3
+    with pytest.raises(ValueError, match=r"told one level of measurement noise for all outputs, got \(0\.1, 0\.3\)"):
+        KKLObserver(read, (0.1, 0.3))
+    with pytest.raises(ValueError, match="told one level"):
+        dataclasses.replace(read, measurement_noise=(0.1, 0.3))
+    papers = exact_observer(C=np.eye(2))  # to which noise is nothing
+    assert KKLObserver(papers, (0.1, 7.0)).measurement_noise == (0.1, 7.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "number"),
+    [({"outputs": 2}, 3), ({"outputs": 2, "process": True, "free_inverse": True}, 3), ({}, 1), ({"process": True}, 2)],
+    ids=str,
+)
+def test_levels_of_each_output_have_a_format_of_their_own(options, number, make_artifact, tmp_path):
+    from test_artifact import contents
+
+    make_artifact(**options).save(tmp_path / "a.safetensors")
+    tensors, meta = contents(tmp_path / "a.safetensors")
+    assert meta["format"] == number
+    assert (meta["inverse"]["noise_max"] == [1, 2]) == (tensors["inverse.noise_gain"].ndim == 2) == (number == 3)
+
+
+def test_what_is_told_of_each_output_must_fit_the_outputs(make_artifact):
+    artifact = make_artifact(outputs=2, free_inverse=True)
+    inverse = artifact.inverse
+    assert dataclasses.replace(
+        inverse, measurement_noise_unit=0.1, measurement_noise_max=3.0
+    ).measurement_noise_max == (
+        3.0,
+        3.0,
+    )
+    for name in ("measurement_noise_unit", "measurement_noise_max"):
+        for wrong in ((1.0,), (1.0, 2.0, 3.0)):
+            with pytest.raises(ArtifactError, match=f"{name} = .* does not fit a noise_gain of shape"):
+                dataclasses.replace(inverse, **{name: wrong})
+        for wrong in ((1.0, -1.0), (1.0, math.nan), (1.0, "1"), (0.0, 1.0)):
+            with pytest.raises(ArtifactError, match=f"{name} must be"):
+                dataclasses.replace(inverse, **{name: wrong})
+        with pytest.raises(ArtifactError, match=f"{name} must be"):
+            dataclasses.replace(make_artifact().inverse, **{name: (1.0, 2.0)})
+    with pytest.raises(ArtifactError, match="noise_gain of 3 outputs does not fit 2"):
+        dataclasses.replace(artifact, inverse=make_artifact(outputs=3).inverse)
+    with pytest.raises(ArtifactError, match="differ in states, or in noise"):
+        dataclasses.replace(artifact, free_inverse=make_artifact(free_inverse=True).free_inverse)
+
+
+def test_what_is_usual_is_assumed_where_nothing_is_said(make_artifact, tmp_path):
+    path = tmp_path / "a.safetensors"
+    for options, usual, assumed in (
+        ({}, 0.5, 0.5),
+        ({}, 0.2, 0.2),
+        ({}, 7.0, 1.0),  # beyond the map's range
+        ({"noise": False}, 7.0, 7.0),
+        ({"outputs": 2}, (0.1, 0.3), (0.1, 0.3)),
+        ({"outputs": 2}, (0.1, 3.0), (0.1, 2.0)),
+        ({"outputs": 2}, [0.3, 0.3], 0.3),
+    ):
+        artifact = dataclasses.replace(make_artifact(**options), measurement_noise=usual)
+        artifact.save(path)
+        for observer in (KKLObserver(artifact), KKLObserver(Artifact.read(path)), load(path), load(path, None)):
+            assert observer.measurement_noise == assumed
+        assert load(path, 0.25).measurement_noise == 0.25
+    narrow = dataclasses.replace(make_artifact().inverse, measurement_noise_max=0.1)
+    assert dataclasses.replace(make_artifact(), inverse=narrow).measurement_noise == 0.1
+    for wrong in (-0.1, math.nan, "0.5", (0.1, 0.2), True):
+        with pytest.raises(ValueError, match="measurement_noise"):
+            dataclasses.replace(make_artifact(), measurement_noise=wrong)
+
+
+def test_files_say_what_is_usual_only_where_it_is_not_half_a_unit(make_artifact, tmp_path):
+    from test_artifact import contents
+
+    narrow = dataclasses.replace(make_artifact().inverse, measurement_noise_max=0.1)
+    for artifact, said in (
+        (make_artifact(), None),
+        (dataclasses.replace(make_artifact(), inverse=narrow), None),
+        (dataclasses.replace(make_artifact(), measurement_noise=0.4), 0.4),
+        (dataclasses.replace(make_artifact(outputs=2), measurement_noise=(0.1, 0.3)), [0.1, 0.3]),
+    ):
+        artifact.save(tmp_path / "a.safetensors")
+        assert contents(tmp_path / "a.safetensors")[1].get("measurement_noise") == said
+    assert Artifact.read(resolve("lorenz")).measurement_noise == 0.5
+
+
+def limits(**changes):
+    values = {
+        "levels": np.array([[0.0, 0.0], [0.1, 10.0], [1.0, 100.0]]),
+        "mean": np.array([[0.1, 1.0], [0.2, 2.0], [0.5, 50.0]]),
+        "low": np.array([[0.0, 0.0], [0.005, 50.0], [0.5, 5000.0]]),
+        "high": np.array([[0.1, 10.0], [0.2, 200.0], [2.0, 20000.0]]),
+        "window": 0.1,
+        "warm_up": 0.05,
+        "false_alarms": 0.01,
+        "duration": 50.0,
+    }
+    return Limits(**(values | changes))
+
+
+def test_limits_of_outputs_with_levels_of_their_own():
+    found = limits()
+    for row, levels in enumerate(found.levels):
+        for part, at in zip((found.mean, found.low, found.high), found.at(tuple(levels)), strict=True):
+            np.testing.assert_allclose(at, part[row])
+    mean, low, high = found.at((0.1, 100.0))  # the second output's noise reaches the first one's residual
+    np.testing.assert_allclose(mean, found.mean[2])
+    np.testing.assert_allclose(high, found.high[2])
+    np.testing.assert_allclose(low, [found.low[1, 0], found.low[2, 1]])
+    for wrong in ((1.1, 0.0), (0.0, 101.0), 2.0):
+        with pytest.raises(ValueError, match=r"no limits beyond noise \[1\.0, 100\.0\]"):
+            found.at(wrong)
+    assert Monitor(found, (0.1, 10.0), 0.01)._sound == pytest.approx([0.01, 100.0])
+    old = limits(levels=np.array([0.0, 1.0, 100.0]))  # of all outputs
+    np.testing.assert_allclose(old.at(1.0)[0], found.mean[1])
+    np.testing.assert_allclose(old.at((1.0, 100.0))[0], found.mean[2])
+
+
+@pytest.mark.parametrize("wrong", [
+    np.zeros((3, 1)), np.zeros((2, 2)), np.array([[0.0, 0.1], [0.1, 1.0], [1.0, 2.0]]),
+    np.array([[0.0, 0.0], [0.1, 10.0], [0.2, 10.0]]), np.zeros((3, 2, 1)), np.array(0.0),
+])  # fmt: skip
+def test_impossible_levels_of_limits(wrong):
+    with pytest.raises(ValueError, match="levels must"):
+        limits(levels=wrong)
+
+
+def test_limits_and_outputs_are_stored(make_artifact, tmp_path):
+    h = Expression([["*", ["x", 0], ["x", 1]], ["sin", ["x", 1]]])
+    artifact = dataclasses.replace(make_artifact(outputs=2), h=h, limits=limits())
+    artifact.save(tmp_path / "a.safetensors")
+    read = Artifact.read(tmp_path / "a.safetensors")
+    assert read.h == h
+    np.testing.assert_array_equal(read.limits.levels, limits().levels)
+    x = np.random.default_rng(0).normal(size=(4, 3, 2))
+    np.testing.assert_array_equal(read.output(x), np.stack([x[..., 0] * x[..., 1], np.sin(x[..., 1])], -1))
+    observer = KKLObserver(read, (0.1, 0.3), monitor=True)
+    observer.reset(np.zeros((3, 2)))
+    observer.step(np.ones((3, 2)))
+    assert np.isfinite(observer.score).all()
+
+
+def test_residuals_where_the_output_is_not_defined_count_as_none(make_artifact):
+    artifact = dataclasses.replace(make_artifact(), h=Expression([["log", ["x", 0]]]))
+    x_hat, y = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]]), np.full((3, 1), 0.5)
+    assert artifact.residual(y, x_hat).ravel().tolist() == [0.0, 0.0, 0.5]
+    assert artifact.knows_output
+    with pytest.raises(ArtifactError, match="holds no output"):
+        make_artifact().output(x_hat)
+    assert not make_artifact().knows_output
+    with pytest.raises(ArtifactError, match="does not fit 1 outputs and 2 states"):
+        dataclasses.replace(make_artifact(), h=Expression([["x", 2]]))
+
+
+def test_who_has_no_limits_is_told_where_to_get_them(make_artifact):
+    knows = dataclasses.replace(make_artifact(), C=np.array([[1.0, 0.0]]))
+    with pytest.raises(
+        ValueError, match=r"holds no limits .* training\.calibrate\(artifact, system\) finds them, and re"
+    ):
+        KKLObserver(knows, monitor=True)
+    with pytest.raises(ValueError, match=r"finds them, and the output h\(x\), which this artifact lacks as well"):
+        KKLObserver(make_artifact(), monitor=True)

@@ -1,0 +1,198 @@
+"""Samples of which an output is missing: the observer coasts on that one."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from linear_system import TwoOutputs, exact_observer
+
+from kkl_gym.simulate import simulate
+from observers import Expression, KKLObserver, Limits
+
+DT, STEPS = 0.05, 400
+C, H = np.eye(2), Expression([["x", 0], ["x", 1]])
+
+
+def exact(**changes):
+    return dataclasses.replace(exact_observer(DT, C, TwoOutputs.name), **changes)
+
+
+def motions(n=3):
+    x0 = np.random.default_rng(0).uniform(-1, 1, (n, 2))
+    return simulate(TwoOutputs(), x0, STEPS, DT)
+
+
+def step_by_step(observer, y):
+    return np.array([observer.reset(y[0]), *(observer.step(row) for row in y[1:])])
+
+
+@pytest.mark.parametrize("output", [{"C": C}, {"C": None, "h": H}], ids=["C", "h"])
+def test_outputs_at_different_rates(output):
+    x = motions()
+    y = TwoOutputs().output(x)
+    slow = y.copy()
+    slow[np.arange(STEPS + 1) % 5 != 0, :, 1] = math.nan  # the second sensor is five times slower
+    held = slow.copy()
+    for k in range(1, STEPS + 1):
+        held[k] = np.where(np.isnan(slow[k]), held[k - 1], slow[k])
+
+    def error(record, **changes):
+        x_hat = KKLObserver(exact(**output, **changes)).estimate(record)
+        return np.sqrt(np.mean((x_hat - x)[200:] ** 2))
+
+    assert error(slow) < 0.01
+    assert error(slow) < 0.05 * error(held)
+    nothing = {"C": None, "h": None}
+    assert np.array_equal(
+        KKLObserver(exact(**nothing)).estimate(slow), KKLObserver(exact(**nothing)).estimate(held)
+    )  # who knows no h can but hold
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(
+    batch=st.lists(st.integers(1, 3), max_size=2).map(tuple),
+    share=st.sampled_from([0.1, 0.5, 0.9]),
+    knows=st.sampled_from(["C", "h", "nothing"]),
+    seed=st.integers(0, 1000),
+)
+def test_records_agree_with_steps_and_batches_with_their_rows(batch, share, knows, seed):
+    artifact = exact(C=C if knows == "C" else None, h=H if knows == "h" else None)
+    rng = np.random.default_rng(seed)
+    y = rng.normal(size=(12, *batch, 2))
+    y[1:][rng.random((11, *batch, 2)) < share] = math.nan
+    whole = y.copy()
+    x_hat = KKLObserver(artifact).estimate(y)
+    np.testing.assert_array_equal(y, whole)  # the caller's array
+    assert np.isfinite(x_hat).all()
+    np.testing.assert_allclose(x_hat, step_by_step(KKLObserver(artifact), y), atol=1e-5)
+    for row in np.ndindex(batch):
+        alone = step_by_step(KKLObserver(artifact), y[(slice(None), *row)])
+        np.testing.assert_allclose(x_hat[(slice(None), *row)], alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_where_all_outputs_are_missing_the_sample_is(batch):
+    y = np.random.default_rng(1).normal(size=(4, *batch, 2))
+    one, other = (KKLObserver(exact()) for _ in range(2))
+    for observer in (one, other):
+        observer.reset(y[0])
+        observer.step(y[1])
+    assert np.array_equal(one.step(np.full((*batch, 2), math.nan)), other.step(None))
+    assert np.array_equal(one.step(y[3]), other.step(y[3]))
+    assert np.array_equal(one.z, other.z)
+
+
+def test_what_is_there_is_taken_in_beside_what_is_not():
+    one, other = (KKLObserver(exact()) for _ in range(2))
+    for observer in (one, other):
+        observer.reset([0.5, 0.2])
+    one.advance([0.6, math.nan])
+    other.advance([0.9, math.nan])
+    assert not np.array_equal(one.z[:3], other.z[:3])
+
+
+def test_only_rows_with_gaps_are_filled_and_only_rows_that_are_told_to_step():
+    y = np.random.default_rng(2).normal(size=(3, 2))
+    observer, plain = (KKLObserver(exact()) for _ in range(2))
+    for each in (observer, plain):
+        each.reset(y)
+    gaps = y.copy()
+    gaps[1, 0] = gaps[2] = math.nan
+    rows = np.array([True, True, False])
+    observer.advance(gaps, rows=rows)
+    plain.advance(y, rows=rows)
+    assert np.array_equal(observer.z[[0, 2]], plain.z[[0, 2]])
+    assert not np.array_equal(observer.z[1], plain.z[1])
+    assert np.isfinite(observer.step(y)).all()
+
+
+def test_the_first_sample_is_whole():
+    observer = KKLObserver(exact())
+    gap = np.array([0.1, math.nan])
+    with pytest.raises(ValueError, match="the first sample must be whole"):
+        observer.reset(gap)
+    with pytest.raises(ValueError, match="the first sample must be whole"):
+        observer.estimate(np.array([gap, [0.1, 0.2]]))
+    observer.reset(np.zeros((2, 2)))
+    observer.step(np.ones((2, 2)))
+    z = observer.z
+    with pytest.raises(ValueError, match="the first sample must be whole"):
+        observer.restart(gap[None], np.array([True, False]))
+    assert np.array_equal(observer.z, z)
+
+
+@pytest.mark.parametrize("wrong", [[math.inf, 0.0], [math.nan, -math.inf], [1e16, math.nan]])
+def test_what_is_neither_there_nor_missing(wrong):
+    observer = KKLObserver(exact())
+    for call in (observer.reset, lambda y: observer.estimate([[0.0, 0.0], y])):
+        with pytest.raises(ValueError, match="y holds infinity or values beyond 1e15; NaN is what says"):
+            call(wrong)
+    observer.reset([0.5, 0.5])
+    z = observer.z
+    with pytest.raises(ValueError, match="y holds infinity"):
+        observer.step(wrong)
+    assert np.array_equal(observer.z, z)
+
+
+def test_a_prediction_that_is_no_number_is_not_taken():
+    undefined = Expression([["sqrt", ["+", ["x", 0], -1e3]], ["x", 1]])
+    observer, holding = KKLObserver(exact(C=None, h=undefined)), KKLObserver(exact(C=None))
+    for each in (observer, holding):
+        each.reset([0.5, 0.5])
+        each.step([math.nan, 0.6])
+    assert np.array_equal(observer.z, holding.z)
+    assert np.isfinite(observer.step(None)).all()
+
+
+LIMITS = Limits(
+    levels=np.array([0.0, 1.0]),
+    mean=np.array([[0.3, 0.3], [0.5, 0.5]]),
+    low=np.array([[0.0, 0.0], [0.4, 0.4]]),
+    high=np.array([[0.1, 0.1], [2.1, 2.1]]),
+    window=0.5,
+    warm_up=0.05,
+    false_alarms=0.01,
+    duration=50.0,
+)
+
+
+def test_what_is_missing_is_not_judged():
+    artifact = exact(limits=LIMITS)
+    watched = KKLObserver(artifact, 0.0, monitor=True)
+    y = TwoOutputs().output(motions(1)[:, 0])
+    watched.reset(y[0])
+    for k in range(1, 300):
+        watched.step(y[k])
+    assert watched.score < 0.5
+    before = watched._monitor._mean.copy(), watched._monitor._square.copy()
+    for k in range(300, 330):
+        watched.step([y[k, 0] + 0.2, math.nan])  # only the first is judged, and found out
+    assert (watched._monitor._mean[1], watched._monitor._square[1]) == (before[0][1], before[1][1])
+    assert watched._monitor._mean[0] != before[0][0]
+    score = watched.score
+    watched.step([math.nan, math.nan])
+    watched.step(None)
+    assert watched.score == score
+    assert np.isfinite(score)
+
+
+def test_rows_of_monitored_batches_with_gaps_are_monitors_of_their_own():
+    artifact = exact(limits=LIMITS)
+    rng = np.random.default_rng(3)
+    y = rng.normal(size=(30, 3, 2))
+    y[1:][rng.random((29, 3, 2)) < 0.3] = math.nan
+    together = KKLObserver(artifact, 1.0, monitor=True)
+    together.reset(y[0])
+    alone = [KKLObserver(artifact, 1.0, monitor=True) for _ in range(3)]
+    for i, observer in enumerate(alone):
+        observer.reset(y[0, i])
+    for k in range(1, 30):
+        active = np.array([True, k % 2 == 0, True])
+        together.advance(y[k], rows=active)
+        for i in np.flatnonzero(active):
+            alone[i].advance(y[k, i])
+        assert together.score == pytest.approx([float(observer.score) for observer in alone], rel=1e-5)
+    assert (together.score > 0).all()
