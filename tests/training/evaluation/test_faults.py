@@ -18,7 +18,7 @@ from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
 from training.cli import main
 from training.commands.faults import report
-from training.evaluation.faults import FAULTS, simulate_faults
+from training.evaluation.faults import FAULTS, PARTS, simulate_faults
 from training.maps.smooth import decoder
 
 
@@ -37,9 +37,18 @@ def with_limits(name):
 def found():
     from kkl_gym import get_system
 
-    return simulate_faults(
-        with_limits("lorenz"), get_system("lorenz"), trajectories=12, duration=16.0, measurement_noise=0.5, seed=0
+    told = []
+    found = simulate_faults(
+        with_limits("lorenz"),
+        get_system("lorenz"),
+        trajectories=12,
+        duration=16.0,
+        measurement_noise=0.5,
+        seed=0,
+        report=told.append,
     )
+    assert told == list(range(1, PARTS))
+    return found
 
 
 def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact, monkeypatch):
