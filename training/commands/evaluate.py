@@ -15,11 +15,11 @@ from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
 from training.commands.options import (
-    Duration,
     NoiseLevels,
     Observers,
     OwnPolicy,
     OwnSystem,
+    Seconds,
     read_observers,
     read_policy,
 )
@@ -70,7 +70,7 @@ class Evaluate:
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
-    duration: Duration = None
+    duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
     """Seed of the trajectories and the noise; no seed gives any that training draws."""

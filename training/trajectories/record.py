@@ -19,7 +19,10 @@ FIRST = 100  # trajectories tried before all others
 FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
-POLICYS_OWN = 4  # every fourth trajectory under a policy is its own, the others are also explored
+# Every so many trajectories under a policy one is its own, the others are explored. On those alone the input tells the
+# state, which an agent's does not. Under the regulator on x_hat, at the default noise, cart-pole's angle is estimated
+# to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
+POLICYS_OWN = 12
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -142,6 +143,25 @@ def test_what_modules_make_of_an_interruption(becomes, monkeypatch, capsys):
     assert end.value.code == 130
     assert capsys.readouterr().err == "kkl-gym: interrupted\n"
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_interruption_that_a_callback_swallows_comes_again(monkeypatch, capsys):
+    class Callback:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def interrupted(name):
+        Callback()
+        time.sleep(60.0)
+
+    hook = sys.unraisablehook
+    monkeypatch.setattr(training.cli, "import_module", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(["maps"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "kkl-gym: interrupted\n"
+    assert sys.unraisablehook is hook
 
 
 def test_commands_run_in_threads_too(capsys):
