@@ -5,8 +5,9 @@ from typing import Any
 
 from numpy.linalg import LinAlgError
 
-from kkl_gym.simulate import RATE_STEP, SubstepsError, check_dt, check_duration, check_interval
+from kkl_gym.simulate import RATE_STEP, SubstepsError, check_duration, check_interval
 from kkl_gym.system import System
+from observers.checks import check_dt
 from training.checking import dynamics, equations, levels, observability
 from training.checking.finding import Finding, Verdict
 from training.checking.subject import Subject
@@ -72,7 +73,7 @@ def check(
     for name, look in FIRST.items():
         findings = list(_guarded(name, look, system))
         yield from findings
-        if name != "system" and any(finding.verdict == "problem" for finding in findings):
+        if any(finding.verdict == "problem" for finding in findings):
             yield Finding(name, "note", "all other checks are left out", "mend this first")
             return
     interval = system.dt if dt is None else check_dt(dt)

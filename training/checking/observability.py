@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kkl_gym.equations import EquationError
+from kkl_gym.equation_errors import EquationError
 from training.checking.finding import Finding, number, percent
 from training.checking.subject import Subject
 from training.presets import eigenvalues
@@ -48,9 +48,6 @@ def smooth(subject: Subject) -> Iterator[Finding]:
 def observability(subject: Subject) -> Iterator[Finding]:
     """The predicted error of each state, and states of which y tells nothing."""
     system = subject.system
-    if system.discrete:
-        yield Finding("observability", "note", "errors are predicted for systems in continuous time alone")
-        return
     try:
         probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS)
     except EquationError:
@@ -84,7 +81,9 @@ def _unknown(subject: Subject, probe: Probe) -> dict[tuple[int, ...], Finding]:
     """What cannot be told from all of y, by the states that it is of."""
     system, found = subject.system, dict[tuple[int, ...], Finding]()
     without_y = np.linalg.norm(probe.Phi[-1] * subject.half, axis=-1).mean(0) / subject.half
-    values, directions = np.linalg.eigh(probe.unknown_of_starts([RESOLUTION * size for size in system.output_range]))
+    values, directions = np.linalg.eigh(
+        probe.unknown_of_starts(tuple(RESOLUTION * size for size in system.output_range))
+    )
     for share, direction in zip(np.sqrt(np.maximum(values, 0.0)), directions.T, strict=True):
         if share <= HARDLY:
             continue
