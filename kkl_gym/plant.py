@@ -64,8 +64,8 @@ class Plant:
     Raises
     ------
     ValueError
-        On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a ``start_box``
-        that does not lie within the declared bounds.
+        On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
+        ``observe``, and a ``start_box`` that does not lie within the declared bounds.
         SubstepsError, a ValueError, if dt is too long for the system.
     """
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym import EquationError
 from kkl_gym.compiled import batch_step
-from kkl_gym.equation_errors import EquationError
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
 from training.checking.finding import Finding, Verdict, number, percent

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from kkl_gym.equation_errors import EquationError
+from kkl_gym import EquationError
 from training.checking.finding import Finding, number, percent
 from training.checking.subject import Subject
 from training.presets import eigenvalues

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
-from kkl_gym.equation_errors import EquationError
+from kkl_gym import EquationError
 from kkl_gym.loading import load_class
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
