@@ -10,6 +10,9 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
+from kkl_gym import EquationError
+from kkl_gym.loading import load_class
+from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.storage import write
 
@@ -65,7 +68,11 @@ class Check:
         from training.checking import check  # here, because it imports torch, which help need not wait for
         from training.systems import named_policy
 
-        system, found = get_system(self.system, self.parameters), []
+        try:
+            system = get_system(self.system, self.parameters)
+        except EquationError:  # once the system was made; what is wrong with its equations is said below
+            system = load_class(self.system, System)().replace(self.parameters)
+        found = []
         policy = named_policy(system, self.policy) if self.policy else None
         with console.status(f"checking {system.name}"):
             for finding in check(system, dt=self.dt, duration=self.duration, policy=policy, spinn=self.spinn):
