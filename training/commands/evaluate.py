@@ -57,7 +57,8 @@ class Evaluate:
     2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
     told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is
     there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
-    Under a policy, those are driven in which it errs about the state and explores.
+    Under a policy, those are driven in which it errs about the state and explores; in the others its inputs tell the
+    state to an observer that has learned the policy.
     """
 
     observers: Observers
