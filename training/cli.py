@@ -146,9 +146,14 @@ def _end(message: str, code: int) -> NoReturn:
 
 def _without_box(text: str) -> str:
     """What tyro says of options that it cannot read, in one line: without frame, colours, title, help and reasons."""
-    plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╮╰╯ ") for line in text.splitlines()]
-    parts = "\n".join(plain[1:]).split("─" * 10)
-    kept = [" ".join(part.strip("─").split()).partition(" Got errors:")[0] for part in parts]
+    parts: list[list[str]] = [[]]
+    for line in text.splitlines()[1:]:  # the first bears the title
+        content = re.sub(r"\x1b\[[0-9;]*m", "", line).strip(" │╰╯")
+        if content and set(content) <= set("─-"):
+            parts.append([])
+        else:
+            parts[-1].append(content)
+    kept = [" ".join(" ".join(part).split()).partition(" Got errors:")[0] for part in parts]
     return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 

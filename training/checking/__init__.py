@@ -73,7 +73,7 @@ def check(
     for name, look in FIRST.items():
         findings = list(_guarded(name, look, system))
         yield from findings
-        if name != "system" and any(finding.verdict == "problem" for finding in findings):
+        if any(finding.verdict == "problem" for finding in findings):
             yield Finding(name, "note", "all other checks are left out", "mend this first")
             return
     interval = system.dt if dt is None else check_dt(dt)

@@ -19,7 +19,6 @@ TIMED = 300  # steps of the environment
 SLOW = 500.0  # microseconds of such a step
 MANY = 0.5  # share of motions from X that leave the bounds
 FEW = 0.1  # share of motions that run away where wider bounds help
-TRIAL = 5.0  # part of the duration for which a policy is tried
 WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
 ROOM = 1.1  # of bounds around those motions
 COARSE, JERKY = 1.0, 0.5  # changes of y from sample to sample, in its standard deviations along a motion
@@ -211,14 +210,13 @@ def _policy(subject: Subject) -> str:
     """What to do about a system that runs away under random inputs."""
     try:
         policy = named_policy(subject.system, "controller")
-        motions = replace(subject, duration=subject.duration / TRIAL, policy=policy).motions
+        motions = replace(subject, policy=policy).motions
     except ValueError:  # no such controller
         motions = SubstepsError()
     if not isinstance(motions, SubstepsError):
         stays = motions.stays[motions.rows("X")]
         if stays.mean() > MANY:
-            seconds = f"{subject.duration / TRIAL:g} s"
-            return f"train with --policy controller, under which {stays.sum()} of {len(stays)} stay for {seconds}"
+            return f"train with --policy controller, under which {stays.sum()} of {len(stays)} stay"
     return "train under a policy of yours that holds the system: --policy script.py:function"
 
 

@@ -48,9 +48,6 @@ def smooth(subject: Subject) -> Iterator[Finding]:
 def observability(subject: Subject) -> Iterator[Finding]:
     """The predicted error of each state, and states of which y tells nothing."""
     system = subject.system
-    if system.discrete:
-        yield Finding("observability", "note", "errors are predicted for systems in continuous time alone")
-        return
     try:
         probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS)
     except EquationError:

@@ -10,8 +10,13 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
+from kkl_gym import EquationError
+from kkl_gym.loading import load_class
+from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.storage import write
+from training.commands.options import Parameters, SystemName
+from training.progress import progress_bars
 
 if TYPE_CHECKING:
     from training.checking import Finding
@@ -27,8 +32,7 @@ class Check:
     and the error to expect of each state. The exit status is 1 if there is a problem. docs/check.md explains the lines.
     """
 
-    system: tyro.conf.Positional[str]
-    """A shipped system, or a class of yours as script.py:Class or module:Class."""
+    system: SystemName
     dt: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Sampling interval in seconds."""
     duration: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
@@ -37,8 +41,7 @@ class Check:
     """What acts on the system, as for `kkl-gym train`: "controller", or a function of yours as script.py:function."""
     spinn: bool = False
     """Also look for a spectrum that makes T smooth, for --pipeline spinn: some seconds more."""
-    parameters: dict[str, float] = field(default_factory=dict)
-    """Physical parameters that differ from the system's defaults, as in: --parameters rho 30."""
+    parameters: Parameters = field(default_factory=dict)
     json: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the findings are written as well."""
 
@@ -65,12 +68,17 @@ class Check:
         from training.checking import check  # here, because it imports torch, which help need not wait for
         from training.systems import named_policy
 
-        system, found = get_system(self.system, self.parameters), []
+        try:
+            system = get_system(self.system, self.parameters)
+        except EquationError:  # once the system was made; what is wrong with its equations is said below
+            system = load_class(self.system, System)().replace(self.parameters)
+        found = []
         policy = named_policy(system, self.policy) if self.policy else None
-        with console.status(f"checking {system.name}"):
+        with progress_bars(console) as progress:
+            progress.bar(f"checking {system.name}")
             for finding in check(system, dt=self.dt, duration=self.duration, policy=policy, spinn=self.spinn):
                 found.append(finding)
-                console.print(_row(finding))
+                progress.console.print(_row(finding))
         problems = sum(finding.verdict == "problem" for finding in found)
         notes = sum(finding.verdict == "note" for finding in found)
         console.print(f"{problems or 'no'} problem{'s' * (problems != 1)}, {notes or 'no'} note{'s' * (notes != 1)}")

@@ -124,5 +124,5 @@ def beyond(artifact: Artifact, level: Level) -> str:
             return ""
     except ValueError as error:
         return str(error)
-    largest = show_level(artifact.inverse.measurement_noise_max)
-    return f"measurement noise {show_level(level)} is beyond the map's range, 0 to {largest}"
+    ranges = ", ".join(f"0 to {largest:g}" for largest in np.atleast_1d(artifact.inverse.measurement_noise_max))
+    return f"measurement noise {show_level(level)} is beyond the map's range, {ranges}"

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 
 import numpy as np
 
@@ -25,6 +26,7 @@ def under_policy(
     rng: np.random.Generator,
     own: np.ndarray,
     w: np.ndarray | None = None,
+    report: Callable[[int], object] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy that errs about the state and explores.
 
@@ -50,6 +52,8 @@ def under_policy(
         Which of the trajectories are the policy's own, without either.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval.
+    report : callable, optional
+        Told now and then the number of intervals that are done.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def under_policy(
         u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
-    return simulate(system, x0, steps, dt, u=act, w=w), u
+    return simulate(system, x0, steps, dt, u=act, w=w, report=report), u
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:

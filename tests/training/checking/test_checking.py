@@ -70,7 +70,7 @@ def test_a_linear_system_has_its_numbers():
     # The norm of ((0, 1), (-1, 0)), whose eigenvalues are +-i.
     assert found["rate"] == "typically 1.41/s in X, at most 1.41/s within the bounds: 1 and 1 substeps of dt = 0.01 s"
     assert "time constants 1 to 1 s (medians over X); 100 samples of the fastest, 20 of" in found["sampling"]
-    assert "y changes by 1 % of its standard deviation" in found["sampling"]
+    assert "y changes by 0.98 % of its standard deviation" in found["sampling"]
     assert found["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
     assert found["bounds"] == "all of 200 motions of 20 s stay within them, from X and 2X, free and driven"
 
@@ -193,17 +193,6 @@ def test_an_input_that_moves_nothing():
     assert "column 2 of G" in found.advice
 
 
-class ForgottenInput(Autonomous):
-    name = "forgotten-input"
-    G = ((0.0,), (1.0,))
-
-
-def test_an_input_without_a_bound():
-    found = one(ForgottenInput(), "system")
-    assert found.found.endswith("its G or g acts on nothing")
-    assert "set u_max" in found.advice
-
-
 class InputByState(Oscillator):
     name = "input-by-state"
 
@@ -266,7 +255,7 @@ def test_discrete_time_and_starts_of_its_own():
     assert by_name["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
     assert by_name["starts"] == "draw_starts of its own, all within the bounds"
     assert "rate" not in by_name
-    assert "continuous time alone" in by_name["observability"]
+    assert by_name["observability"].startswith("x2: predicted error 4.7 %")
     with pytest.raises(ValueError, match="no others"):
         findings(Rotation(), dt=0.2)
 
@@ -285,7 +274,7 @@ class Elongated(Autonomous):
 
 
 def test_bounds_that_are_too_narrow():
-    found = one(Elongated(), "bounds", duration=20.0)
+    found = one(Elongated(), "bounds", dt=0.1, duration=20.0)
     assert "leave them" in found.found
     assert "most often x1" in found.found
     low, high = map(float, found.advice.removeprefix("widen the bounds of x1 to (").removesuffix(")").split(","))
@@ -296,7 +285,7 @@ def test_bounds_that_are_too_narrow():
         name = "wide"
         bounds = ((1.2 * low, 1.2 * high), (-3, 3))
 
-    assert one(Wide(), "bounds", "ok", duration=20.0)
+    assert one(Wide(), "bounds", "ok", dt=0.1, duration=20.0)
 
 
 class Upright(Oscillator):
@@ -324,9 +313,9 @@ class Adrift(Upright):
 def test_a_system_that_no_random_input_holds():
     found = one(Upright(), "bounds", duration=5.0)
     assert "50 of 50 free and 50 of 50 driven leave them" in found.found
-    assert "train with --policy controller, under which 100 of 100 stay for 1 s" in found.advice
-    assert "--policy script.py:function" in one(Weak(), "bounds").advice
-    assert one(Adrift(), "bounds").advice.endswith("10 times as wide: shrink X")
+    assert "train with --policy controller, under which 100 of 100 stay" in found.advice
+    assert "--policy script.py:function" in one(Weak(), "bounds", duration=5.0).advice
+    assert one(Adrift(), "bounds", duration=5.0).advice.endswith("10 times as wide: shrink X")
     assert "no error can be predicted for motions without input" in one(Upright(), "observability", "note").found
 
 
