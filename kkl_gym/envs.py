@@ -7,7 +7,7 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.equations import complex_motion, components
+from kkl_gym.equations import complex_motion, components, target_of
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
 from kkl_gym.simulate import advance, followed
@@ -115,7 +115,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
 
         # What every step reads, as Python numbers
         self._nx, self._nu = self.system.nx, self.system.nu
-        self._goal = [*zip(self.system.target, self.plant.weights.tolist(), strict=True)]
+        self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []

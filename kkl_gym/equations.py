@@ -146,7 +146,11 @@ def check_equations(system: Any) -> None:
             wanted = "for each state of a batch what it returns for that state alone, and always the same"
             found = f"{batch[0].tolist()} in a batch and {alone[0].tolist()} alone; {held(starts[0])}"
             raise returned(equations, wanted, f"{found}: sum, max and norm mix states, use arithmetic on components")
-    _check_target(system)
+    try:
+        target_of(system)
+    except EquationError as error:
+        if not isinstance(error.__cause__, ValueError):  # there is none at these parameters, as environments will say
+            raise
 
 
 def _values(system: Any, name: str, x: Any) -> list[Any]:
@@ -174,18 +178,34 @@ def _checked_starts(system: Any) -> np.ndarray:
     return starts.astype(float)
 
 
-def _check_target(system: Any) -> None:
+def target_of(system: Any) -> Any:
+    """A system's target, checked.
+
+    Parameters
+    ----------
+    system : System
+        The system.
+
+    Returns
+    -------
+    sequence of float, length nx
+        The target, untouched.
+
+    Raises
+    ------
+    EquationError
+        If it fails, as where there is no equilibrium, or is something else than a state.
+    """
     found, nx = f"target of {system.name!r}", system.nx
     try:
         target = system.target
-    except ValueError:  # there is none at these parameters; whoever needs one will say so
-        return
     except Exception as error:  # whatever a user's code raises
         raise _unfinished(found, error) from error
     if callable(target):
         raise EquationError(f"{found} is a method: write @property above its def")
     if not _is_sequence(target) or len(target) != nx or not all(_fits(t, 0.0) and math.isfinite(t) for t in target):
         raise EquationError(f"{found} must be {nx} finite numbers, one for each state, got {shown(target)}")
+    return target
 
 
 def _unfinished(what: str, error: Exception) -> EquationError:

@@ -10,7 +10,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from kkl_gym.compiled import batch_step
-from kkl_gym.equations import components
+from kkl_gym.equations import components, target_of
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.simulate import followed_rows
@@ -120,7 +120,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         nx, ny = self.system.nx, self.system.ny
         self._low, self._high = (np.array(bound)[:, None] for bound in zip(*self.system.bounds, strict=True))
         self._u_max = np.array(self.system.u_max)
-        self._target = np.array(self.system.target)[:, None]
+        self._target = np.array(target_of(self.system))[:, None]
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.

@@ -43,12 +43,16 @@ def test_own_system(tmp_path):
 
 # What makes each of the commands for a system of one's own a matter of seconds.
 SMALL = {
+    "check": "",
     "tune": "--modes 2 --duration 5",
     "train": "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch 64 --inverse-steps 9 --threads 1",
     "evaluate": "--trajectories 3 --duration 8",
     "certify": "--trajectories 2",
     "faults": "--trajectories 4 --duration 6",
-    "agent": "--timesteps 1",
+    "agent train": "--timesteps 1",
+    "agent compare": "--information state x_hat --seeds 1 --episodes 2 --timesteps 1 --jobs 1",
+    "demo": "--duration 1",
+    "speed": "--steps 5 --turns 1 --num-envs 4 --vector-steps 3",
 }
 
 
@@ -56,30 +60,33 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
-    commands, script = re.findall(r"```(?:sh|python)\n(.*?)```", OWN_SYSTEM, re.DOTALL)
+    commands, own, registered = re.findall(r"```(?:sh|python)\n(.*?)```", OWN_SYSTEM, re.DOTALL)
     done = []
     for line in commands.splitlines():
         kkl_gym, command, *rest = line.split()
         assert kkl_gym == "kkl-gym"
-        main([command, *rest, *SMALL[command].split()])
-        done.append(command)
+        name = f"{command} {rest[0]}" if command == "agent" else command
+        main([command, *rest, *SMALL[name].split()])
+        done.append(name)
     assert done == list(SMALL)
     printed = capsys.readouterr().out
-    for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors"):
+    for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors", "scores.png"):
         assert written in printed
     path = "runs/pendulum/pendulum.safetensors"
     with pytest.raises(SystemExit, match="--system"):
         main(["evaluate", path])
 
     made = {}
-    exec(script, made)
-    env, envs = made["env"], made["envs"]
-    x_hat, info = env.reset(seed=0)
-    assert env.spec.id == "HiddenPendulum-v0"
-    assert env.unwrapped.system.name == "pendulum"
-    assert x_hat.shape == info["x"].shape == (2,)
-    assert envs.reset(seed=0)[0].shape == (8, 2)
-    assert [make.close() for make in (env, envs)] == [None, None]
+    for script, env_id in ((own, "kkl_gym/Own-v0"), (registered, "HiddenPendulum-v0")):
+        exec(script, made)
+        env, envs = made["env"], made["envs"]
+        x_hat, info = env.reset(seed=0)
+        assert env.spec.id == env_id
+        assert env.unwrapped.system.name == "pendulum"
+        assert x_hat.shape == info["x"].shape == (2,)
+        assert ("x_hat" in info) == (script is own)
+        assert envs.reset(seed=0)[0].shape == (8, 2)
+        assert [make.close() for make in (env, envs)] == [None, None]
 
 
 def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
@@ -92,7 +99,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
         main([command, *rest, *SMALL[command].split(), *extra])
     with pytest.raises(SystemExit, match="--policy"):
         main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])
-    assert "runs/balance/report.png" in capsys.readouterr().out
+    assert "wrote runs/balance/cart_pole.safetensors" in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_cart_pole(tmp_path, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from wrong_systems import Branching, Late, Wide
 
-from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, get_system
+from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
 from kkl_gym.compiled import batch_step, compiled_step
 from kkl_gym.equations import components
 from kkl_gym.simulate import advance, advance_batch, simulate
@@ -264,16 +264,28 @@ def test_tracing_says_where():
     assert re.match(rf"EquationError: f\(x\) of 'late' {HERE}", batch_step(Late()).obstacle)
 
 
+class Long(Wide):
+    name = "long"
+    dt = 0.01
+
+    def step(self, x, u):
+        return self.f(x)
+
+
 @pytest.mark.parametrize(
     "step",
     [
+        lambda: advance(Long(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01),
+        lambda: advance_batch(Long(), many, none, 0.0 * many, 0.01),
         lambda: advance(Wide(), (0.5, 0.5), (0.0,), (0.0, 0.0), 0.01),
         lambda: advance_batch(Wide(), many, none, 0.0 * many, 0.01),
         lambda: simulate(Wide(), many.T, 3, 0.01),
     ],
 )
 def test_what_a_loop_cannot_take_is_looked_at_again(step):
-    with pytest.raises(EquationError, match=r"f\(x\) of 'wide' \(.*\) must return 2 components, .* 3 of them"):
+    with pytest.raises(
+        EquationError, match=r"^(f\(x\) of 'wide'|step\(x, u\) of 'long') \(.*\) must return 2 .* 3 of them"
+    ):
         step()
 
 
@@ -309,13 +321,32 @@ class Checked(Draining):
         return math.sqrt(level) if isinstance(level, float) else level**0.5
 
 
+class Sped(Draining):
+    name = "sped"
+
+    def rate(self, x):
+        return 1.0 + abs(x[0]) + 0.0 * abs(x[0] ** 0.5)
+
+
+class Stepping(Draining):
+    """The same in discrete time."""
+
+    name = "stepping"
+    dt = 0.1
+
+    def step(self, x, u):
+        return (x[0] - 0.1) ** 0.5, x[1]
+
+
+REAL = "must return real numbers; it returned complex ones on the way from x"
+
+
 @pytest.mark.parametrize(
     ("system", "message"),
     [
-        (
-            Draining(),
-            r"f\(x\) of 'draining' \(.*\) must return real numbers; it returned complex ones on the way from x",
-        ),
+        (Draining(), rf"f\(x\) of 'draining' \(.*\) {REAL}"),
+        (Sped(), rf"f\(x\) of 'sped' \(.*\) {REAL}"),
+        (Stepping(), rf"step\(x, u\) of 'stepping' \(.*\) {REAL}"),
         (Checked(), r"f\(x\) of 'checked' failed in .*: ValueError: math domain error; x = \(-0.*elementary\.sqrt"),
     ],
 )
@@ -362,6 +393,49 @@ def test_outputs_that_fail_on_the_way(make):
         EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which \[0\]"
     ):
         env.step(np.zeros(env.action_space.shape))
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("raise ValueError('no equilibrium here')", "(`raise ValueError('no equilibrium here')`): ValueError: no equi"),
+        ("return math.sqrt(-1), 0.0", "(`return math.sqrt(-1), 0.0`): ValueError: math domain error"),
+    ],
+)
+def test_a_target_that_does_not_exist_is_for_environments_to_miss(tank, body, message):
+    path = tank(more=f"@property\ndef target(self):\n    {body}")
+    system = get_system(f"{path}:Tank")
+    for make in (lambda: KKLEnv(system), lambda: KKLVectorEnv(system, 2)):
+        with pytest.raises(EquationError, match=re.escape(message)) as raised:
+            make()
+        assert str(raised.value).startswith(f"target of 'tank' failed in {path}, line ")
+
+
+def test_equations_without_source():
+    names = {}
+    exec("import math\ndef f(self, x):\n    return x[1], math.sin(x[0])", names)
+    kind = type("Typed", (Draining,), {"name": "typed", "f": names["f"]})
+    with pytest.raises(EquationError, match=r"^f\(x\) of 'typed' failed in <string>, line 3: TypeError: .* equations"):
+        get_system(kind)
+
+
+def test_what_is_not_implemented_says_so_itself():
+    kind = type("Partial", (System,), {"name": "partial", "X": ((0, 1),), "bounds": ((0, 1),)})
+    with pytest.raises(NotImplementedError, match="Partial does not define f"):
+        kind().drift(np.zeros((3, 1)))
+    with pytest.raises(NotImplementedError, match="Partial does not define f"):
+        advance(kind(), (0.5,), (), (0.0,), 0.1)
+
+
+def test_bounds_within_which_an_output_is_lost():
+    class Lost(Draining):
+        name = "lost"
+
+        def h(self, x):
+            return (elementary.sqrt(x[0]), x[0] / x[1])
+
+    with pytest.raises(EquationError, match=r"h\(x\) of 'lost' .* must return numbers everywhere within .*: tighten"):
+        KKLEnv(Lost())
 
 
 def test_any_function_of_components():

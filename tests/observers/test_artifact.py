@@ -255,7 +255,7 @@ def test_filters_of_nothing(shape, file):
     rewrite(file, lambda tensors, meta: tensors.update(A=-np.eye(shape[0]), B=np.ones(shape)))
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert "A must be (nz, nz)" in str(raised.value)
+    assert "got nz = " in str(raised.value)
 
 
 def test_maps_that_estimate_nothing(file):
@@ -266,7 +266,7 @@ def test_maps_that_estimate_nothing(file):
     rewrite(file, empty)
     with raises_naming(file) as raised:
         Artifact.read(file)
-    assert "weights must be (outputs, inputs)" in str(raised.value)
+    assert "must estimate one state at least" in str(raised.value)
 
 
 @pytest.mark.parametrize("dt", [0.0, -0.01, True, "0.01", None, 10**400, np.inf, np.nan, [0.01]])

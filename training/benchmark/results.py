@@ -1,7 +1,7 @@
 """The results of a benchmark's jobs, put together: as CSV files, as a table and as a figure."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ def collect(out: Path) -> None:
         with explained(folder, ValueError):
             errors.append(pd.read_csv(folder / "errors.csv"))
             info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
-            its = {rule: job[rule] for rule in ("budget", "protocol", "search", "validation", "seed", "version")}
+            its = _rules(job, folder.parent.name)
             speed = folder / "speed.json"
             costs.append(
                 {
@@ -79,6 +79,19 @@ def collect(out: Path) -> None:
                 )
     write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
     write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
+
+
+def _rules(job: Mapping[str, Any], system: str) -> dict[str, Any]:
+    """What the jobs of one benchmark agree in. Systems of the user's have sampling intervals and noise of their own."""
+    budget, dt = dict(job["budget"]), job["budget"]["dt"]
+    budget |= {"duration": f"{budget['duration'] / dt:.0f} samples", "dt": None}
+    own = "" if system in SYSTEMS else f" of {system}"
+    rules = {"budget": budget, f"dt{own}": dt}
+    for name in ("protocol", "validation"):
+        described = dict(job[name])
+        rules[f"measurement_noise{own}"] = described.pop("measurement_noise")
+        rules[name] = described | {"duration": f"{described['duration'] / dt:.0f} samples"}
+    return rules | {name: job[name] for name in ("search", "seed", "version")}
 
 
 def report(out: Path) -> str:

@@ -1,5 +1,11 @@
-"""How much the benchmark gives each method, and how it is measured: what is behind ``--budget`` and ``--quick``."""
+"""How much the benchmark gives each method, and how it is measured: what is behind ``--budget`` and ``--quick``.
 
+Times are at the pace of the shipped systems; other systems are given as many samples of their own.
+"""
+
+from dataclasses import replace
+
+from kkl_gym.system import System
 from training.benchmark.protocol import Protocol
 from training.methods import Budget
 
@@ -24,3 +30,14 @@ PROTOCOL = Protocol()
 QUICK_PROTOCOL = Protocol(trajectories=5, duration=10.0)
 VALIDATION = Protocol(trajectories=20, duration=20.0)
 SEARCH = 0.2  # of the budget's CPU seconds, for each configuration that is compared
+
+
+def paced_budget(budget: Budget, system: System) -> Budget:
+    """The same at a system's own pace."""
+    dt = float(f"{budget.dt * system.pace:.12g}")  # the system's own, where rounding would not have it so
+    return replace(budget, duration=budget.duration * system.pace, dt=dt)
+
+
+def paced_protocol(protocol: Protocol, system: System) -> Protocol:
+    """The same at a system's own pace."""
+    return replace(protocol, duration=protocol.duration * system.pace)

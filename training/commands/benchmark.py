@@ -1,6 +1,5 @@
 """``kkl-gym benchmark``."""
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -9,6 +8,9 @@ import tyro
 from rich.console import Console
 
 from kkl_gym.systems import SYSTEMS, get_system
+from observers.checks import noise_levels
+from training.commands.options import NoiseLevels
+from training.evaluation.levels import multiple, show_level
 from training.progress import LOG, progress_bars, under_way
 from training.seeds import Stream, generator
 
@@ -36,8 +38,8 @@ class Benchmark:
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
     """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, ekf, ukf, ekf-wrong, ekf-untuned; or classes of yours
     as script.py:Class or module:Class."""
-    measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(aliases=["--noise"])] = (0.0, 0.5)
-    """Standard deviations of the noise on each sample of y."""
+    measurement_noise: NoiseLevels = None
+    """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
     jobs: int = 2
@@ -107,34 +109,37 @@ class Benchmark:
         import torch
 
         from training.benchmark.jobs import Job
-        from training.benchmark.sizes import BUDGETS, PROTOCOL, QUICK_PROTOCOL, SEARCH, VALIDATION
+        from training.benchmark.sizes import BUDGETS, PROTOCOL, QUICK_PROTOCOL, SEARCH, VALIDATION, paced_budget
+        from training.benchmark.sizes import paced_protocol as paced
         from training.methods import METHODS, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
-        if self.jobs < 1 or not self.systems or not methods or not levels:
+        if self.jobs < 1 or not self.systems or not methods or levels == ():
             raise ValueError("give at least one system, method, noise level and worker process")
-        if any(not 0 <= level < math.inf for level in levels):
-            raise ValueError(f"measurement_noise = {levels} must be finite and not negative")
         generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
-        for names in (*named, [f"{level:g}" for level in levels]):
+        for names in (*named, [show_level(level) for level in levels or ()]):
             if len(set(names)) < len(names):
                 raise ValueError(f"{names} has one of them twice")
-        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, measurement_noise=levels, seed=self.seed)
+        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, seed=self.seed)
         budget = BUDGETS[name]
         search = None if self.quick else SEARCH * budget.cpu_seconds
         device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
-        return [
-            Job(
-                system=system,
-                method=method,
-                folder=out / "jobs" / get_system(system).name / get_method(method).name,
-                budget=budget,
-                protocol=protocol,
-                search=search,
-                validation=replace(VALIDATION, measurement_noise=levels),
-                device=device,
-            )
-            for system in self.systems
-            for method in methods
-        ]
+        jobs = []
+        for given in self.systems:
+            system = get_system(given)
+            noise = tuple(noise_levels("measurement_noise", level, system.ny) for level in levels or ())
+            noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
+            for method in methods:
+                job = Job(
+                    system=given,
+                    method=method,
+                    folder=out / "jobs" / system.name / get_method(method).name,
+                    budget=paced_budget(budget, system),
+                    protocol=replace(paced(protocol, system), measurement_noise=noise),
+                    search=search,
+                    validation=replace(paced(VALIDATION, system), measurement_noise=noise),
+                    device=device,
+                )
+                jobs.append(job)
+        return jobs

@@ -40,7 +40,7 @@ class Certify:
     policy: OwnPolicy = None
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, or one for each output as in 0.1,0.3. For the theorems it is
-    cut at three of these. A map whose range it is beyond is left out."""
+    cut at three of these. Maps that were trained for less are left out."""
     process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
     """Bound of the process noise, in multiples of the system's scale per second."""
     psi: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the motion's diameter)")] = None

@@ -15,7 +15,7 @@ import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
-from training.commands.options import Duration, NoiseLevel, OneObserver, OneSystem, Shown, shown
+from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
@@ -36,7 +36,7 @@ class Demo:
     """Folder for the figure: estimates.png, of one system alone estimates-NAME.png."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y."""
-    duration: Duration = None
+    duration: Seconds = None
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""

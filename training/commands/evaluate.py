@@ -15,11 +15,11 @@ from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
 from training.commands.options import (
-    Duration,
     NoiseLevels,
     Observers,
     OwnPolicy,
     OwnSystem,
+    Seconds,
     read_observers,
     read_policy,
 )
@@ -57,7 +57,8 @@ class Evaluate:
     2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
     told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is
     there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
-    Under a policy, those are driven in which it errs about the state and explores.
+    Under a policy, those are driven in which it errs about the state and explores; in the others its inputs tell the
+    state to an observer that has learned the policy.
     """
 
     observers: Observers
@@ -70,7 +71,7 @@ class Evaluate:
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
-    duration: Duration = None
+    duration: Seconds = None
     """Length of each trajectory in seconds; 50 for the systems that ship."""
     seed: int = 0
     """Seed of the trajectories and the noise; no seed gives any that training draws."""

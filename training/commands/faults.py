@@ -12,7 +12,16 @@ from rich.table import Column, Table
 from kkl_gym import SYSTEMS
 from observers.storage import replacing, write
 from training import markdown
-from training.commands.options import Observers, OwnPolicy, OwnSystem, read_observers, read_policy
+from training.commands.options import (
+    NoiseLevel,
+    Observers,
+    OwnPolicy,
+    OwnSystem,
+    Seconds,
+    read_observers,
+    read_policy,
+)
+from training.evaluation.levels import beyond, level_for
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
@@ -36,10 +45,11 @@ class Faults:
     policy: OwnPolicy = None
     trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 500
     """Number of trajectories for each observer."""
-    duration: float = 50.0
-    """Length of each trajectory in seconds."""
-    measurement_noise: float = 0.5
-    """Standard deviation of the noise on each sample of y."""
+    duration: Seconds = None
+    """Length of each trajectory in seconds; 50 for the systems that ship."""
+    measurement_noise: NoiseLevel = None
+    """Standard deviation of the noise on each sample of y, or one for each output as in 0.1,0.3. Maps that were trained
+    for less are left out."""
     seed: int = 0
     """Seed of starts, inputs and noise."""
     out: Path = Path("runs/faults")
@@ -76,19 +86,25 @@ class Faults:
         frames = []
         with progress_bars(console) as progress:
             for name, artifact, system in read_observers(self.observers, self.system):
+                level = level_for(artifact, system, self.measurement_noise)
+                if reason := beyond(artifact, level):
+                    progress.say(f"{name}, left out: {reason}")
+                    continue
                 with progress.phase(f"breaking the sensor of {name}", PARTS) as report_parts:
                     found = simulate_faults(
                         artifact,
                         system,
                         trajectories=self.trajectories,
-                        duration=self.duration,
-                        measurement_noise=self.measurement_noise,
+                        duration=system.duration if self.duration is None else self.duration,
+                        measurement_noise=level,
                         seed=self.seed,
                         policy=read_policy(artifact, system, self.policy),
                         report=report_parts,
                     )
                 found.insert(0, "observer", name)
                 frames.append(found)
+        if not frames:
+            raise ValueError(f"nothing is left of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
         write(self.out / "faults.csv", found.to_csv(index=False, float_format="%.6g"))
         console.print(report(self.out))

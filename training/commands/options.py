@@ -77,7 +77,7 @@ NoiseLevels = Annotated[
     ),
     tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: 0 and the system's own)"),
 ]
-Duration = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
+Seconds = Annotated[float | None, tyro.conf.arg(metavar="SECONDS", help_behavior_hint="(default: the system's own)")]
 OwnPolicy = Annotated[
     str | None,
     tyro.conf.arg(

@@ -11,8 +11,10 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.commands.options import Parameters, SystemName
+from observers.checks import noise_levels
+from training.commands.options import NoiseLevel, Parameters, Seconds, SystemName
 from training.config import Pipeline
+from training.evaluation.levels import Level, show_level
 from training.presets import preset
 from training.progress import progress_bars
 from training.spectrum import Spectrum, papers_spectrum
@@ -37,15 +39,15 @@ class Tune:
     system: SystemName
     pipeline: Pipeline = "input-aware"
     """What is to be trained with the spectrum, as for `kkl-gym train`."""
-    measurement_noise: float = 0.5
-    """Standard deviation of the noise on each sample of y."""
+    measurement_noise: NoiseLevel = None
+    """Standard deviation of the noise on each sample of y, or one for each output as in 0.1,0.3."""
     modes: int = 21
     """Most modes for each output. They cost time in every step, and training. Below the number of the default's real
     ones, all are chosen anew. spinn has 2 nx + 1."""
-    dt: float = 0.01
-    """Sampling interval in seconds."""
-    duration: float = 50.0
-    """Length of a run in seconds: how much transients count."""
+    dt: Seconds = None
+    """Sampling interval in seconds; 0.01 for the systems that ship."""
+    duration: Seconds = None
+    """Length of a run in seconds: how much transients count. 50 for the systems that ship."""
     parameters: Parameters = field(default_factory=dict)
     seed: int = 0
     """Seed of the motions' starts."""
@@ -73,46 +75,48 @@ class Tune:
         ValueError
             If an option makes no sense, or the system's motions cannot be followed.
         """
-        if not 0 <= self.measurement_noise < np.inf or self.modes < 1:
-            raise ValueError(
-                f"measurement_noise = {self.measurement_noise} must not be negative, modes = {self.modes} be positive"
-            )
+        if self.modes < 1:
+            raise ValueError(f"modes = {self.modes} must be positive")
         if self.check is not None and not 0 < self.check < np.inf:
             raise ValueError(f"check = {self.check} must be a positive number of seconds")
         if self.check is not None and self.pipeline == "spinn":
             raise ValueError("check trains input-aware maps: it must be left out with --pipeline spinn")
         system = get_system(self.system, self.parameters)
+        runs = _Runs.of(self, system)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
-        folder = self.out or Path("runs") / "tuning" / f"{name}-{self.measurement_noise:g}{given.replace(' ', '-')}"
+        folder = (
+            self.out
+            or Path("runs") / "tuning" / f"{name}-{show_level(runs.noise).replace(', ', '-')}{given.replace(' ', '-')}"
+        )
         again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
         again += f" --pipeline {self.pipeline}" if self.pipeline != "input-aware" else ""
         again += f" --parameters{given}" if given else ""
         if self.pipeline == "spinn":
-            return self._intervals(system, console, folder=folder, again=again)
-        found = self._compare(system, console)
+            return self._intervals(system, runs, console, folder=folder, again=again)
+        found = self._compare(system, runs, console)
         console.print(found.table())
-        found.save(folder, {"dt": self.dt})
+        found.save(folder, {"dt": runs.dt})
         console.print(f"wrote config.json, front.csv and front.png in {folder}; to train an observer with it:\n{again}")
         if self.check is not None:
-            self._check(console, found, folder)
+            self._check(console, found, runs, folder)
         return found.best
 
-    def _intervals(self, system: System, console: Console, *, folder: Path, again: str) -> Choice:
+    def _intervals(self, system: System, runs: "_Runs", console: Console, *, folder: Path, again: str) -> Choice:
         """Judge intervals for a physics-informed map, print and write."""
         from training.tuning.intervals import judge  # pandas takes half a second to import
 
         with progress_bars(console) as progress, progress.phase(f"judging intervals for {system.name}", 100) as report:
             found = judge(
                 system,
-                self.dt,
-                duration=self.duration,
-                measurement_noise=self.measurement_noise,
+                runs.dt,
+                duration=runs.duration,
+                measurement_noise=runs.noise,
                 seed=self.seed,
                 report=lambda share: report(100 * share),
             )
-        console.print(found.table(f"{system.name}, measurement noise {self.measurement_noise:g}"))
-        found.save(folder, self.dt)
+        console.print(found.table(f"{system.name}, measurement noise {show_level(runs.noise)}"))
+        found.save(folder, runs.dt)
         if not any(one.smooth for one in found.smoothness):
             console.print("[yellow]no interval makes T smooth;[/yellow] the written one comes closest")
         best, papers = found.best.spectrum.eigenvalues, papers_spectrum(system)
@@ -121,24 +125,24 @@ class Tune:
         console.print(f"wrote config.json and intervals.csv in {folder}; to train an observer with it:\n{again}")
         return found.best
 
-    def _compare(self, system: System, console: Console) -> "Found":
+    def _compare(self, system: System, runs: "_Runs", console: Console) -> "Found":
         """Spectra chosen for some levels of noise, others for the one asked for, and the best."""
         from training.tuning.found import EXTENDED, Found
 
         start = Spectrum(preset(system, "input-aware", "fast").eigenvalues)
-        noise = self.measurement_noise
-        levels = sorted({0.0, noise, noise / 5 if noise else 0.1, 2 * noise if noise else 0.5})
+        noise = runs.noise
+        levels = runs.levels(system)
         with (
             progress_bars(console) as progress,
             progress.phase(f"choosing modes for {system.name}", 3 + len(levels)) as report,
         ):
-            probe = Probe(system, self.dt, self.duration, seed=self.seed, start=start)
+            probe = Probe(system, runs.dt, runs.duration, seed=self.seed, start=start)
             fronts = {}
             for done, level in enumerate(levels, 1):
                 report(done)
                 fronts[level] = probe.choose(level, self.modes, anew=True)
             report(1 + len(levels))
-            others = self._others(probe)
+            others = self._others(probe, noise)
             report(2 + len(levels))
             if start.modes <= self.modes:
                 best = replace(probe.choose(noise, self.modes)[-1], kind=EXTENDED)
@@ -146,11 +150,11 @@ class Tune:
             else:
                 small = [choice for choice in [fronts[noise][-1], *others] if choice.spectrum.modes <= self.modes]
                 best = min(small, key=lambda choice: choice.error)
-        return Found(system, noise, fronts, others, best, least=probe.least(noise) if noise else None)
+        return Found(system, noise, fronts, others, best, least=probe.least(noise) if np.min(noise) else None)
 
-    def _others(self, probe: Probe) -> list[Choice]:
+    def _others(self, probe: Probe, noise: Level) -> list[Choice]:
         """The package's default and the paper's, whatever their size, and Bessel filters of few enough modes."""
-        system, noise = probe.system, self.measurement_noise
+        system = probe.system
         default = preset(system, "input-aware", "fast")
         named = {"default": Spectrum(default.eigenvalues, default.pairs), "paper's": Spectrum(papers_spectrum(system))}
         found = [Choice(one, probe.error(one, noise), kind) for kind, one in named.items()]
@@ -159,7 +163,7 @@ class Tune:
             return found
         return found + probe.bessel(noise, orders, CUTOFFS * np.median(probe.frequencies))
 
-    def _check(self, console: Console, found: "Found", folder: Path) -> None:
+    def _check(self, console: Console, found: "Found", runs: "_Runs", folder: Path) -> None:
         """Train observers for some of the spectra, and compare what they leave with what was predicted."""
         import torch
 
@@ -177,8 +181,8 @@ class Tune:
                     choice.spectrum,
                     measurement_noise=found.noise,
                     seconds=self.check,
-                    dt=self.dt,
-                    duration=self.duration,
+                    dt=runs.dt,
+                    duration=runs.duration,
                 )
                 for choice in progress.track(choices, description=f"training observers of {found.system.name}")
             ]
@@ -192,3 +196,29 @@ class Tune:
             for choice, left in zip(choices, measured, strict=True)
         ]
         write_csv(folder / "check.csv", ["kind", "modes", "predicted", "trained"], rows)
+
+
+@dataclass(frozen=True)
+class _Runs:
+    """What is asked for, or the system's own: noise, sampling interval and length of the runs."""
+
+    noise: Level
+    dt: float
+    duration: float
+
+    @classmethod
+    def of(cls, asked: Tune, system: System) -> "_Runs":
+        given = system.measurement_noise if asked.measurement_noise is None else asked.measurement_noise
+        return cls(
+            noise_levels("measurement_noise", given, system.ny),
+            system.dt if asked.dt is None else asked.dt,
+            system.duration if asked.duration is None else asked.duration,
+        )
+
+    def levels(self, system: System) -> list[Level]:
+        """None, the one that is asked for, and others about it; about the system's own if none is asked for."""
+        asked = bool(np.any(self.noise))
+        about = self.noise if asked else system.measurement_noise
+        others = np.divide(about, 5), np.multiply(2 if asked else 1, about)
+        found = {0.0, self.noise, *(noise_levels("measurement_noise", level, system.ny) for level in others)}
+        return sorted(found, key=lambda level: np.atleast_1d(level).tolist())

@@ -1,7 +1,7 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -248,7 +248,7 @@ def errors(
     ValueError
         If the level of noise is none, or beyond the map's range.
     """
-    level: Any = noise_levels("measurement_noise", measurement_noise, system.ny)
+    level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
     y = _measured(system, trajectories, level, seed)
     x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
@@ -293,7 +293,7 @@ def kalman_errors(
     ValueError
         If the level of noise is none, or the equations take no symbols.
     """
-    level: Any = noise_levels("measurement_noise", measurement_noise, system.ny)
+    level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = _measured(system, trajectories, level, seed)
     assumed = max(trajectories.process_noise, LEAST_PROCESS_NOISE / system.pace)
     Q = np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)  # of a uniform w that is held over dt
@@ -305,7 +305,7 @@ def kalman_errors(
     return _errors(trajectories, x_hat, dt, skip)
 
 
-def _measured(system: System, trajectories: UnseenTrajectories, level: Any, seed: int) -> np.ndarray:
+def _measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(system, trajectories.x, measurement_noise=level, rng=rng)
 

@@ -9,6 +9,7 @@ import pandas as pd
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.evaluation.calibration import sound_trajectories
+from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.systems import profile
 from training.trajectories.controllers import Controller
@@ -30,7 +31,7 @@ def simulate_faults(
     *,
     trajectories: int,
     duration: float,
-    measurement_noise: float | tuple[float, ...],
+    measurement_noise: Level,
     seed: int,
     policy: Controller | None = None,
     report: Callable[[int], object] = lambda done: None,

@@ -1,6 +1,5 @@
 """Levels of measurement noise: as people write them, and as far as a map knows them."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -75,6 +74,8 @@ def multiple(system: System, factor: float) -> Level:
 def level_for(artifact: Artifact, system: System, given: Level | None = None) -> Level:
     """Return the level of measurement noise that is asked for; by default the system's own, as far as a map knows it.
 
+    A map that is told one level for all outputs gets the largest of those that are the system's own.
+
     Parameters
     ----------
     artifact : Artifact
@@ -94,8 +95,13 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
     ValueError
         If what is given is no level, or not one for each output.
     """
-    level = np.minimum(system.measurement_noise, _largest(artifact)) if given is None else given
-    return noise_levels("measurement_noise", level, system.ny)
+    if given is not None:
+        return noise_levels("measurement_noise", given, system.ny)
+    own = multiple(system, 1.0)
+    try:
+        return artifact.inverse.within(own)
+    except ValueError:
+        return artifact.inverse.within(float(np.max(own)))
 
 
 def beyond(artifact: Artifact, level: Level) -> str:
@@ -113,13 +119,10 @@ def beyond(artifact: Artifact, level: Level) -> str:
     str
         The reason; empty if the map can.
     """
-    largest = _largest(artifact)
-    if (np.asarray(level) <= largest).all():
-        return ""
-    return f"measurement noise {show_level(level)} is beyond the map's range, 0 to {show_level(largest)}"
-
-
-def _largest(artifact: Artifact) -> Level:
-    """Where the map's range ends; infinity for a map that is not told the level."""
-    inverse = artifact.inverse
-    return inverse.measurement_noise_max if "measurement_noise" in inverse.features else math.inf
+    try:
+        if artifact.inverse.within(level) == level:
+            return ""
+    except ValueError as error:
+        return str(error)
+    ranges = ", ".join(f"0 to {largest:g}" for largest in np.atleast_1d(artifact.inverse.measurement_noise_max))
+    return f"measurement noise {show_level(level)} is beyond the map's range, {ranges}"

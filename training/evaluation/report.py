@@ -23,7 +23,8 @@ def write_report(
     """Draw the errors in training, the PDE residual over the domain, and estimates against the truth.
 
     Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
-    unseen, without process noise and input but a policy's, and not those that ``kkl-gym evaluate`` takes.
+    unseen, without process noise and input but a policy's, and not those that ``kkl-gym evaluate`` takes. Above each
+    state stands its NRMSE after the transient, the median of 20 of them.
 
     Parameters
     ----------
@@ -65,6 +66,7 @@ def write_report(
     for column, level in enumerate((0.0, artifact.measurement_noise)):
         y = noisy_output(system, x, measurement_noise=level, rng=rng)
         x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y, u)
+        nrmse = errors(artifact, system, trajectories, measurement_noise=level, seed=seed).nrmse
         for i in range(system.nx):
             ax = figure.add_subplot(grid[1 + i, column])
             ax.plot(t, x[..., i], "k", lw=1.2, label="true")
@@ -73,6 +75,8 @@ def write_report(
             if i == 0:
                 ax.set_title(f"measurement noise {show_level(level)}")
                 ax.legend(loc="upper right")
+            if len(nrmse) and not np.isnan(nrmse[0, i]):
+                ax.set_title(f"NRMSE {np.median(nrmse[:, i]):.2g} %", loc="right", fontsize="medium")
         ax.set_xlabel("t in s")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)

@@ -11,44 +11,49 @@ import torch
 from scipy.stats import spearmanr
 
 from kkl_gym.system import System
+from observers.checks import noise_levels
 from training.evaluation.errors import errors, unseen_trajectories
+from training.evaluation.levels import Level, multiple
 from training.pipeline import train
 from training.presets import preset
 from training.seeds import Stream
 from training.spectrum import Spectrum
 
-LEAST_NOISE = 0.01  # that a map is trained for, also where none is expected
+LEAST_NOISE = 0.02  # of the system's own, that a map is trained for, also where none is expected
 HEADROOM = 4.0  # of the noise that a map is trained for over the noise that is expected: it does better so
 TRAJECTORIES = 500  # of each training
 RUNS = 50  # on which its observer is measured
 
 
-def settings(spectrum: Spectrum, measurement_noise: float) -> dict[str, Any]:
+def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> dict[str, Any]:
     """Find the settings of a :class:`training.config.Config` that make an observer for some noise.
 
     Parameters
     ----------
+    system : System
+        To be observed.
     spectrum : Spectrum
         Of its filter.
-    measurement_noise : float
-        Standard deviation that is expected on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation that is expected on each sample of y, of all outputs or each.
 
     Returns
     -------
     dict
         Settings by name; the others are the preset's.
     """
+    largest = np.maximum(HEADROOM * np.asarray(measurement_noise), multiple(system, LEAST_NOISE))
     return {
         "eigenvalues": spectrum.eigenvalues,
         "pairs": spectrum.pairs,
-        "measurement_noise_max": max(HEADROOM * measurement_noise, LEAST_NOISE),
-        "noise_free_share": 0.05 if measurement_noise else 0.9,
+        "measurement_noise_max": noise_levels("measurement_noise_max", largest, system.ny),
+        "noise_free_share": 0.05 if np.any(measurement_noise) else 0.9,
         "high_noise_emphasis": 4.0,
     }
 
 
 def trained_error(
-    system: System, spectrum: Spectrum, *, measurement_noise: float, seconds: float, dt: float, duration: float
+    system: System, spectrum: Spectrum, *, measurement_noise: Level, seconds: float, dt: float, duration: float
 ) -> float:
     """Train an observer of free motion and measure what it leaves.
 
@@ -58,8 +63,8 @@ def trained_error(
         To be observed.
     spectrum : Spectrum
         Of the filter.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seconds : float
         CPU time of the training.
     dt : float
@@ -74,7 +79,7 @@ def trained_error(
     """
     config = replace(
         preset(system, "input-aware", "fast"),
-        **settings(spectrum, measurement_noise),
+        **settings(system, spectrum, measurement_noise),
         inputs=False,
         trajectories=TRAJECTORIES,
         dt=dt,

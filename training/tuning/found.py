@@ -11,6 +11,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers.storage import replacing, write
+from training.evaluation.levels import Level, as_cell, show_level
 from training.tuning.check import settings
 from training.tuning.probe import Choice
 
@@ -28,21 +29,21 @@ class Found:
     ----------
     system : System
         That is to be observed.
-    noise : float
-        Standard deviation of the measurement noise to tune for.
-    fronts : dict of float to list of Choice
+    noise : float or tuple of float, length ny
+        Standard deviation of the measurement noise to tune for, of all outputs or each.
+    fronts : dict of levels of noise to list of Choice
         Spectra of more and more modes by level of noise.
     others : list of Choice
         To compare with, at ``noise``.
     best : Choice
         One of them.
     least : float or None
-        Error in percent of whoever knows the equations; None without noise.
+        Error in percent of whoever knows the equations; None where an output is without noise.
     """
 
     system: System
-    noise: float
-    fronts: dict[float, list[Choice]]
+    noise: Level
+    fronts: dict[Level, list[Choice]]
     others: list[Choice]
     best: Choice
     least: float | None
@@ -50,7 +51,7 @@ class Found:
     def table(self) -> Table:
         """For people."""
         table = Table(
-            "modes", "predicted error in %", "", title=f"{self.system.name}, measurement noise {self.noise:g}"
+            "modes", "predicted error in %", "", title=f"{self.system.name}, measurement noise {show_level(self.noise)}"
         )
         for choice in [*self.fronts[self.noise], *self.others]:
             mark = "[green]written[/green]" if choice is self.best else ""
@@ -61,10 +62,10 @@ class Found:
 
     def save(self, folder: Path, beside: dict[str, Any]) -> None:
         """Write config.json, with some settings beside those that were found, front.csv and front.png."""
-        config = {**settings(self.best.spectrum, self.noise), **beside}
+        config = {**settings(self.system, self.best.spectrum, self.noise), **beside}
         write(folder / "config.json", json.dumps(config, indent=2) + "\n")
         rows = [
-            (level, choice.kind, choice.spectrum.modes, choice.error)
+            (as_cell(level), choice.kind, choice.spectrum.modes, choice.error)
             for level, choices in [*self.fronts.items(), (self.noise, self.others)]
             for choice in choices
         ]
@@ -81,11 +82,11 @@ class Found:
         color = f"C{list(self.fronts).index(self.noise)}"
         for i, (level, choices) in enumerate(self.fronts.items()):
             width = 2 if level == self.noise else 1
-            left.semilogy(*_points(choices), "o-", color=f"C{i}", ms=3, lw=width, label=f"noise {level:g}")
+            left.semilogy(*_points(choices), "o-", color=f"C{i}", ms=3, lw=width, label=f"noise {show_level(level)}")
         for kind, marker in ((EXTENDED, "*"), ("default", "s"), ("paper's", "^"), ("Bessel", "x")):
             same = [choice for choice in self.others if choice.kind == kind]
             if same:
-                label = f"{kind}, noise {self.noise:g}"
+                label = f"{kind}, noise {show_level(self.noise)}"
                 left.semilogy(*_points(same), marker, color=color, ms=7, mfc="none", label=label)
         title = self.system.name.replace("_", " ")
         left.set(xlabel="modes for each output", ylabel="predicted error in %", title=title)
@@ -98,7 +99,7 @@ class Found:
         poles = self.best.spectrum.poles
         right.plot(poles.real, poles.imag, "x", color=color, label=f"written: {self.best.kind}")
         right.set(xscale="symlog", xlabel="Re λ in 1/s", ylabel="Im λ in rad/s")
-        right.set_title(f"eigenvalues of A, noise {self.noise:g}")
+        right.set_title(f"eigenvalues of A, noise {show_level(self.noise)}")
         right.legend(fontsize="small")
         return figure
 

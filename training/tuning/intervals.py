@@ -10,6 +10,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers.storage import write
+from training.evaluation.levels import Level
 from training.smoothness import Smoothness, intervals, smoothest, smoothness
 from training.spectrum import Spectrum, papers_spectrum
 from training.tuning.probe import Choice, Probe
@@ -81,7 +82,7 @@ def judge(
     dt: float,
     *,
     duration: float,
-    measurement_noise: float,
+    measurement_noise: Level,
     seed: int = 0,
     report: Callable[[float], object] = lambda share: None,
 ) -> Judged:
@@ -95,8 +96,8 @@ def judge(
         Sampling interval in seconds.
     duration : float
         Length in seconds of the runs over which errors are predicted.
-    measurement_noise : float
-        Standard deviation of the noise on each sample of y.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
     seed : int, default 0
         Of the motions' starts.
     report : callable, optional

@@ -152,7 +152,7 @@ def test_the_command_goes_on(tmp_path, capsys, monkeypatch):
     with pytest.raises(SystemExit, match="holds an agent already"):
         main(command)
     assert sorted(Path(tmp_path).glob("[!.]*")) == [
-        tmp_path / name for name in ("agent.checkpoint.pt", "agent.safetensors", "progress.csv")
+        tmp_path / name for name in ("agent.checkpoint.pt", "agent.safetensors", "log.txt", "progress.csv")
     ]
 
 

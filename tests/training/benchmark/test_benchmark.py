@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib
@@ -456,7 +457,7 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
         ({"methods": ()}, "at least one"),
         ({"jobs": 0}, "at least one"),
         ({"report": True}, "does not exist; run the benchmark first"),
-        ({"measurement_noise": (-0.1,)}, r"measurement_noise = \(-0.1,\) must be finite and not negative"),
+        ({"measurement_noise": (-0.1,)}, "measurement_noise must be a finite number, not negative, got -0.1"),
         ({"measurement_noise": (math.inf,)}, "measurement_noise"),
         ({"seed": -1}, "seed = -1 must be a whole number from 0"),
         ({"seed": 2**32}, "seed = 4294967296 must be"),
@@ -597,6 +598,46 @@ def test_levels_of_noise_by_both_names(toy, tiny, tmp_path):
         out = str(tmp_path / option)
         main(["benchmark", "--systems", "lorenz", "--methods", name, option, "0.25", "1", "--jobs", "1", "--out", out])
         assert set(pd.read_csv(tmp_path / option / "results.csv").noise) == {0.25, 1.0}
+
+
+SLOW = """
+from linear_system import Oscillator
+
+
+class Slow(Oscillator):
+    name, dt = "slow", 0.1
+
+
+class Two(Slow):
+    name = "two"
+    measurement_noise = (0.1, 0.3)
+
+    def h(self, x):
+        return x[0], x[1]
+"""
+
+
+def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeypatch):
+    """Beside one that ships, in one folder."""
+    script = tmp_path / "slow.py"
+    script.write_text(SLOW)
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", replace(SHORT, duration=5.0))
+    out = tmp_path / "out"
+    systems = ("van_der_pol", f"{script}:Slow", f"{script}:Two")
+    Benchmark(quick=True, systems=systems, methods=("ekf",), out=out, jobs=1).run(quiet())
+    jobs = [json.loads((out / "jobs" / name / "ekf" / "job.json").read_text()) for name in ("van_der_pol", "slow")]
+    assert [job["budget"]["dt"] for job in jobs] == [0.01, 0.1]
+    assert [job["budget"]["duration"] for job in jobs] == [20.0, 200.0]
+    assert [job["protocol"]["duration"] for job in jobs] == [5.0, 50.0]
+    assert [job["validation"]["duration"] for job in jobs] == [20.0, 200.0]
+    results = pd.read_csv(out / "results.csv")
+    levels = results.groupby("system").noise.unique().map(list).to_dict()
+    assert levels == {"van_der_pol": ["0.0", "0.5"], "slow": ["0.0", "0.1"], "two": ["0.0", "0.1, 0.3"]}
+    page = (out / "table.md").read_text()
+    cells = [rows_of(page, f"SMAPE in %, all steps, starts in X, noise {level}")[1] for level in ("0.1, 0.3", "0.5")]
+    assert [[cell == "–" for cell in one["EKF"]] for one in cells] == [[True, True, False], [False, True, True]]
+    shown = heatmap(results, pd.read_csv(out / "methods.csv"), note="")
+    assert [ax.get_title()[-3:] for ax in shown.axes[:-1:3]] == ["e 0", "0.1", "0.3", "0.5"]
 
 
 def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):

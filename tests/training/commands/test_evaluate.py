@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 
 import linear_system
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -86,6 +87,22 @@ def test_nrmse_says_what_smape_of_mixed_units_does_not(reactor):
         assert 0.1 < float(row[2]) < 0.4
         assert 1.5 < float(row[3]) < 2.5
     assert not below
+
+
+def test_levels_of_each_output(tmp_path, capsys):
+    system = f"{linear_system.__file__}:TwoOutputs"
+    linear_system.exact_observer(0.01, np.eye(2), "two-outputs").save(tmp_path / "two.safetensors")
+    options = [str(tmp_path / "two.safetensors"), "--system", system, "--trajectories", "2", "--duration", "2"]
+    main(["evaluate", *options, "--noise", "0", "0.2,0.1", "0.4", "--csv", str(tmp_path / "errors.csv")])
+    assert pd.read_csv(tmp_path / "errors.csv").measurement_noise.unique().tolist() == ["0.0", "0.2, 0.1", "0.4"]
+    assert "│ X      │ 0.2, 0.1 │" in capsys.readouterr().out
+    main(["evaluate", *options])
+    assert "│ X      │ 0.1, 0.3 │" in capsys.readouterr().out  # the system's own
+    with pytest.raises(SystemExit, match="one number, or one for each of 2 outputs"):
+        main(["evaluate", *options, "--noise", "1,2,3"])
+    with pytest.raises(SystemExit):
+        main(["evaluate", *options, "--noise", "loud"])
+    assert "write a number, or one for each output, as in 0.1,0.3" in " ".join(capsys.readouterr().err.split())
 
 
 def test_durations_and_levels_are_the_systems_own(reactor):

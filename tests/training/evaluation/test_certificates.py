@@ -21,6 +21,7 @@ from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.artifact import resolve
 from training import certify
 from training.cli import main
+from training.evaluation.certificates.certificate import parts
 from training.evaluation.certificates.gains import controllability, envelope, h2, h_infinity, theorem_gain
 from training.evaluation.certificates.generalisation import (
     forward_samples,
@@ -36,6 +37,7 @@ from training.evaluation.certificates.lipschitz import (
 )
 from training.evaluation.certificates.segments import segment_lipschitz, slopes
 from training.evaluation.certificates.settled import record_settled
+from training.filter_noise import stationary_covariance
 from training.maps.smooth import Smooth, decoder, encoder, residual
 
 A, B = np.diag([-1.0, -2.5, -4.0]), np.ones((3, 1))
@@ -63,7 +65,14 @@ def linear_observer(spoiled=1.0, A=A):
 
 @pytest.fixture(scope="module")
 def exact():
-    return certify(linear_observer(), Oscillator(), measurement_noise=0.5, process_noise=0.0, trajectories=50)
+    told = []
+    found = certify(
+        linear_observer(), Oscillator(), measurement_noise=0.5, process_noise=0.0, trajectories=50, report=told.append
+    )
+    assert told[0] == 1
+    assert told == sorted(told)
+    assert told[-1] == parts(linear_observer())
+    return found
 
 
 def test_exact_maps_have_no_risk(exact):
@@ -434,6 +443,21 @@ def test_motions_come_in_two_halves_of_whole_motions():
     assert np.ptp(radius, axis=1).max() < 1e-6  # without noise each stays on its circle
     assert (first.x == each[:2].reshape(-1, 2)).all()
     assert (second.noisy_z == recorded.noisy_z[len(first.x) :]).all()
+
+
+def test_noise_of_each_output():
+    artifact, level = linear_system.exact_observer(0.01, np.eye(2), "two-outputs"), (0.1, 0.3)
+    found = certify(artifact, linear_system.TwoOutputs(), process_noise=0.0, trajectories=50)
+    assert found.measurement_noise == level  # the system's own
+    assert found.noise_bound == pytest.approx((0.3, 0.9))
+    each = stationary_covariance(artifact.filter)
+    (L,) = artifact.inverse.mlp.weights
+    predicted = np.sqrt(np.trace(L @ (0.1**2 * each[0] + 0.3**2 * each[1]) @ L.T))
+    assert found.predicted_noise_error == pytest.approx(predicted, rel=1e-5)
+    assert found.measured_noise_error == pytest.approx(predicted, rel=0.03)
+    noise = 2 * (found.lipschitz_upper * found.gain_theorem) ** 2 * (0.3**2 + 0.9**2)
+    assert found.noise_term == pytest.approx(noise)
+    assert json.loads(json.dumps(found.as_json()))["measurement_noise"] == [0.1, 0.3]
 
 
 def test_each_bound_has_the_map_that_its_observer_uses():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear_system import Oscillator, Reactor, reactor_observer
+from linear_system import Oscillator, Reactor, TwoOutputs, exact_observer, reactor_observer
 
 import training.evaluation.errors
 import training.maps.optimise
@@ -13,6 +13,7 @@ from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
 from training.evaluation.errors import kalman_errors, starts
+from training.filter_noise import stationary_covariance
 
 
 def test_starts_outside_lie_outside():
@@ -77,6 +78,18 @@ def test_an_error_of_the_small_state_shows_in_its_nrmse_and_nowhere_else():
     np.testing.assert_allclose(found.nrmse[:, 0], 100 * 0.03 / size[0], rtol=0.02)
     np.testing.assert_allclose(found.nrmse[:, 1], 2.0 * rms[:, 1] / size[1], rtol=0.02)
     assert np.median(found.nrmse[:, 1]) == pytest.approx(2.0, rel=0.2)
+
+
+@pytest.mark.parametrize("level", [(0.1, 0.3), (0.3, 0.0)])
+def test_each_output_has_noise_of_its_level(level):
+    """In closed form: the exact observer's error is what its filter makes of the noise."""
+    system, artifact = TwoOutputs(), exact_observer(C=np.eye(2), name="two-outputs")
+    runs = unseen_trajectories(system, 0.05, n=40, duration=100.0, seed=0)
+    P = (np.reshape(level, (2, 1, 1)) ** 2 * stationary_covariance(artifact.filter)).sum(0)
+    (L,) = artifact.inverse.mlp.weights
+    expected = 100 * np.sqrt(np.diag(L @ P @ L.T)) / runs.x.std((0, 1))
+    found = errors(artifact, system, runs, measurement_noise=level, seed=0)
+    np.testing.assert_allclose(np.median(found.nrmse, axis=0), expected, rtol=0.05)
 
 
 def test_levels_of_noise_that_are_none(make_artifact):

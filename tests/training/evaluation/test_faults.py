@@ -8,16 +8,18 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import training.commands.faults
 import training.evaluation.calibration
 import training.evaluation.certificates.certificate
 import training.evaluation.certificates.gains
 import training.evaluation.faults
 from kkl_gym import VanDerPol
+from kkl_gym.elementary import sin
 from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
 from training.cli import main
 from training.commands.faults import report
-from training.evaluation.faults import FAULTS, simulate_faults
+from training.evaluation.faults import FAULTS, PARTS, simulate_faults
 from training.maps.smooth import decoder
 
 
@@ -36,9 +38,18 @@ def with_limits(name):
 def found():
     from kkl_gym import get_system
 
-    return simulate_faults(
-        with_limits("lorenz"), get_system("lorenz"), trajectories=12, duration=16.0, measurement_noise=0.5, seed=0
+    told = []
+    found = simulate_faults(
+        with_limits("lorenz"),
+        get_system("lorenz"),
+        trajectories=12,
+        duration=16.0,
+        measurement_noise=0.5,
+        seed=0,
+        report=told.append,
     )
+    assert told == list(range(1, PARTS))
+    return found
 
 
 def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact, monkeypatch):
@@ -124,7 +135,28 @@ def test_command(tmp_path, monkeypatch, capsys):
             main(["faults", *wrong, "--out", str(tmp_path)])
 
 
-def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path):
+def test_the_level_and_the_duration_are_the_systems_own(make_artifact, tmp_path, monkeypatch):
+    told = []
+
+    def spy(artifact, system, *, duration, measurement_noise, **_):
+        told.append((duration, measurement_noise))
+        return pd.DataFrame({"score": [0.0], "fault": "none", "deadline": 1.0, "delay": 0.0, "system": system.name})
+
+    monkeypatch.setattr(training.evaluation.faults, "simulate_faults", spy)
+    monkeypatch.setattr(training.commands.faults, "report", lambda out: "")
+    for system in ("van_der_pol", "Oscillator", "Slow"):
+        name = f"{tmp_path / 'systems.py'}:{system}"
+        (tmp_path / "systems.py").write_text(
+            "from linear_system import Oscillator\n\n\nclass Slow(Oscillator):\n    name, dt = 'slow', 0.1\n"
+        )
+        own = system != "van_der_pol"
+        make_artifact(system=name if own else system).save(tmp_path / "map.safetensors")
+        path = str(tmp_path / "map.safetensors")
+        main(["faults", path, *(["--system", name] if own else []), "--out", str(tmp_path / "out")])
+    assert told == [(50.0, 0.5), (50.0, 0.1), (500.0, 0.1)]
+
+
+def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path, capsys):
     system = f"{linear_system.__file__}:Oscillator"
     limits = Limits(
         np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
@@ -134,6 +166,9 @@ def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path)
     with pytest.raises(SystemExit, match="name its class with --system"):
         main(["faults", path])
     options = ["--system", system, "--trajectories", "4", "--duration", "12", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit, match=f"nothing is left of {path}"):
+        main(["faults", path, "--noise", "1.5", *options])
+    assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in capsys.readouterr().out
     main(["faults", path, *options])
     found = pd.read_csv(tmp_path / "out" / "faults.csv")
     assert found.groupby(["observer", "system", "fault"]).size().to_dict() == {
@@ -150,3 +185,20 @@ def test_published_faults_have_the_columns_that_the_command_writes(found, tmp_pa
     faults.to_csv(tmp_path / "faults.csv", index=False)
     report(tmp_path)
     assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()
+
+
+def test_faults_of_an_output_that_is_not_linear():
+    class Sine(linear_system.Oscillator):
+        name = "oscillator"
+        X = ((-0.2, 0.2), (-0.2, 0.2))
+        process_noise = 0.0
+
+        def h(self, x):
+            return (sin(x[0]),)
+
+    blind = dataclasses.replace(linear_system.exact_observer(), C=None, measurement_noise=0.01)
+    calibrated = training.evaluation.calibration.calibrate(blind, Sine(), duration=10.0, false_alarms=0.1)
+    rows = simulate_faults(calibrated, Sine(), trajectories=10, duration=20.0, measurement_noise=0.01, seed=0)
+    alarms = rows.assign(alarm=rows.delay < np.inf).groupby("fault").alarm.mean()
+    assert alarms["none"] <= 0.2
+    assert (alarms[["bias", "drop-out", "freeze"]] >= 0.8).all()

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import linear_system
 import numpy as np
 import pytest
 from hypothesis import given
@@ -37,9 +38,12 @@ def test_the_systems_own_level_as_far_as_the_map_knows_it(make_artifact):
     assert level_for(artifact, VanDerPol()) == 0.5
     assert level_for(told_up_to(artifact, 0.1), VanDerPol()) == 0.1
     assert level_for(make_artifact(noise=False), VanDerPol()) == 0.5
-    assert level_for(artifact, TwoOutputs()) == (0.1, 0.3)
-    assert level_for(told_up_to(artifact, 0.2), TwoOutputs()) == (0.1, 0.2)
-    assert level_for(told_up_to(artifact, 0.05), TwoOutputs()) == 0.05
+    assert level_for(artifact, TwoOutputs()) == 0.3  # the larger one: this map is told one for all outputs
+    assert level_for(told_up_to(artifact, 0.2), TwoOutputs()) == 0.2
+    two = make_artifact(system=f"{linear_system.__file__}:TwoOutputs", outputs=2)  # told up to 1 and 2
+    assert level_for(two, TwoOutputs()) == (0.1, 0.3)
+    assert level_for(told_up_to(two, (1.0, 0.2)), TwoOutputs()) == (0.1, 0.2)
+    assert level_for(told_up_to(two, (0.05, 0.05)), TwoOutputs()) == 0.05
 
 
 def test_multiples_of_the_systems_own_level():
@@ -50,7 +54,11 @@ def test_multiples_of_the_systems_own_level():
 def test_levels_beyond_the_maps_range(make_artifact):
     artifact = make_artifact()
     assert not beyond(artifact, 1.0)
-    assert not beyond(artifact, (0.1, 1.0))
+    two = make_artifact(system=f"{linear_system.__file__}:TwoOutputs", outputs=2)
+    assert not beyond(two, (0.1, 2.0))
+    assert not beyond(two, 1.0)
     assert beyond(artifact, 1.5) == "measurement noise 1.5 is beyond the map's range, 0 to 1"
-    assert beyond(artifact, (0.1, 1.5)) == "measurement noise 0.1, 1.5 is beyond the map's range, 0 to 1"
+    assert beyond(two, (0.1, 2.5)) == "measurement noise 0.1, 2.5 is beyond the map's range, 0 to 1, 0 to 2"
+    assert beyond(two, 1.5) == "measurement noise 1.5 is beyond the map's range, 0 to 1, 0 to 2"
+    assert "told one level of measurement noise for all outputs" in beyond(artifact, (0.1, 0.3))
     assert not beyond(make_artifact(noise=False), np.inf)

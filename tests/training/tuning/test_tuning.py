@@ -53,7 +53,7 @@ def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, mo
     monkeypatch.setattr(training.tuning.probe, "RESOLUTION", 0.0)
     rng, n, sigma = np.random.default_rng(0), 8000, 0.4
     flow = expm(np.array([[0.0, 0.01], [-0.01, 0.0]]))
-    x = [rng.normal(size=(n, 2)) / np.sqrt(probe._known)]
+    x = [rng.normal(size=(n, 2)) / np.sqrt(np.diag(probe._known))]
     for _ in range(600):
         x.append(x[-1] @ flow.T)
     y = probe.system.output(np.array(x)) + sigma * rng.normal(size=(601, n, 1))
@@ -69,7 +69,7 @@ def test_no_linear_decoder_of_noisy_z_does_better_and_one_does_as_well(probe, mo
 
 def test_the_least_error_is_that_of_a_kalman_filter(probe):
     kalman = ExtendedKalmanFilter(
-        probe.system, 0.01, Q=np.zeros((2, 2)), R=0.09 * np.eye(1), start=(np.zeros(2), np.diag(1 / probe._known))
+        probe.system, 0.01, Q=np.zeros((2, 2)), R=0.09 * np.eye(1), start=(np.zeros(2), np.linalg.inv(probe._known))
     )
     kalman.reset(probe.y[0])
     P = [kalman.P[0]]
@@ -174,7 +174,9 @@ def test_an_output_that_does_not_move_leaves_the_start_unknown():
     assert only.error == pytest.approx(
         relative(
             probe,
-            np.array([expm(age * 0.01 * F) @ np.diag(1 / probe._known) @ expm(age * 0.01 * F).T for age in probe.ages]),
+            np.array(
+                [expm(age * 0.01 * F) @ np.linalg.inv(probe._known) @ expm(age * 0.01 * F).T for age in probe.ages]
+            ),
         ),
         rel=1e-4,
     )
@@ -185,7 +187,7 @@ def test_chaotic_motions_are_followed_as_far_as_numbers_go():
     probe = Probe(get_system("lorenz"), dt=0.02, duration=20.0, motions=2)
     assert 1e4 < np.abs(probe.Phi).max() < 1e5
     assert len(probe.x) < 900
-    P, nx = np.broadcast_to(np.diag(1 / probe._known), (2, 3, 3)), 3
+    P, nx = np.broadcast_to(np.linalg.inv(probe._known), (2, 3, 3)), 3
     H, R, left = np.array([[0.0, 1.0, 0.0]]), 0.25, []
     for k in range(len(probe.x)):
         if k:
@@ -209,7 +211,7 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
         chosen[noise] = read_changes(folder / "config.json")
         assert {"config.json", "front.csv", "front.png"} == {path.name for path in folder.iterdir()}
     assert chosen["0"]["eigenvalues"] != chosen["0.5"]["eigenvalues"]
-    assert (chosen["0"]["measurement_noise_max"], chosen["0.5"]["measurement_noise_max"]) == (0.01, 2.0)
+    assert (chosen["0"]["measurement_noise_max"], chosen["0.5"]["measurement_noise_max"]) == (0.002, 2.0)
     assert (chosen["0"]["noise_free_share"], chosen["0.5"]["noise_free_share"]) == (0.9, 0.05)
     assert chosen["0"]["high_noise_emphasis"] == chosen["0.5"]["high_noise_emphasis"] == 4.0
     small = ["--trajectories", "10", "--duration", "2", "--samples", "20", "--width", "8", "--inverse-steps", "3"]
@@ -227,6 +229,20 @@ def test_results_lie_under_runs(tmp_path, monkeypatch):
     front = pd.read_csv(tmp_path / "runs" / "tuning" / "oscillator-0.25" / "front.csv")
     assert list(front) == ["noise", "kind", "modes", "error"]
     assert set(front.noise) == {0.0, 0.05, 0.25, 0.5}
+
+
+def test_noise_and_sampling_interval_are_the_systems_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    small = ["--duration", "4", "--modes", "2"]
+    main(["tune", f"{linear_system.__file__}:TwoOutputs", *small])
+    folder = tmp_path / "runs" / "tuning" / "two-outputs-0.1-0.3"
+    assert json.loads((folder / "config.json").read_text())["measurement_noise_max"] == [0.4, 1.2]
+    noise = pd.read_csv(folder / "front.csv").noise.unique()
+    assert noise.tolist() == ["0.0", "0.02, 0.06", "0.1, 0.3", "0.2, 0.6"]
+    main(["tune", f"{linear_system.__file__}:Reactor", "--noise", "0", *small])
+    folder = tmp_path / "runs" / "tuning" / "reactor-0"
+    assert json.loads((folder / "config.json").read_text())["dt"] == 0.05
+    assert pd.read_csv(folder / "front.csv").noise.unique().tolist() == [0.0, 0.4, 2.0]
 
 
 def test_choices_begin_with_given_modes(probe):
@@ -349,7 +365,7 @@ def test_predictions_do_not_depend_on_the_units_of_states(probe):
 
 
 def test_errors_of_states_are_those_of_a_kalman_filter(probe):
-    start, noise = np.diag(1 / probe._known), 0.3
+    start, noise = np.linalg.inv(probe._known), 0.3
     expected = []
     for age in probe.ages:
         flow = np.array([expm(k * 0.01 * F) for k in range(age + 1)])
@@ -358,7 +374,9 @@ def test_errors_of_states_are_those_of_a_kalman_filter(probe):
     np.testing.assert_allclose(probe.error_of_states(None, noise), probe.share @ np.array(expected), rtol=1e-6)
     assert (probe.error_of_states(SPECTRUM, noise) > probe.error_of_states(None, noise)).all()
     unknown = probe.unknown_of_starts(noise)  # of the start, in its own standard deviations
-    np.testing.assert_allclose(unknown, np.linalg.inv(known) * np.sqrt(np.outer(probe._known, probe._known)), rtol=1e-6)
+    np.testing.assert_allclose(
+        unknown, np.linalg.inv(known) * np.sqrt(np.outer(*2 * [np.diag(probe._known)])), rtol=1e-6
+    )
 
 
 def test_outputs_may_be_noisy_to_different_degrees():
