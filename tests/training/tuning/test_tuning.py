@@ -238,7 +238,7 @@ def test_noise_and_sampling_interval_are_the_systems_own(tmp_path, monkeypatch):
     folder = tmp_path / "runs" / "tuning" / "two-outputs-0.1-0.3"
     assert json.loads((folder / "config.json").read_text())["measurement_noise_max"] == [0.4, 1.2]
     noise = pd.read_csv(folder / "front.csv").noise.unique()
-    assert noise.tolist() == ["0", "0.02, 0.06", "0.1, 0.3", "0.2, 0.6"]
+    assert noise.tolist() == ["0.0", "0.02, 0.06", "0.1, 0.3", "0.2, 0.6"]
     main(["tune", f"{linear_system.__file__}:Reactor", "--noise", "0", *small])
     folder = tmp_path / "runs" / "tuning" / "reactor-0"
     assert json.loads((folder / "config.json").read_text())["dt"] == 0.05
