@@ -68,8 +68,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     Raises
     ------
     ValueError
-        On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe`` or ``render_mode``,
-        and a ``start_box`` that does not lie within the declared bounds.
+        On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
+        ``observe`` or ``render_mode``, and a ``start_box`` that does not lie within the declared bounds.
 
     Examples
     --------

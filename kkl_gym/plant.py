@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.equation_errors import held, returned
 from kkl_gym.simulate import check_interval
 from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
@@ -63,8 +64,8 @@ class Plant:
     Raises
     ------
     ValueError
-        On an unknown system or parameter, dt <= 0, a negative noise level, an unknown ``observe``, and a ``start_box``
-        that does not lie within the declared bounds.
+        On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
+        ``observe``, and a ``start_box`` that does not lie within the declared bounds.
         SubstepsError, a ValueError, if dt is too long for the system.
     """
 
@@ -204,9 +205,20 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     -------
     low, high : ndarray, shape (ny,)
         The bounds.
+
+    Raises
+    ------
+    EquationError
+        If an output is no number somewhere there.
     """
     ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
-    y = system.output(np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, system.nx))
+    x = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, system.nx)
+    with np.errstate(all="ignore"):
+        y = system.output(x)
+    lost = np.isnan(y).any(1)
+    if lost.any():
+        found = f"{y[lost][0].tolist()}; {held(x[lost][0])}: tighten the bounds to where there is an output"
+        raise returned(system.h, "numbers everywhere within the bounds", found)
     return y.min(0) - margin, y.max(0) + margin
 
 

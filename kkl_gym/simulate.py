@@ -21,6 +21,7 @@ RATE_STEP = 0.4
 # A millionth less, so that rates which rounding takes to either side of a power of two get the same substeps.
 PER_RATE = (1.0 - 1e-6) / RATE_STEP
 MOST_EQUAL = 1 << 10  # substeps of one length; beyond, their length follows the rate
+REPORTED = 50  # intervals between two reports
 MAX_SUBSTEPS = 1 << 16
 GROWTH = 8  # of the need for substeps within one interval, from which on it is done again with lengths that follow it
 
@@ -392,6 +393,8 @@ def simulate(
     dt: float,
     u: np.ndarray | Feedback | None = None,
     w: np.ndarray | None = None,
+    *,
+    report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
 
@@ -410,6 +413,8 @@ def simulate(
         (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval; None is zero.
+    report : callable, optional
+        Told now and then the number of intervals that are done.
 
     Returns
     -------
@@ -436,6 +441,8 @@ def simulate(
     x = np.ascontiguousarray(x0.T)
     out[0] = x0
     for k in range(steps):
+        if report is not None and k % REPORTED == 0:
+            report(k)
         acting = u(k, out[k]) if callable(u) else None if u is None else u[k]
         held = (
             no_u if acting is None else np.ascontiguousarray(acting.T),

@@ -4,17 +4,14 @@ import ast
 import builtins
 import itertools
 import linecache
-import sysconfig
+import sys
 from pathlib import Path
 from types import CodeType, TracebackType
 from typing import Any
 
-_ROOT = Path(__file__).resolve().parents[1]
-_LIBRARIES = (
-    *(sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")),
-    *(str(_ROOT / package) for package in ("kkl_gym", "observers", "training")),
-    "<",  # frozen modules, and functions that a library wrote
-)
+# Wherever they are installed; the rest of what is installed is known by its folder.
+_LIBRARIES = sys.stdlib_module_names - {"__main__"} | {"kkl_gym", "observers", "training"}
+_LIBRARIES |= {"mpmath", "numba", "numpy", "sympy", "torch"}
 
 
 def user_line(error: BaseException) -> str | None:
@@ -102,4 +99,8 @@ def _steps(error: BaseException) -> list[TracebackType]:
 
 
 def _of_library(step: TracebackType) -> bool:
-    return step.tb_frame.f_code.co_filename.startswith(_LIBRARIES)
+    frame = step.tb_frame
+    file = frame.f_code.co_filename
+    package = frame.f_globals.get("__name__", "").partition(".")[0]
+    # A name in angle brackets is that of a function that a library wrote.
+    return package in _LIBRARIES or file.startswith("<") or "site-packages" in file or "dist-packages" in file

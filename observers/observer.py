@@ -43,9 +43,9 @@ class KKLObserver:
     Raises
     ------
     ValueError
-        If a noise level is no number, negative or not finite, the measurement noise is beyond what the map was trained
-        for or differs between outputs where the map is told one level for all, or the artifact holds no limits for a
-        monitor.
+        If ``artifact`` is none or ``monitor`` no bool, a noise level is no number, negative or beyond 1e12, the
+        measurement noise is beyond what the map was trained for or differs between outputs where the map is told one
+        level for all, or the artifact holds no limits for a monitor.
     """
 
     def __init__(

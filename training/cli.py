@@ -4,6 +4,7 @@ Importing this module imports nothing that takes time or may be missing. The mod
 command is called.
 """
 
+import _thread
 import ast
 import io
 import os
@@ -19,6 +20,7 @@ from typing import Any, NoReturn
 
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
+    "check": ("check", "Check"),
     "train": ("train", "Train"),
     "evaluate": ("evaluate", "Evaluate"),
     "benchmark": ("benchmark", "Benchmark"),
@@ -94,13 +96,21 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         noticed.append(number)
         raise KeyboardInterrupt
 
+    def unraisable(failed: "sys.UnraisableHookArgs") -> None:
+        if isinstance(failed.exc_value, KeyboardInterrupt):  # lost in a callback, of which imports have many: again
+            threading.Timer(0.05, _thread.interrupt_main).start()
+        else:
+            hook(failed)
+
     if threading.current_thread() is not threading.main_thread():  # which alone has handlers of signals
         yield noticed
         return
-    before = signal.signal(signal.SIGINT, handler)
+    before, hook = signal.signal(signal.SIGINT, handler), sys.unraisablehook
+    sys.unraisablehook = unraisable
     try:
         yield noticed
     finally:
+        sys.unraisablehook = hook
         signal.signal(signal.SIGINT, before)
 
 
@@ -136,9 +146,14 @@ def _end(message: str, code: int) -> NoReturn:
 
 def _without_box(text: str) -> str:
     """What tyro says of options that it cannot read, in one line: without frame, colours, title, help and reasons."""
-    plain = [re.sub(r"\x1b\[[0-9;]*m", "", line).strip("│╭╮╰╯ ") for line in text.splitlines()]
-    parts = "\n".join(plain[1:]).split("─" * 10)
-    kept = [" ".join(part.strip("─").split()).partition(" Got errors:")[0] for part in parts]
+    parts: list[list[str]] = [[]]
+    for line in text.splitlines()[1:]:  # the first bears the title
+        content = re.sub(r"\x1b\[[0-9;]*m", "", line).strip(" │╰╯")
+        if content and set(content) <= set("─-"):
+            parts.append([])
+        else:
+            parts[-1].append(content)
+    kept = [" ".join(" ".join(part).split()).partition(" Got errors:")[0] for part in parts]
     return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 

@@ -118,7 +118,7 @@ class Config:
     """What acts on the system while motions are simulated for an input-aware map: "controller" for the system's own
     (a linear-quadratic regulator at the target by default), or a function of yours, as script.py:function or
     module:function, that turns states (n, nx) into actions (n, nu) in [-1, 1]. It acts on states with an error and
-    explores; a quarter of the trajectories are its own. There are no free motions then, and no second inverse for
+    explores; one trajectory in twelve is its own. There are no free motions then, and no second inverse for
     them. For plants that no random input would hold within their bounds."""
     free_inverse: bool = True
     """Whether an input-aware map has a second inverse, of z_y alone, for as long as no input has acted. Never under a

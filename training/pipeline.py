@@ -28,11 +28,11 @@ from training.maps.inverse import InverseProblem
 from training.maps.least_squares import POINTS, solve_forward
 from training.maps.networks import Network, on_torch
 from training.maps.optimise import Log, Stage, log_to, optimise
-from training.maps.pde import check_continuous
 from training.maps.samplers import ClosedLoopSampler, ForwardMapSampler, Sampler, TrajectorySampler
 from training.maps.scaling import StateScale
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import Stream, generator
+from training.smoothness import check_continuous
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.closed_loop import record_closed_loop
@@ -209,19 +209,20 @@ class _Run:
     ) -> TrajectorySampler:
         """Batches along trajectories, transients and noise included; z may have an error of some covariance beside."""
         config = self.config
-        return TrajectorySampler(
-            trajectories,
-            linear,
-            measurement_noise_max=config.measurement_noise_max,
-            batch=config.batch,
-            device=self.device,
-            measurement_noise=self.system.measurement_noise,
-            noise_free_share=config.noise_free_share,
-            high_noise_emphasis=config.high_noise_emphasis,
-            process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
-            error=error,
-            scaling=config.scaling,
-        )
+        with self.progress.phase("preparing batches"):
+            return TrajectorySampler(
+                trajectories,
+                linear,
+                measurement_noise_max=config.measurement_noise_max,
+                batch=config.batch,
+                device=self.device,
+                measurement_noise=self.system.measurement_noise,
+                noise_free_share=config.noise_free_share,
+                high_noise_emphasis=config.high_noise_emphasis,
+                process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
+                error=error,
+                scaling=config.scaling,
+            )
 
     def learn_free_inverse(self) -> InverseMap:
         """T_inv of z_y alone, fitted along motions without input, some of them from beyond X."""
@@ -272,8 +273,9 @@ class _Run:
     ) -> TrajectorySampler | ForwardMapSampler:
         """Batches z' = T(x'), blurred by the error of T that the simulated z shows."""
         linear = self.linear
-        T_x = np.stack([forward(x) for x in trajectories.x])
-        z = transients(T_x, trajectories.z[0], linear=linear, ages=self.ages)
+        with self.progress.phase("T along the trajectories"):
+            T_x = np.stack([forward(x) for x in trajectories.x])
+            z = transients(T_x, trajectories.z[0], linear=linear, ages=self.ages)
         error = (trajectories.z - z)[self.settled].reshape(-1, linear.size)
         if self.config.transients:
             return self.along(dataclasses.replace(trajectories, z=z), linear, error.T @ error / len(error))

@@ -10,7 +10,6 @@ import scipy
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.maps.coordinates import settling_time
-from training.maps.pde import check_continuous
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, evenly_spaced
 from training.trajectories.record import recording_ages
@@ -59,6 +58,15 @@ class Smoothness:
     def smooth(self) -> bool:
         """Whether the exponents of all modes are at least SMOOTH."""
         return bool((self.exponent >= SMOOTH).all())
+
+
+def check_continuous(system: System) -> None:
+    """Raise ValueError if a system is in discrete time, to which the equation of T does not apply."""
+    if system.discrete:
+        raise ValueError(
+            f"{system.name} is in discrete time, and the pipeline 'spinn' solves an equation of continuous time: take "
+            "the pipeline 'input-aware'"
+        )
 
 
 def smoothness(

@@ -127,7 +127,8 @@ class KKLEstimator:
     Raises
     ------
     ValueError
-        If ``estimate`` is unknown, no map ships for the system, or the noise level is beyond the map's range.
+        If ``estimate`` is unknown, a flag is no bool, no map ships for the system, or the noise level is beyond the
+        map's range.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for.

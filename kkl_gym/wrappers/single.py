@@ -57,9 +57,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Raises
     ------
     ValueError
-        If the environment is not one of ours, ``estimate`` is unknown, no map ships for the system, or the noise level
-        is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and ``ignore_input`` is
-        false, or a wrapper inside hides samples from the observer.
+        If the environment is not one of ours, ``estimate`` is unknown, a flag is no bool, no map ships for the system,
+        or the noise level is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and
+        ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for. It is a ValueError.

@@ -103,7 +103,8 @@ def test_compiled_is_numpys_step(system, dt):
 @compiles
 @pytest.mark.parametrize("system", KINKED, ids=str)
 def test_kinks_and_jumps_are_the_same_on_floats_arrays_and_compiled(system):
-    step = compiled_step(system)
+    assert kkl_gym.KKLVectorEnv(system, 2).compiled
+    step = batch_step(system)
     x, u, w = batch(system)
     kinks = np.array([-1.5, -1.0, -0.5, 0.0, 0.3, 1.0, 1.5])
     x[0, :7], x[1, 7:14] = kinks, kinks  # where the equations of either change

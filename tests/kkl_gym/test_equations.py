@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from wrong_systems import Branching, Late, Wide
 
-from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, get_system
+from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, elementary, get_system
 from kkl_gym.compiled import batch_step, compiled_step
 from kkl_gym.equations import components
 from kkl_gym.simulate import advance, advance_batch, simulate
@@ -362,6 +362,17 @@ def test_outputs_that_fail_on_the_way(make):
         EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which \[0\]"
     ):
         env.step(np.zeros(env.action_space.shape))
+
+
+def test_bounds_within_which_an_output_is_lost():
+    class Lost(Draining):
+        name = "lost"
+
+        def h(self, x):
+            return (elementary.sqrt(x[0]), x[0] / x[1])
+
+    with pytest.raises(EquationError, match=r"h\(x\) of 'lost' .* must return numbers everywhere within .*: tighten"):
+        KKLEnv(Lost())
 
 
 def test_any_function_of_components():

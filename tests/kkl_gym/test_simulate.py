@@ -424,3 +424,11 @@ def test_check_dt_takes_numbers():
     check_dt(1)
     check_dt(np.float64(0.01))
     check_dt(np.float32(0.01))
+
+
+def test_long_simulations_tell_how_far_they_are():
+    told = []
+    x0 = np.ones((3, 3))
+    reported = simulate(Lorenz(), x0, 120, 0.01, report=told.append)
+    assert told == [0, 50, 100]
+    assert np.array_equal(reported, simulate(Lorenz(), x0, 120, 0.01))

@@ -1,7 +1,9 @@
 import copy
+import dataclasses
 import json
 
 import gymnasium as gym
+import linear_system
 import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
@@ -229,6 +231,31 @@ def test_noise_beyond_the_maps_range(saved):
     env = KKLObservation(KKLEnv("lorenz", measurement_noise=1.5), path, measurement_noise=1.0)
     assert env.observer.measurement_noise == 1.0
     assert KKLObservation(KKLEnv("lorenz", measurement_noise=0.3), path).observer.measurement_noise == 0.3
+
+
+def two_outputs(make_artifact, path):
+    """A system with two outputs by its name, and the file of an observer that is told a level for each."""
+    system = f"{linear_system.__file__}:TwoOutputs"
+    dataclasses.replace(make_artifact(outputs=2), system="two-outputs", parameters={}).save(path)
+    return system, str(path)
+
+
+def test_each_output_has_its_level(make_artifact, tmp_path):
+    system, path = two_outputs(make_artifact, tmp_path / "two.safetensors")
+    plain = gym.make("kkl_gym:kkl_gym/Own-v0", system=system)
+    assert KKLObservation(plain, path).observer.measurement_noise == (0.1, 0.3)  # the environment's
+    env = KKLObservation(plain, path, measurement_noise=np.array([0.2, 0.4]))
+    for again in (env, gym.make(EnvSpec.from_json(env.spec.to_json()))):
+        assert again.observer.measurement_noise == (0.2, 0.4)
+        again.reset(seed=0)
+        again.step(again.action_space.sample())
+    with pytest.raises(ValueError, match=r"= \(0\.2, 2\.4\) is beyond the map's range, 0 to \(1, 2\)"):
+        KKLObservation(plain, path, measurement_noise=[0.2, 2.4])
+    with pytest.raises(ValueError, match="one for each of 2 outputs"):
+        KKLObservation(plain, path, measurement_noise=(0.1, 0.2, 0.3))
+    many = KKLVectorEnv(system, 3, measurement_noise=(0.2, 0.4))
+    assert KKLVectorObservation(many, path).observer.measurement_noise == (0.2, 0.4)
+    assert KKLVectorObservation(many, path, measurement_noise=(0.1, 0.4)).observer.measurement_noise == (0.1, 0.4)
 
 
 def test_wrong_arguments(saved, tmp_path):

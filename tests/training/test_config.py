@@ -1,11 +1,13 @@
 """Settings that make no sense."""
 
+import json
 from dataclasses import replace
 
 import pytest
 from linear_system import Oscillator
 
 from training import preset
+from training.config import override, read_changes
 
 
 @pytest.mark.parametrize(
@@ -29,6 +31,9 @@ from training import preset
         ({"trajectories": 2.5}, "trajectories"),
         ({"seed": -1}, "seed"),
         ({"measurement_noise_max": float("nan")}, "measurement_noise_max"),
+        ({"measurement_noise_max": ()}, "measurement_noise_max.each"),
+        ({"measurement_noise_max": (0.1, 0.0)}, r"measurement_noise_max\.each\.1"),
+        ({"measurement_noise_max": (0.1, "0.3")}, r"measurement_noise_max\.each\.1"),
         ({"process_noise_share": 1.5}, "share"),
         ({"noise_free_share": float("nan")}, "share"),
         ({"high_noise_emphasis": 0.0}, "high_noise_emphasis"),
@@ -51,3 +56,15 @@ def test_settings_that_do_not_go_with_the_pipeline():
         replace(preset(Oscillator(), "input-aware", "fast"), random_features=10)
     with pytest.raises(ValueError, match=r"box_factor = 2.0, adaptive = True: settings of the pipeline 'spinn'"):
         replace(preset(Oscillator(), "input-aware", "fast"), box_factor=2.0, adaptive=True)
+
+
+def test_levels_of_noise_of_all_outputs_or_each(tmp_path):
+    path = tmp_path / "settings.json"
+    for written, levels in ((0.2, 0.2), ([0.1, 0.3], (0.1, 0.3))):
+        path.write_text(json.dumps({"measurement_noise_max": written}))
+        changes = read_changes(path)
+        assert override(preset(Oscillator(), "input-aware", "fast"), changes).measurement_noise_max == levels
+    for wrong, match in (([0.1, -1], "greater than 0"), ([], "at least 1 item"), ("0.1", "valid number")):
+        path.write_text(json.dumps({"measurement_noise_max": wrong}))
+        with pytest.raises(ValueError, match=match):
+            read_changes(path)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
-from linear_system import Autonomous, Oscillator, sylvester
+from linear_system import Autonomous, Oscillator, TwoUnits, sylvester
 from small_runs import CPU, toy
 
 import training.evaluation.errors
@@ -18,6 +18,7 @@ from kkl_gym import VanDerPol
 from observers import Artifact, KKLObserver
 from training import checkpoints, errors, preset, train, unseen_trajectories
 from training.config import override
+from training.evaluation.report import write_report
 from training.trajectories.record import record
 
 
@@ -236,13 +237,41 @@ def test_artifact_of_a_run_records_what_made_it(tmp_path):
 
 
 def test_two_outputs_train_and_run(tmp_path):
+    system = TwoUnits()
+    config = toy(system, duration=2.0, closed_loop_trajectories=10, inverse_steps=10)
+    result = train(system, config, tmp_path / "run", device=CPU)
+    write_report(tmp_path / "report.png", result, system)
+    result.artifact.save(tmp_path / "a.safetensors")
+    read = Artifact.read(tmp_path / "a.safetensors")
+    assert read.ny == 2
+    assert read.C is None
+    np.testing.assert_allclose(read.output(np.array([0.1, 0.2])), [100.0, 0.12])
+    assert read.measurement_noise == system.measurement_noise == (100.0, 0.12)
+    for inverse in (read.inverse, read.free_inverse):
+        assert inverse.measurement_noise_max == (200.0, 0.24)
+        assert inverse.noise_gain.shape == (2, len(inverse.whiten))
+    y, u = np.zeros((10, 3, 2)), np.zeros((9, 3, 1))
+    estimates = [KKLObserver(read, levels).estimate(y, u) for levels in (None, (100.0, 0.12), (10.0, 0.2), (0.0, 0.1))]
+    assert estimates[0].shape == (10, 3, 2)
+    np.testing.assert_array_equal(estimates[0], estimates[1])
+    assert not np.allclose(estimates[0], estimates[2])
+    assert not np.allclose(estimates[0], estimates[3])
+    y[1:, 1, 1] = np.nan
+    assert np.isfinite(KKLObserver(read).estimate(y, u)).all()
+
+
+def test_levels_that_do_not_fit_the_outputs_are_an_error_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match="measurement_noise_max must be one number, or one for each of 1 outputs"):
+        train(Oscillator(), toy(Oscillator(), measurement_noise_max=(0.1, 0.3)), tmp_path)
+
+
+def test_an_output_that_cannot_be_told_from_outside_is_left_out(tmp_path):
     @dataclass(frozen=True)
-    class Both(Oscillator):
-        name: ClassVar[str] = "both"
+    class Sine(Oscillator):
+        name: ClassVar[str] = "sine"
 
         def h(self, x):
-            return x[0], x[0] + x[1]
+            return (np.sin(x[0]),)
 
-    artifact = train(Both(), toy(Both(), duration=20.0), tmp_path).artifact
-    assert artifact.ny == 2
-    assert KKLObserver(artifact).estimate(np.zeros((10, 3, 2)), np.zeros((9, 3, 1))).shape == (10, 3, 2)
+    artifact = train(Sine(), toy(Sine(), duration=1.0, inverse_steps=2, inputs=False), tmp_path, device=CPU).artifact
+    assert not artifact.knows_output

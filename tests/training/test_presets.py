@@ -1,8 +1,9 @@
 """The configurations behind --preset."""
 
-from linear_system import Oscillator
+import pytest
+from linear_system import Oscillator, TwoOutputs, TwoUnits
 
-from kkl_gym import VanDerPol
+from kkl_gym import Lorenz, VanDerPol
 from training import preset, presets
 from training.config import Config
 
@@ -27,3 +28,24 @@ def test_spinn_of_a_system_of_ones_own_forgets_its_start_and_looks_for_no_spectr
     config = preset(Oscillator(), "spinn", "fast", changes=given)
     assert {name: getattr(config, name) for name in given} == given
     assert config.box_factor == 2.0
+
+
+def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
+    for system, levels in (
+        (VanDerPol(), 1.0),
+        (TwoOutputs(), (0.2, 0.6)),
+        (Oscillator(), 0.2),
+        (TwoUnits(), (200.0, 0.24)),
+    ):
+        for pipeline in ("input-aware", "spinn"):
+            given = {"eigenvalues": (-1.0, -2.0)}
+            assert preset(system, pipeline, "fast", changes=given).measurement_noise_max == levels
+    assert preset(Lorenz(), "input-aware", "fast").measurement_noise_max == 3.0
+
+    class Exact(TwoOutputs):
+        """Its sensors are said to be without noise, which no map need believe."""
+
+        name = "exact"
+        measurement_noise = (0.0, 0.3)
+
+    assert preset(Exact(), "input-aware", "fast").measurement_noise_max == pytest.approx((0.2, 0.6), rel=0.01)

@@ -17,7 +17,6 @@ from training.agents.agent import Agent, AgentError
 from training.agents.information import Information
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
-from training.checkpoints import SUFFIX
 from training.commands.compare import Compare
 from training.commands.options import NoiseLevel, SystemName
 from training.evaluation.levels import as_name, show_level
@@ -80,6 +79,7 @@ class Train:
         import torch  # which takes seconds to import, as stable-baselines3 does
 
         from training.agents.learn import learn
+        from training.checkpoints import SUFFIX
 
         task = get_task(self.system, self.measurement_noise)
         name = get_system(task.system).name

@@ -178,10 +178,12 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
     """
     own = "".join(f", {parameter} = {value:g}" for parameter, value in system.parameters.items())
     given = "".join(f"; {setting} = {value}" for setting, value in changes.items())
+    counts = {"state": system.nx, "output": system.ny, "input": system.nu}
+    sizes = [f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items()]
     spectrum = Spectrum(config.eigenvalues, config.pairs)
     rates = spectrum.poles.real
     return [
-        f"training an observer for {system.name}{own}: {system.nx} states, {system.ny} outputs, {system.nu} inputs",
+        f"training an observer for {system.name}{own}: {', '.join(sizes)}",
         f"pipeline {config.pipeline}, preset {name}{given}",
         f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
         f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",

@@ -5,18 +5,9 @@ from collections.abc import Callable
 import torch
 
 from kkl_gym.equations import components
-from kkl_gym.system import Components, System
+from kkl_gym.system import Components
 
 TensorMap = Callable[[torch.Tensor], torch.Tensor]
-
-
-def check_continuous(system: System) -> None:
-    """Raise ValueError if a system is in discrete time, to which the equation does not apply."""
-    if system.discrete:
-        raise ValueError(
-            f"{system.name} is in discrete time, and the pipeline 'spinn' solves an equation of continuous time: take "
-            "the pipeline 'input-aware'"
-        )
 
 
 def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -> torch.Tensor:

@@ -10,9 +10,9 @@ from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import ALIKE, draw_process_noise, noisy_output
+from training.trajectories.policy import EXPLORATION
 from training.trajectories.record import Trajectories
 
-EXPLORATION = 0.5  # largest amplitude of what is added to a controller's action, in input bounds
 HOLDS = (1, 5, 10, 20)  # samples for which actions are held
 GROUPS = 50  # of closed-loop trajectories with a noise level and a time for which actions are held in common
 

@@ -9,10 +9,10 @@ import numpy as np
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
 
-# Functions in the derivatives that sympy does not print for NumPy, or prints for arrays of one shape only.
+# Functions in the derivatives that some releases of sympy do not print for NumPy, or for arrays of one shape only.
 _IN_NUMPY = {
-    "Max": lambda *values: functools.reduce(np.maximum, values),
-    "Min": lambda *values: functools.reduce(np.minimum, values),
+    "largest": lambda *values: functools.reduce(np.maximum, values),
+    "smallest": lambda *values: functools.reduce(np.minimum, values),
     "Heaviside": np.heaviside,
 }
 
@@ -51,7 +51,11 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
         derivatives = {j: sympy.diff(value, x[j]) for j in range(nx)}
         if any(derivative.has(sympy.Derivative) for derivative in derivatives.values()):
             raise ValueError(f"component {i} of {equations.__name__}(x) has no derivative that sympy knows: {value}")
-        rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in derivatives.items() if d != 0})
+        printable = {
+            j: d.replace(sympy.Max, sympy.Function("largest")).replace(sympy.Min, sympy.Function("smallest"))
+            for j, d in derivatives.items()
+        }
+        rows.append({j: sympy.lambdify(x, d, [_IN_NUMPY, "numpy"], cse=True) for j, d in printable.items() if d != 0})
     return rows
 
 

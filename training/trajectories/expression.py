@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from kkl_gym.equations import components
 from kkl_gym.system import System
 from observers import Expression
 
@@ -42,23 +43,22 @@ def output_expression(system: System) -> Expression:
     Raises
     ------
     ValueError
-        If h does not take symbols, or is beyond what expressions can say; the message says what to write instead.
+        If h does not take symbols, is beyond what expressions can say, or is not the same on symbols as on arrays. The
+        message says what follows, and what to write instead.
     """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
-    x = sympy.symbols(f"x:{system.nx}", real=True)
+    x = list(sympy.symbols(f"x:{system.nx}", real=True))
     try:
-        values = [sympy.sympify(value) for value in system.h(list(x))]
-        found = Expression([_tree(value, list(x)) for value in values])
-    except Exception as error:  # whatever a user's equations raise
+        found = Expression([_tree(sympy.sympify(value), x) for value in components(system.h, x)])
+        states = system.draw_starts(np.random.default_rng(0), 100)
+        if not np.allclose(found(states), system.output(states), rtol=1e-9, atol=1e-12, equal_nan=True):
+            raise ValueError("it is not the same on symbols as on arrays; write it with kkl_gym.elementary alone")
+    except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(
-            f"h(x) of {system.name!r} cannot be written into its observer, which then cannot compare y with h(x_hat), "
-            "and holds the last value of an output that is missing: write h in arithmetic and the functions of "
-            f"kkl_gym.elementary (sin, where, ...), without math, numpy and if ({error})"
+            f"the observer of {system.name!r} cannot hold h(x), without which it neither judges samples nor predicts "
+            f"those that are missing: {error}"
         ) from error
-    states = system.draw_starts(np.random.default_rng(0), 100)
-    if not np.allclose(found(states), system.output(states), rtol=1e-9, atol=1e-12, equal_nan=True):
-        raise ValueError(f"h(x) of {system.name!r} is another on symbols than on arrays: {values}")
     return found
 
 

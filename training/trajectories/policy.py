@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections.abc import Callable
 
 import numpy as np
 
@@ -25,6 +26,7 @@ def under_policy(
     rng: np.random.Generator,
     own: np.ndarray,
     w: np.ndarray | None = None,
+    report: Callable[[int], object] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy that errs about the state and explores.
 
@@ -50,6 +52,8 @@ def under_policy(
         Which of the trajectories are the policy's own, without either.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval.
+    report : callable, optional
+        Told now and then the number of intervals that are done.
 
     Returns
     -------
@@ -57,6 +61,11 @@ def under_policy(
         States, NaN from where a trajectory has left the system's bounds.
     u : ndarray, shape (steps, n, nu)
         Inputs in their own units.
+
+    Raises
+    ------
+    ValueError
+        If the policy gives an action that is no number.
     """
     n, u_max = len(x0), np.array(system.u_max)
     error = random_signals(system.scale, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=SIGNALS)
@@ -68,10 +77,15 @@ def under_policy(
 
     def act(k: int, x: np.ndarray) -> np.ndarray:
         seen = np.where(np.isfinite(x), x, system.X_centre) + error[k]  # what has escaped may do anything
-        u[k] = np.clip(policy(seen) + exploration[k], -1.0, 1.0) * u_max
+        action = policy(seen)
+        unknown = ~np.isfinite(action).all(-1)
+        if unknown.any():
+            at = int(unknown.argmax())
+            raise ValueError(f"the policy gives the action {action[at].tolist()} at x = {seen[at].tolist()}")
+        u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
-    return simulate(system, x0, steps, dt, u=act, w=w), u
+    return simulate(system, x0, steps, dt, u=act, w=w, report=report), u
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -19,7 +20,10 @@ FIRST = 100  # trajectories tried before all others
 FEWEST_INSIDE = 0.05  # share of them that must stay within the bounds
 # Seconds, at the pace of the shipped systems, for which inputs lead starts out of the training box.
 RANDOM_LEAD_IN, CONSTANT_LEAD_IN = 10.0, 20.0
-POLICYS_OWN = 4  # every fourth trajectory under a policy is its own, the others are also explored
+# Every so many trajectories under a policy one is its own, the others are explored. On those alone the input tells the
+# state, which an agent's does not. Under the regulator on x_hat, at the default noise, cart-pole's angle is estimated
+# to 3.4 % of X's half-width with 4 here, to 3.2 % with 12 and to 3.1 % with none; by an exact EKF to 2.7 %.
+POLICYS_OWN = 12
 NEAR = 0.4  # share of the trajectories that start in X itself where others start in a larger box
 
 
@@ -104,7 +108,7 @@ def record(
     ages: np.ndarray,
     rng: np.random.Generator,
     motions: Motions | None = None,
-    report: Callable[[int], None] = lambda done: None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Trajectories:
     """Simulate trajectories and run the filter beside them.
 
@@ -125,7 +129,7 @@ def record(
     motions : Motions, optional
         What to draw from, undriven if the filter takes no inputs; by default all kinds of inputs.
     report : callable, optional
-        Told the number of trajectories that are there so far.
+        Told the number of trajectories that are there so far, parts of those under way included.
 
     Returns
     -------
@@ -143,7 +147,7 @@ def record(
     xs: list[np.ndarray] = []
     zs: list[np.ndarray] = []
     levels: list[np.ndarray] = []
-    for x, u, level in trajectories(system, n=n, steps=steps, dt=linear.dt, rng=rng, motions=motions):
+    for x, u, level in trajectories(system, n=n, steps=steps, dt=linear.dt, rng=rng, motions=motions, report=report):
         xs.append(x[ages])
         zs.append(linear.run(system.output(x), u, ages))
         levels.append(level)
@@ -159,6 +163,7 @@ def trajectories(
     dt: float,
     rng: np.random.Generator,
     motions: Motions | None = None,
+    report: Callable[[float], object] = lambda done: None,
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Simulate trajectories from starts in the training box, in chunks.
 
@@ -179,6 +184,8 @@ def trajectories(
         Of everything random.
     motions : Motions, optional
         What to draw from; by default there are no inputs and no process noise, and starts lie in X.
+    report : callable, optional
+        As for :func:`record`.
 
     Yields
     ------
@@ -203,12 +210,18 @@ def trajectories(
         _check_share(system, int(first.inside.sum()), len(first.inside), steps * dt)
     while pending:
         rows, pending = pending[:CHUNK], pending[CHUNK:]
-        found = _simulated(system, rows, steps=steps, dt=dt, rng=rng, motions=motions)
+        told = partial(_tell, report, n - len(pending) - len(rows), len(rows) / steps)
+        found = _simulated(system, rows, steps=steps, dt=dt, rng=rng, motions=motions, report=told)
         pending += [row for row, stayed in zip(rows, found.inside) if not stayed]
         tried += len(rows)
         if pending and tried >= FIRST:
             _check_share(system, n - len(pending), tried, steps * dt)
         yield found.x[:, found.inside], found.u[:, found.inside], found.level[found.inside]
+
+
+def _tell(report: Callable[[float], object], there: int, each: float, interval: int) -> None:
+    """Tell how many trajectories are there: some, and a part of each that is under way."""
+    report(there + each * interval)
 
 
 @dataclass(frozen=True)
@@ -222,7 +235,14 @@ class _Chunk:
 
 
 def _simulated(
-    system: System, rows: list[tuple[int, bool]], *, steps: int, dt: float, rng: np.random.Generator, motions: Motions
+    system: System,
+    rows: list[tuple[int, bool]],
+    *,
+    steps: int,
+    dt: float,
+    rng: np.random.Generator,
+    motions: Motions,
+    report: Callable[[int], object] | None = None,
 ) -> _Chunk:
     """Simulate trajectories of the kinds that the rows say: the number of the input's kind, and whether led from X."""
     count, led = len(rows), np.array([beyond for _, beyond in rows])
@@ -244,9 +264,9 @@ def _simulated(
         w = draw_process_noise(system, level, n=count, steps=steps, rng=rng)
     if motions.policy:
         own = np.array([i % POLICYS_OWN == 0 for i, _ in rows])
-        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w)
+        x, u = under_policy(system, motions.policy, x0, steps=steps, dt=dt, rng=rng, own=own, w=w, report=report)
     else:
-        x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w)
+        x = simulate(system, x0, steps, dt, u=u if motions.kinds else None, w=w, report=report)
     return _Chunk(x, u, level, np.isfinite(x[-1]).all(-1))
 
 

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import tomllib
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -12,7 +13,11 @@ from pathlib import Path
 import pytest
 
 import training.cli
+from kkl_gym import Lorenz
 from training.cli import COMMANDS, EXTRAS, main
+from training.commands.settings import defaults
+from training.config import setting_types
+from training.presets import preset
 
 ROOT = Path(__file__).parents[3]
 
@@ -43,6 +48,82 @@ def test_every_command_has_help_of_its_own(name, capsys):
     shown = capsys.readouterr().out
     assert f"usage: kkl-gym {name}" in shown
     assert "None" not in shown
+
+
+def test_help_of_no_command_imports_what_takes_seconds():
+    done = python(
+        "import sys\nfrom training.cli import COMMANDS, main\n"
+        "for words in ([], *([name] for name in COMMANDS), *(['agent', name] for name in ('train', 'compare'))):\n"
+        "    try:\n        main([*words, '--help'])\n    except SystemExit as end:\n        assert not end.code\n"
+        "slow = {'torch', 'pandas', 'matplotlib', 'sympy', 'stable_baselines3', 'scipy.signal', 'scipy.stats'}\n"
+        "print(*sorted(slow & set(sys.modules)), file=sys.stderr)"
+    )
+    assert done.returncode == 0
+    assert done.stderr.strip() == ""
+
+
+def test_help_says_what_the_presets_take(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", "").split())
+    for setting, default in (
+        ("width", "fast 128, paper 512"),
+        ("depth", "fast 3, paper 4"),
+        ("eigenvalues", "from the system"),
+        ("dt", "from the system"),
+        ("trajectories", "4000; spinn: fast 4000, paper 500"),
+        ("inverse-steps", "fast 18000 (van_der_pol 24000), paper 244140; spinn: fast 18000, paper 244140"),
+        ("adaptive", "no"),
+        ("cpu-seconds", "none"),
+    ):
+        described = shown.partition(f" --{setting}")[2].partition("(default: ")[2]
+        assert described.startswith(f"{default})"), setting
+    assert set(defaults()) == set(setting_types())
+
+
+def test_what_help_says_of_the_presets_is_what_they_take():
+    texts = defaults()
+    for name in ("fast", "paper"):
+        config = vars(preset(Lorenz(), "input-aware", name))
+        for setting in ("width", "depth", "batch", "activation", "optimiser", "samples"):
+            assert str(config[setting]) in texts[setting]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ("train lorenz --dt abc", "Error parsing --dt: could not convert string to float: 'abc'"),
+        ("train lorenz --activation relu",
+         "invalid choice 'relu' for argument '--activation'. Expected one of ('tanh', 'silu')."),
+        ("evaluate lorenz --nope 3", "Unrecognized options: --nope, 3"),
+        ("agent foo", "Unrecognized options: foo; Available subcommands: train, evaluate, compare"),
+        ("agent", "Expected one of {train, evaluate, compare}."),
+        ("train lorenz --pairs -1 2 -3",
+         "Error parsing --pairs: Could not find valid parse for arguments: ['-1', '2', '-3']"),
+        ("demo --duration", "Missing value for argument '--duration'. Expected 1 values."),
+    ],
+)  # fmt: skip
+def test_options_that_cannot_be_read_are_said_in_one_line(arguments, said, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments.split())
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"kkl-gym: {said}\n"
+
+
+def test_flags_of_settings():
+    assert "adaptive" in str(defaults())
+    with pytest.raises(SystemExit) as end:
+        main(["train", "lorenz", "--adaptive", "--no-solved-output-layer", "--no-transients"])
+    assert end.value.code.startswith(
+        "kkl-gym: adaptive = True, solved_output_layer = False, transients = False: settings"
+    )
+
+
+def test_a_reader_who_has_seen_enough_gets_no_error():
+    done = subprocess.run(
+        f"{sys.executable} -m training maps | head -n 1", shell=True, cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.stderr == ""
 
 
 def test_wrong_settings_are_said_in_a_line_each():
@@ -142,6 +223,25 @@ def test_what_modules_make_of_an_interruption(becomes, monkeypatch, capsys):
     assert end.value.code == 130
     assert capsys.readouterr().err == "kkl-gym: interrupted\n"
     assert signal.getsignal(signal.SIGINT) is handler
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_interruption_that_a_callback_swallows_comes_again(monkeypatch, capsys):
+    class Callback:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def interrupted(name):
+        Callback()
+        time.sleep(60.0)
+
+    hook = sys.unraisablehook
+    monkeypatch.setattr(training.cli, "import_module", interrupted)
+    with pytest.raises(SystemExit) as end:
+        main(["maps"])
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "kkl-gym: interrupted\n"
+    assert sys.unraisablehook is hook
 
 
 def test_commands_run_in_threads_too(capsys):

@@ -8,7 +8,7 @@ from linear_system import Oscillator, TwoOutputs, exact_observer
 
 from kkl_gym.elementary import sin
 from observers import ArtifactError, Expression, KKLObserver
-from training.evaluation.calibration import WARM_UP, calibrate, sound_trajectories
+from training.evaluation.calibration import PARTS, WARM_UP, calibrate, sound_trajectories
 
 
 class Noiseless(Oscillator):
@@ -19,8 +19,9 @@ class Noiseless(Oscillator):
 
 
 def test_calibration_keeps_its_promise():
-    system = Noiseless()
-    calibrated = calibrate(exact_observer(), system, trajectories=600, duration=20.0)
+    system, told = Noiseless(), []
+    calibrated = calibrate(exact_observer(), system, trajectories=600, duration=20.0, report=told.append)
+    assert told == list(range(1, PARTS))
     found = calibrated.limits
     assert (np.diff(found.mean[1:, 0]) > 0).all()  # more noise, wider limits
     assert found.low[0] == 0.0
@@ -90,7 +91,9 @@ def test_impossible_calibrations():
     for wrong in ({"false_alarms": 0.0}, {"duration": 1.0}, {"trajectories": 599}, {"seed": -1}):
         with pytest.raises(ValueError, match=r"need|too few"):
             calibrate(exact_observer(), Oscillator(), **wrong)
-    with pytest.raises(ValueError, match=r"h\(x\) of 'oscillator' cannot be written into its observer.*elementary"):
+    with pytest.raises(
+        ValueError, match=r"observer of 'oscillator' cannot hold h\(x\), .*test_calibration\.py, .*kkl_gym\.elementary"
+    ):
         calibrate(dataclasses.replace(exact_observer(), C=None), OnFloats())
     with pytest.raises(ArtifactError, match="system"):
         calibrate(exact_observer(), Steep())

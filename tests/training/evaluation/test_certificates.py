@@ -21,6 +21,7 @@ from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
 from observers.artifact import resolve
 from training import certify
 from training.cli import main
+from training.evaluation.certificates.certificate import parts
 from training.evaluation.certificates.gains import controllability, envelope, h2, h_infinity, theorem_gain
 from training.evaluation.certificates.generalisation import (
     forward_samples,
@@ -64,7 +65,14 @@ def linear_observer(spoiled=1.0, A=A):
 
 @pytest.fixture(scope="module")
 def exact():
-    return certify(linear_observer(), Oscillator(), measurement_noise=0.5, process_noise=0.0, trajectories=50)
+    told = []
+    found = certify(
+        linear_observer(), Oscillator(), measurement_noise=0.5, process_noise=0.0, trajectories=50, report=told.append
+    )
+    assert told[0] == 1
+    assert told == sorted(told)
+    assert told[-1] == parts(linear_observer())
+    return found
 
 
 def test_exact_maps_have_no_risk(exact):

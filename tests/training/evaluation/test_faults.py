@@ -14,11 +14,12 @@ import training.evaluation.certificates.certificate
 import training.evaluation.certificates.gains
 import training.evaluation.faults
 from kkl_gym import VanDerPol
+from kkl_gym.elementary import sin
 from observers import Artifact, KKLObserver, Limits
 from observers.artifact import resolve
 from training.cli import main
 from training.commands.faults import report
-from training.evaluation.faults import FAULTS, simulate_faults
+from training.evaluation.faults import FAULTS, PARTS, simulate_faults
 from training.maps.smooth import decoder
 
 
@@ -37,9 +38,18 @@ def with_limits(name):
 def found():
     from kkl_gym import get_system
 
-    return simulate_faults(
-        with_limits("lorenz"), get_system("lorenz"), trajectories=12, duration=16.0, measurement_noise=0.5, seed=0
+    told = []
+    found = simulate_faults(
+        with_limits("lorenz"),
+        get_system("lorenz"),
+        trajectories=12,
+        duration=16.0,
+        measurement_noise=0.5,
+        seed=0,
+        report=told.append,
     )
+    assert told == list(range(1, PARTS))
+    return found
 
 
 def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact, monkeypatch):
@@ -175,3 +185,20 @@ def test_published_faults_have_the_columns_that_the_command_writes(found, tmp_pa
     faults.to_csv(tmp_path / "faults.csv", index=False)
     report(tmp_path)
     assert (tmp_path / "table.md").read_text() == (published / "table.md").read_text()
+
+
+def test_faults_of_an_output_that_is_not_linear():
+    class Sine(linear_system.Oscillator):
+        name = "oscillator"
+        X = ((-0.2, 0.2), (-0.2, 0.2))
+        process_noise = 0.0
+
+        def h(self, x):
+            return (sin(x[0]),)
+
+    blind = dataclasses.replace(linear_system.exact_observer(), C=None, measurement_noise=0.01)
+    calibrated = training.evaluation.calibration.calibrate(blind, Sine(), duration=10.0, false_alarms=0.1)
+    rows = simulate_faults(calibrated, Sine(), trajectories=10, duration=20.0, measurement_noise=0.01, seed=0)
+    alarms = rows.assign(alarm=rows.delay < np.inf).groupby("fault").alarm.mean()
+    assert alarms["none"] <= 0.2
+    assert (alarms[["bias", "drop-out", "freeze"]] >= 0.8).all()

@@ -205,10 +205,23 @@ def test_gain_tuning_takes_the_least_of_the_authors_criterion(tmp_path):
         problem.decoder,
     ):  # maps that ignore the cutoff: only the transient gain depends on it
         network.linear_layers()[0].weight.data[:, -1] = 0.0
-    assert problem.best_cutoff() == pytest.approx(0.1)
+    assert problem.best_cutoff() == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(("name", "expected"), [("node", 0.0), ("node-noise", 0.1), ("dmf", 0.0), ("dmf-noise", 0.5)])
+def test_autoencoder_learns_at_states_that_the_system_draws(tmp_path):
+    class Ring(Oscillator):
+        name = "ring"
+
+        def draw_starts(self, rng, n, factor=1.0):
+            angle = rng.uniform(-np.pi, np.pi, n)
+            return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+    problem = _AEProblem(Task(Ring(), SMALL, tmp_path), 0.5, 8.0)
+    x = problem.draw(100, torch.Generator().manual_seed(0)).numpy()
+    np.testing.assert_allclose(np.hypot(x[:, 0], x[:, 1]), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "expected"), [("node", 0.0), ("node-noise", 0.1), ("dmf", 0.0), ("dmf-noise", 0.1)])
 def test_noise_variants_see_noise_in_training(name, expected, tmp_path, monkeypatch):
     module = importlib.import_module(f"training.methods.{name[:4].rstrip('-')}")
     seen = []

@@ -41,6 +41,13 @@ def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
     assert np.isnan(x[-1]).any()
 
 
+def test_actions_that_are_no_numbers_are_an_error():
+    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
+    with pytest.raises(ValueError, match=r"the policy gives the action \[nan\] at x = \["):
+        under_policy(SYSTEM, lambda x: np.where(x[:, :1] > 0.31, np.nan, 0.0), np.full((4, 2), 0.3), steps=300,
+                     dt=SYSTEM.dt, rng=rng, own=own)  # fmt: skip
+
+
 def test_an_unstable_plant_is_held_by_a_policy_alone():
     sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
     with pytest.raises(ValueError, match="--policy"):

@@ -213,3 +213,11 @@ def test_without_escapes_the_draws_are_chunk_by_chunk(monkeypatch):
         np.testing.assert_array_equal(u, inputs)
         np.testing.assert_array_equal(level, expected)
         np.testing.assert_array_equal(x, simulate(system, x0, steps, dt, u=inputs, w=w))
+
+
+def test_parts_of_a_chunk_are_told(monkeypatch):
+    monkeypatch.setattr(training.trajectories.record, "CHUNK", 10)
+    linear, told = LinearFilter(np.diag([-1.0, -2.0]), np.ones((2, 1)), 0.01), []
+    rng, ages = np.random.default_rng(0), recording_ages(100, 10)
+    record(Oscillator(), linear, n=15, steps=100, ages=ages, rng=rng, report=told.append)
+    assert told == [0, 5, 10, 10, 12.5, 15]

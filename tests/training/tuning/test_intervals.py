@@ -14,7 +14,7 @@ from training.presets import preset
 from training.smoothness import Smoothness, intervals, smoothness
 from training.spectrum import Spectrum, papers_spectrum
 from training.tuning import Choice, Probe
-from training.tuning.intervals import CANDIDATE, PAPERS, Judged
+from training.tuning.intervals import CANDIDATE, PAPERS, Judged, judge
 
 SYSTEM = str(Path(linear_system.__file__)) + ":Oscillator"
 
@@ -58,3 +58,9 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
 def test_no_check_of_intervals():
     with pytest.raises(SystemExit, match="check trains input-aware maps"):
         main(["tune", SYSTEM, "--pipeline", "spinn", "--check", "1"])
+
+
+def test_judging_tells_how_far_it_is():
+    told = []
+    found = judge(Oscillator(), 0.05, duration=10.0, measurement_noise=0.2, report=told.append)
+    assert told == pytest.approx(np.arange(1, 2 * len(found.choices) + 1) / (2 * len(found.choices)))

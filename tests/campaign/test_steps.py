@@ -1,0 +1,158 @@
+"""Steps from twice the training boxes under bounded inputs: all that is returned is finite and within its space."""
+
+from collections import Counter
+from itertools import count, product
+
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+from kkl_gym import SYSTEMS, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
+
+LEVELS = ({}, {"process_noise": 0.0, "measurement_noise": 0.0}, {"process_noise": 0.3, "measurement_noise": 2.0})
+CASES = list(product(AutoresetMode, LEVELS, ("state", "output")))
+
+
+def twice(name):
+    """The box 2X, as a start box."""
+    return np.transpose(SYSTEMS[name]().box(2))
+
+
+def actions(rng, shape):
+    """Random inputs, those at their bounds and those to be clipped."""
+    drawn = rng.uniform(-1, 1, shape).astype(np.float32)
+    kind = rng.integers(3)
+    return drawn if kind == 0 else np.sign(drawn) if kind == 1 else 3 * drawn
+
+
+def check(space, bounds, obs, info):
+    """All rows of what is returned, in a few operations each."""
+    assert obs.dtype == np.float32
+    assert ((obs >= space.low) & (obs <= space.high)).all()  # false for NaN too
+    assert ((info["x"] >= bounds[0]) & (info["x"] <= bounds[1])).all()
+    for key in info:
+        if not key.startswith(("_", "final")):
+            assert np.isfinite(info[key]).all(), key
+
+
+def run(envs, steps, seed):
+    """Make some steps of every row; returns how many of them moved, and how many episodes there were."""
+    rng, counts = np.random.default_rng(seed), Counter()
+    space, bounds = envs.single_observation_space, np.array(envs.unwrapped.system.bounds).T
+    mode = envs.metadata["autoreset_mode"]
+    obs, info = envs.reset(seed=seed)
+    check(space, bounds, obs, info)
+    over = np.zeros(envs.num_envs, dtype=bool)
+    for _ in range(steps):
+        obs, reward, terminated, truncated, info = envs.step(actions(rng, envs.action_space.shape))
+        check(space, bounds, obs, info)
+        assert ((reward > 0) & (reward <= 1) | over & (reward == 0)).all()
+        counts["steps"] += int((~over).sum())
+        ended = terminated | truncated
+        counts["episodes"] += int((ended & ~over).sum())
+        counts["escapes"] += int((terminated & ~over).sum())
+        if mode is AutoresetMode.SAME_STEP and ended.any():
+            final = {key: values[ended] for key, values in info["final_info"].items()}
+            check(space, bounds, np.stack(info["final_obs"][ended]), final)
+        elif mode is AutoresetMode.DISABLED and ended.mean() > 0.1:
+            obs, info = envs.reset(options={"reset_mask": ended})
+            check(space, bounds, obs, info)
+            ended = np.zeros_like(ended)
+        over = ended if mode is not AutoresetMode.SAME_STEP else over
+    return counts
+
+
+def vectors(rows, length):
+    """Every system under each of CASES."""
+    for name, (mode, levels, observe) in product(SYSTEMS, CASES):
+        yield (
+            name,
+            KKLVectorEnv(
+                name,
+                rows,
+                **levels,
+                observe=observe,
+                start_box=twice(name),
+                autoreset_mode=mode,
+                max_episode_steps=length,
+            ),
+        )
+
+
+def campaign(total, rows, length):
+    """At least that many steps, shared out among all of :func:`vectors`; returns counts by system."""
+    found = {name: Counter() for name in SYSTEMS}
+    share = total / len(SYSTEMS) / len(CASES)
+    seeds = count()
+    for name, envs in vectors(rows, length):
+        counts = Counter()
+        while counts["steps"] < share:  # more than once where rows waited
+            counts += run(envs, int(np.ceil((share - counts["steps"]) / rows)), next(seeds))
+        found[name] += counts
+    return found
+
+
+def run_single(env, steps):
+    """Steps of a single environment."""
+    rng = np.random.default_rng(0)
+    bounds = np.array(env.unwrapped.system.bounds).T
+    obs, info = env.reset(seed=0)
+    for _ in range(steps):
+        check(env.observation_space, bounds, obs, info)
+        obs, reward, terminated, _, info = env.step(actions(rng, env.action_space.shape))
+        assert 0 < reward <= 1
+        if terminated:
+            check(env.observation_space, bounds, obs, info)
+            obs, info = env.reset()
+
+
+def printed(found, capsys):
+    kinds = ("steps", "episodes", "escapes")
+    with capsys.disabled():
+        print(f"\n{'from 2X':17}", *(f"{kind:>14}" for kind in kinds))
+        for name, counts in found.items():
+            print(f"{name:17}", *(f"{counts[kind]:14,}" for kind in kinds))
+
+
+def test_steps_stay_finite_and_within_their_spaces():
+    found = campaign(100_000, 64, length=12)
+    assert sum(counts["steps"] for counts in found.values()) >= 100_000
+    assert all(counts["episodes"] > 0 for counts in found.values())
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_estimates_stay_finite_and_within_their_spaces(name, estimate):
+    for mode in AutoresetMode:
+        envs = KKLVectorEnv(name, 50, start_box=twice(name), autoreset_mode=mode, max_episode_steps=12)
+        run(KKLVectorObservation(envs, estimate=estimate), 40, seed=0)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_single_steps_stay_finite_and_within_their_spaces(name):
+    run_single(KKLEnv(name, start_box=twice(name)), 300)
+    run_single(KKLObservation(KKLEnv(name, start_box=twice(name))), 100)
+
+
+@pytest.mark.long
+def test_a_hundred_million_steps(capsys):
+    found = campaign(100_000_000, 1024, length=500)
+    printed(found, capsys)
+    assert sum(counts["steps"] for counts in found.values()) >= 100_000_000
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_million_estimates(name, capsys):
+    counts = Counter()
+    for seed, (mode, estimate) in enumerate(product(AutoresetMode, ("x", "z"))):
+        envs = KKLVectorEnv(name, 1024, start_box=twice(name), autoreset_mode=mode, max_episode_steps=100)
+        counts += run(KKLVectorObservation(envs, estimate=estimate), 170, seed)
+    printed({name: counts}, capsys)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_a_hundred_thousand_single_steps(name):
+    run_single(KKLEnv(name, start_box=twice(name)), 100_000)
+    run_single(KKLObservation(KKLEnv(name, start_box=twice(name))), 20_000)

@@ -1,0 +1,81 @@
+"""``kkl-gym check``."""
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import linear_system
+import pytest
+from linear_system import Oscillator
+
+import training.checking.equations
+from kkl_gym.compiled import BatchStep
+from training.cli import main
+
+OSCILLATOR = f"{Path(linear_system.__file__)}:Oscillator"
+
+
+@dataclass(frozen=True)
+class Named(Oscillator):
+    """Written where no array can follow."""
+
+    gain: float = 1.0
+
+    name: ClassVar[str] = "named"
+
+    def f(self, x):
+        return x[1], -self.gain * x[0] if x[0] > 0 else -x[0]
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_compiled(monkeypatch):
+    monkeypatch.setattr(training.checking.equations, "batch_step", lambda system: BatchStep(lambda *args: args[0]))
+
+
+def test_a_table_of_what_was_found(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    file = tmp_path / "found.json"
+    main(["check", OSCILLATOR, "--duration", "2", "--policy", "controller", "--json", str(file)])
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[-1] == "no problems, no notes"
+    found = json.loads(file.read_text())
+    assert len(found) == len(shown) - 1
+    for line, finding in zip(shown, found, strict=False):
+        assert line.split()[0] == finding["verdict"] == "ok"
+        assert finding["check"] in line
+        assert finding["found"] in line
+    assert any("under the policy" in finding["found"] for finding in found)
+
+
+def test_a_problem_is_shown_with_advice_and_ends_with_status_1(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    file = tmp_path / "found.json"
+    with pytest.raises(SystemExit) as end:
+        main(["check", f"{__file__}:Named", "--parameters", "gain", "2", "--json", str(file)])
+    assert end.value.code == 1
+    shown = capsys.readouterr().out
+    assert "gain = 2" in shown
+    assert "problem" in shown
+    assert "x[0] > 0" in shown  # square brackets are no markup
+    assert "→ as it is, batches, training and evaluation do not run" in shown
+    assert shown.splitlines()[-1] == "1 problem, 3 notes"
+    assert "problem" in {finding["verdict"] for finding in json.loads(file.read_text())}
+
+
+@pytest.mark.parametrize("options", [["--dt", "-1"], ["--duration", "0"], ["--parameters", "rho", "1"]])
+def test_bad_options(options):
+    with pytest.raises(SystemExit, match=r"must|no parameter"):
+        main(["check", OSCILLATOR, *options])
+
+
+def test_help_imports_nothing_that_takes_time():
+    code = (
+        "import sys\nfrom training.cli import main\ntry:\n    main(['check', '--help'])\n"
+        "except SystemExit:\n    print({'torch', 'scipy', 'sympy'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "exit status" in done.stdout.replace("\n", " ")
+    assert done.stdout.endswith("set()\n")

@@ -1,0 +1,86 @@
+"""Outputs as data that say what the system says."""
+
+import math
+import re
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import sympy
+from linear_system import Oscillator, TwoUnits
+
+from kkl_gym import System
+from kkl_gym.elementary import abs as absolute
+from kkl_gym.elementary import atan2, clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
+from observers import Expression
+from training.trajectories.expression import output_expression
+
+
+@dataclass(frozen=True)
+class Everything(System):
+    """Every elementary function once."""
+
+    length: float = 1.5
+
+    name: ClassVar[str] = "everything"
+    X: ClassVar = ((-2, 2), (-1, 3))
+    bounds: ClassVar = ((-9, 9), (-9, 9))
+
+    def f(self, x):
+        return x[1], -x[0]
+
+    def h(self, x):
+        a, b = x
+        return (
+            self.length * sin(a) - cos(b) / 3 + 7,
+            tan(a / 2) + tanh(b) + exp(-b),
+            log(1 + a**2) * sqrt(absolute(b)) - sign(a),
+            atan2(b, a) + minimum(a, b) * maximum(a, 0.5) + clip(a, -1, 1),
+            where(a > 0, a, where((b <= 1) & (a < -1), b, 2.0)) + where((a >= 1) | (b > 2), 1.0, 0.0),
+            (a**2 + b**2) ** -0.5 + b**3 + a % 1.5,
+            absolute(self.length - a),
+            4.0,
+        )
+
+
+def test_every_function_is_written_down():
+    found = output_expression(Everything())
+    x = np.random.default_rng(1).uniform(-3, 3, (500, 2))
+    np.testing.assert_allclose(found(x), Everything().output(x), rtol=1e-12, atol=1e-12)
+    other = Everything(length=0.5)
+    np.testing.assert_allclose(output_expression(other)(x), other.output(x), rtol=1e-12, atol=1e-12)
+
+
+def test_linear_outputs_are_written_down_too():
+    assert output_expression(Oscillator()) == Expression([["x", 0]])
+    x = np.array([[0.1, 0.2]])
+    np.testing.assert_allclose(output_expression(TwoUnits())(x), [[100.0, 0.12]])
+
+
+def deep(x):
+    value = x[0]
+    for _ in range(30):
+        value = sin(value)
+    return (value,)
+
+
+@pytest.mark.parametrize(
+    ("h", "match"),
+    [
+        (lambda self, x: (math.sin(x[0]),), r"test_expression\.py, line \d+.* kkl_gym\.elementary"),
+        (lambda self, x: (np.sin(x[0]),), r"kkl_gym\.elementary"),
+        (lambda self, x: (x[0] if x[0] > 0 else x[1],), r"kkl_gym\.elementary\.where"),
+        (lambda self, x: (sympy.sinh(x[0]) if isinstance(x[0], sympy.Basic) else np.sinh(x[0]),), "'sinh' is unknown"),
+        (
+            lambda self, x: (x[0] if isinstance(x[0], sympy.Basic) else 2 * x[0],),
+            "not the same on symbols as on arrays",
+        ),
+        (lambda self, x: deep(x), "at most 24 levels"),
+    ],
+)
+def test_outputs_that_cannot_be_written_down(h, match):
+    kind = type("Odd", (Oscillator,), {"name": "odd", "h": h})
+    with pytest.raises(ValueError, match=r"the observer of 'odd' cannot hold h\(x\)") as raised:
+        output_expression(kind())
+    assert re.search(match, str(raised.value))

@@ -1,0 +1,113 @@
+"""Whether a system is ready for training, and what to change: what ``kkl-gym check`` prints."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from numpy.linalg import LinAlgError
+
+from kkl_gym.simulate import RATE_STEP, SubstepsError, check_duration, check_interval
+from kkl_gym.system import System
+from observers.checks import check_dt
+from training.checking import dynamics, equations, levels, observability
+from training.checking.finding import Finding, Verdict
+from training.checking.subject import Subject
+from training.trajectories.controllers import Controller
+
+STEPS, FEWEST = 5000, 200  # sampling intervals of motions where no duration is given
+
+FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
+    "system": equations.declaration,
+    "starts": equations.starts,
+    "equations": equations.kinds_of_numbers,
+}
+THEN: dict[str, Callable[[Subject], Iterator[Finding]]] = {
+    "compiled": equations.machine_code,
+    "finite": equations.finite,
+    "inputs": equations.inputs,
+    "rate": dynamics.rate,
+    "speed": dynamics.speed,
+    "bounds": dynamics.bounds,
+    "sampling": dynamics.sampling,
+    "output": levels.outputs,
+    "target": levels.target,
+    "process noise": levels.process_noise,
+    "spectrum": observability.spectrum,
+    "observability": observability.observability,
+    "spinn": observability.smooth,
+}
+
+
+def check(
+    system: System,
+    *,
+    dt: float | None = None,
+    duration: float | None = None,
+    policy: Controller | None = None,
+    spinn: bool = False,
+) -> Iterator[Finding]:
+    """Look for what would go wrong with a system in environments, training and evaluation.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    dt : float, optional
+        Sampling interval in seconds; the system's own if it is left out.
+    duration : float, optional
+        Length of motions in seconds; the system's own if it is left out, but no more than STEPS sampling intervals.
+    policy : callable, optional
+        States (n, nx) to actions (n, nu) in [-1, 1]. It acts on the system in place of random inputs.
+    spinn : bool, default False
+        Whether to look for a spectrum that makes T smooth, too.
+
+    Yields
+    ------
+    Finding
+        One after the other, as they come. Where starts or equations do not work, the rest is left out.
+
+    Raises
+    ------
+    ValueError
+        If ``dt`` or ``duration`` make no sense.
+    """
+    for name, look in FIRST.items():
+        findings = list(_guarded(name, look, system))
+        yield from findings
+        if any(finding.verdict == "problem" for finding in findings):
+            yield Finding(name, "note", "all other checks are left out", "mend this first")
+            return
+    interval = system.dt if dt is None else check_dt(dt)
+    try:
+        check_interval(system, interval)
+    except SubstepsError as error:
+        yield Finding("sampling", "problem", *str(error).split(": ", 1))
+        return
+    length = _affordable(system, interval) if duration is None else duration
+    check_duration(length, interval)
+    subject = Subject(system, interval, length, policy)
+    for name, look_at in THEN.items():
+        if name != "spinn" or spinn:
+            yield from _guarded(name, look_at, subject)
+
+
+def _affordable(system: System, dt: float) -> float:
+    """The system's own duration in seconds, or what takes as long to simulate as STEPS sampling intervals."""
+    try:
+        substeps = 1.0 if system.discrete else max(1.0, system.typical_rate * dt / RATE_STEP)
+    except ValueError:  # of an integrator; the check of the rate says so
+        substeps = 1.0
+    return min(system.duration, dt * max(FEWEST, round(STEPS / substeps)))
+
+
+def _guarded(name: str, look: Callable[[Any], Iterator[Finding]], at: System | Subject) -> Iterator[Finding]:
+    """What a check says, and what it raises as a problem."""
+    try:
+        yield from look(at)
+    except SubstepsError as error:
+        found, _, advice = str(error).partition("; ")
+        yield Finding(name, "problem", found, advice)
+    except (ValueError, ArithmeticError, LinAlgError) as error:
+        yield Finding(name, "problem", str(error))
+
+
+__all__ = ["Finding", "Verdict", "check"]

@@ -1,0 +1,222 @@
+"""Whether the equations are what the package takes: on every kind of number, everywhere within the bounds."""
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from kkl_gym import EquationError
+from kkl_gym.compiled import batch_step
+from kkl_gym.equations import components, input_matrix, rate_at
+from kkl_gym.system import System
+from training.checking.finding import Finding, Verdict, number, percent
+from training.checking.subject import Subject, of_bounds, of_X
+
+COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
+LEAST_EFFECT = 1e-9  # of an input at its bound, in half-widths of X over 1 / rate
+
+Evaluation = Callable[[Any], list[Any]]
+"""From components of a state to all that the equations say there."""
+
+COST = {
+    "floats": "single environments and observers do not run",
+    "arrays": "batches, training and evaluation do not run",
+    "tensors": "no map of --pipeline spinn can be trained",
+    "symbols": "no Kalman filter, no choice of a spectrum, no monitor of nonlinear outputs, no --pipeline spinn, and "
+    "batches are not compiled",
+}
+
+
+def declaration(system: System) -> Iterator[Finding]:
+    """States, inputs and parameters."""
+    bounds = ", ".join(f"{u_max:g}" for u_max in system.u_max)
+    values = ", ".join(f"{name} = {value:g}" for name, value in system.parameters.items())
+    found = [
+        f"{system.name}: {_counted(system.nx, 'state')} ({', '.join(system.state_names)})",
+        f"{_counted(system.nu, 'input')} up to {bounds}" if system.nu else "no inputs",
+        f"parameters {values}" if values else "no parameters",
+    ]
+    if system.discrete:
+        found.append(f"steps of {system.dt:g} s of its own")
+    yield Finding("system", "ok", "; ".join(found))
+
+
+def starts(system: System) -> Iterator[Finding]:
+    """What a draw_starts of the user's returns."""
+    if type(system).draw_starts is System.draw_starts:
+        return
+    low, high = np.array(system.bounds, dtype=float).T
+    for factor in (1.0, 2.0):
+        x = system.draw_starts(np.random.default_rng(0), COMPARED, factor)
+        call = f"draw_starts(rng, {COMPARED}, {factor:g})"
+        if np.shape(x) != (COMPARED, system.nx):
+            found = f"{call} returns starts of shape {np.shape(x)}"
+            yield Finding("starts", "problem", found, f"return an array of shape ({COMPARED}, {system.nx})")
+            return
+        inside = ((x >= low) & (x <= high)).all(1)
+        if not inside.all():
+            found = f"{percent(1 - inside.mean())} of the starts of {call} lie beyond the bounds"
+            yield Finding("starts", "problem", found, "draw them within the bounds, or widen those")
+            return
+    yield Finding("starts", "ok", "draw_starts of its own, all within the bounds")
+
+
+def kinds_of_numbers(system: System) -> Iterator[Finding]:
+    """The equations on floats, arrays, tensors and symbols: do they work, and say the same."""
+    x = np.concatenate([of_X(system, COMPARED), of_bounds(system, COMPARED)])
+    expected, agreeing = None, list[str]()
+    for kind, evaluated in (("floats", _floats), ("arrays", _arrays), ("tensors", _tensors), ("symbols", _symbols)):
+        verdict: Verdict = "problem" if kind in ("floats", "arrays") else "note"
+        try:
+            with np.errstate(all="ignore"):
+                values = evaluated(_everything(system), x)
+        except (EquationError, NotImplementedError) as error:
+            yield Finding("equations", verdict, f"on {kind}: {error}", f"as it is, {COST[kind]}")
+            continue
+        if expected is None:
+            expected = values
+        apart = _apart(expected, values)
+        if apart.any():
+            where = np.array2string(x[int(apart.argmax())], separator=", ", precision=4)
+            yield Finding(
+                "equations",
+                "problem",
+                f"on {kind} they do not say what they say on {agreeing[0]}, such as at x = {where}",
+                "let them depend on state, input and parameters alone, and replace `if` by kkl_gym.elementary.where",
+            )
+            continue
+        agreeing.append(kind)
+    if agreeing:
+        parts = "step and h" if system.discrete else "f, g, h and rate"
+        yield Finding("equations", "ok", f"{parts} work on {', '.join(agreeing)}, and agree at {len(x)} points")
+
+
+def machine_code(subject: Subject) -> Iterator[Finding]:
+    """Whether batches run as machine code."""
+    if importlib.util.find_spec("numba") is None:
+        yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
+        return
+    obstacle = batch_step(subject.system).obstacle
+    if obstacle is None:
+        yield Finding("compiled", "ok", "large batches of environments run as machine code")
+    elif subject.system.discrete:
+        yield Finding("compiled", "ok", "nothing to compile: the system is not integrated")
+    else:
+        yield Finding(
+            "compiled",
+            "note",
+            f"batches run on NumPy, several times slower: {obstacle}",
+            "write the equations in arithmetic and functions of kkl_gym.elementary, if speed matters",
+        )
+
+
+def finite(subject: Subject) -> Iterator[Finding]:
+    """Whether f and h are numbers in X, in 2X and within the bounds."""
+    system = subject.system
+    shares = []
+    for name, x in (("X", subject.inner), ("2X", subject.outer), ("the bounds", subject.everywhere)):
+        with np.errstate(all="ignore"):
+            good = np.isfinite(np.concatenate([system.drift(x), system.output(x)], axis=1)).all(1)
+        shares.append((1 - good.mean(), name, x, good))
+    if not any(share for share, *_ in shares):
+        yield Finding("finite", "ok", f"f and h are finite at {3 * len(subject.inner)} points of X, 2X and the bounds")
+        return
+    *_, x, good = max(shares, key=lambda one: one[0])
+    found = ", ".join(f"{percent(share)} of {name}" for share, name, *_ in shares if share)
+    where = np.array2string(x[~good][0], separator=", ", precision=4)
+    edge = _separating(system, x, good)
+    advice = f"draw the bounds, and X, where the equations hold{edge}, or change the equations"
+    yield Finding("finite", "problem", f"f or h is no finite number in {found}, such as at x = {where}", advice)
+
+
+def inputs(subject: Subject) -> Iterator[Finding]:
+    """Whether each input moves something."""
+    system, x = subject.system, subject.inner
+    none = np.zeros((len(x), system.nu))
+    for j, u_max in enumerate(system.u_max):
+        full = none.copy()
+        full[:, j] = u_max
+        effect = subject.derivative(x, full) - subject.derivative(x, none)
+        size = np.sqrt(np.nanmean(effect**2, axis=0)) / subject.half
+        name, most = f"input {j + 1}", int(size.argmax())
+        if size[most] <= LEAST_EFFECT * subject.rate:
+            yield Finding(
+                "inputs", "problem", f"{name} moves no state", f"give column {j + 1} of G, or of g(x), its numbers"
+            )
+        else:
+            yield Finding(
+                "inputs",
+                "ok",
+                f"{name} at its bound {u_max:g} moves {system.state_names[most]} by "
+                f"{number(size[most] * subject.half[most])} per second",
+            )
+
+
+def _everything(system: System) -> Evaluation:
+    """All that the equations say of a state, one after the other."""
+    half = [0.5 * u_max for u_max in system.u_max]
+
+    def evaluation(x: Any) -> list[Any]:
+        if system.discrete:
+            return [*components(system.step, x, half), *components(system.h, x)]
+        rows = [gij for row in input_matrix(system, x) for gij in row]
+        return [*components(system.f, x), *rows, *components(system.h, x), rate_at(system, x)]
+
+    return evaluation
+
+
+def _floats(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
+    rows: list[list[float]] = []
+    for point in x.tolist():
+        try:
+            rows.append([float(value) for value in evaluation(point)])
+        except EquationError as error:
+            if not isinstance(error.__cause__, ArithmeticError):  # 1 / 0, which is infinite in arrays
+                raise
+            rows.append([])
+    width = max(map(len, rows))
+    return np.array([row or [np.nan] * width for row in rows])
+
+
+def _arrays(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
+    return np.stack([np.broadcast_to(value, len(x)) for value in evaluation(x.T)], axis=-1)
+
+
+def _tensors(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
+    import torch
+
+    values = evaluation(torch.tensor(x).unbind(-1))
+    return np.stack([torch.as_tensor(value, dtype=torch.float64).expand(len(x)).numpy() for value in values], axis=-1)
+
+
+def _symbols(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
+    import sympy
+
+    symbols = list(sympy.symbols(f"x:{x.shape[1]}", real=True))
+    values = sympy.lambdify(symbols, [sympy.sympify(value) for value in evaluation(symbols)], "numpy", cse=True)(*x.T)
+    return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values], axis=-1)
+
+
+def _apart(expected: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """At which points (n,) two kinds of numbers disagree, where both give numbers."""
+    if expected.shape != values.shape:
+        return np.ones(len(expected), dtype=bool)
+    size = np.nanmax(np.where(np.isfinite(expected), np.abs(expected), 0.0), axis=0)
+    both = np.isfinite(expected) & np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((both & (np.abs(expected - values) > 1e-6 * np.abs(expected) + 1e-9 * size)).any(1))
+
+
+def _separating(system: System, x: np.ndarray, good: np.ndarray) -> str:
+    """Say which value of one state parts good points from bad ones, if one does."""
+    for name, value in zip(system.state_names, x.T, strict=True):
+        if good.any() and value[~good].max() < value[good].min():
+            return f", which is for {name} above {value[good].min():.4g}"
+        if good.any() and value[~good].min() > value[good].max():
+            return f", which is for {name} below {value[good].max():.4g}"
+    return ""
+
+
+def _counted(n: int, what: str) -> str:
+    return f"{n} {what}" + ("" if n == 1 else "s")

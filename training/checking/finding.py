@@ -1,0 +1,39 @@
+"""What a check says, and how it writes numbers."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Verdict = Literal["ok", "note", "problem"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of a check's table.
+
+    Parameters
+    ----------
+    check : str
+        What was looked at.
+    verdict : {"ok", "note", "problem"}
+        A problem spoils what is trained or measured. A note is worth knowing.
+    found : str
+        What there is, with units.
+    advice : str
+        What to change; empty where nothing need be.
+    """
+
+    check: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+def number(value: float) -> str:
+    """Three digits, without an exponent where that is short."""
+    return f"{value:.0f}" if 1000 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
+def percent(share: float) -> str:
+    """Two digits, in percent."""
+    value = 100.0 * share
+    return (f"{value:.0f}" if abs(value) >= 100 else f"{value:.2g}") + " %"
