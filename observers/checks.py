@@ -10,6 +10,7 @@ from numpy.ma import MaskedArray, is_masked
 
 _FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
 _NO_NUMBERS = (bool, np.timedelta64)  # though Python takes one for an integer, and NumPy the other
+_TEXTS = (str, bytes, bytearray, memoryview)  # sequences too
 _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
 
 
@@ -203,6 +204,12 @@ def real_array(name: str, values: Any) -> np.ndarray:
             return values
         if values.dtype.kind in "fiu" and values.dtype.itemsize <= 8:
             return values.astype(float)
+    elif type(values) is list:
+        for value in values:
+            if type(value) is not float:
+                break
+        else:  # a step's list, which needs no further look
+            return np.array(values, dtype=float)
     elif isinstance(values, MaskedArray) and is_masked(values):
         raise ValueError(f"{name} holds masked entries: {shown(values)}; give them values")
     try:
@@ -221,7 +228,7 @@ def real_array(name: str, values: Any) -> np.ndarray:
 def _of_numbers(values: Any) -> bool:
     """Whether all that nested sequences hold are numbers: NumPy takes True for 1 beside floats, and drops masks."""
     if type(values) is list or isinstance(values, Sequence):
-        if isinstance(values, str | bytes | bytearray | memoryview):
+        if isinstance(values, _TEXTS):
             return False
         for value in values:
             if type(value) is not float and type(value) is not int and not _of_numbers(value):
