@@ -115,9 +115,9 @@ def sampling(subject: Subject) -> Iterator[Finding]:
         found[0] += f" (the rate suggests {suggested:g} and {5000 * suggested:g} s)"
         fastest, slowest = time_constants(subject)
         if np.isfinite(slowest):
-            found.append(f"time constants {number(fastest)} to {number(slowest)} s (medians over X)")
             found.append(
-                f"{number(fastest / dt)} samples of the fastest, {number(duration / slowest)} of the slowest fit"
+                f"time constants {number(fastest)} to {number(slowest)} s (medians over X), of which the fastest spans "
+                f"{number(fastest / dt)} samples and a motion {number(duration / slowest)} of the slowest"
             )
             if duration < slowest:
                 verdict = "note"

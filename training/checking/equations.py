@@ -89,7 +89,8 @@ def kinds_of_numbers(system: System) -> Iterator[Finding]:
         agreeing.append(kind)
     if agreeing:
         parts = "step and h" if system.discrete else "f, g, h and rate"
-        yield Finding("equations", "ok", f"{parts} work on {', '.join(agreeing)}, and agree at {len(x)} points")
+        agree = f" and agree at {len(x)} points" if len(agreeing) > 1 else ""
+        yield Finding("equations", "ok", f"{parts} work on {', '.join(agreeing)}{agree}")
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:

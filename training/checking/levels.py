@@ -141,5 +141,5 @@ def _equilibria(subject: Subject) -> str:
         new = all((np.abs(x - other) > 1e-3 * subject.half).any() for other in found)
         if new and np.abs(_drift(subject, x, no_input)).max() < EXACT:
             found.append(x)
-    states = " or ".join(_listed(x, subject.half) for x in found[:3])
+    states = " or ".join(_listed(x, subject.half) for x in found[:2])
     return f"let target return an equilibrium, such as {states}" if found else ""

@@ -68,8 +68,8 @@ def observability(subject: Subject) -> Iterator[Finding]:
         if any(i in states for states in unknown):
             continue
         exact, noisy, least = map(percent, shares)
-        found = f"{system.state_names[i]}: predicted error {exact} of its standard deviation, {noisy} at noise {level}"
-        found += f" (who knows the equations: {least})"
+        found = f"{system.state_names[i]}: predicted error {exact} of its standard deviation without noise, "
+        found += f"{noisy} at noise {level} (who knows the equations: {least})"
         vague = shares[0] > VAGUE
         advice = (
             f"let `kkl-gym tune` look for a better spectrum, with --dt {subject.dt:g} --duration {subject.duration:g}"

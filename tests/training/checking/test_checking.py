@@ -69,7 +69,10 @@ def test_a_linear_system_has_its_numbers():
     found = {one.check: one.found for one in findings(Oscillator(), duration=20.0)}
     # The norm of ((0, 1), (-1, 0)), whose eigenvalues are +-i.
     assert found["rate"] == "typically 1.41/s in X, at most 1.41/s within the bounds: 1 and 1 substeps of dt = 0.01 s"
-    assert "time constants 1 to 1 s (medians over X); 100 samples of the fastest, 20 of" in found["sampling"]
+    assert (
+        "time constants 1 to 1 s (medians over X), of which the fastest spans 100 samples and a motion 20 of"
+        in found["sampling"]
+    )
     assert "y changes by 0.98 % of its standard deviation" in found["sampling"]
     assert found["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
     assert found["bounds"] == "all of 200 motions of 20 s stay within them, from X and 2X, free and driven"
@@ -576,3 +579,11 @@ def test_motions_are_no_longer_than_can_be_followed_in_seconds(monkeypatch):
         findings(Oscillator(), duration=1e-3)
     with pytest.raises(ValueError, match="dt"):
         findings(Oscillator(), dt=-1.0)
+
+
+def test_the_page_explains_every_line():
+    page = (EXAMPLES.parent / "docs" / "check.md").read_text(encoding="utf-8")
+    for name in (*FIRST, *THEN):
+        assert f"\n| {name} |" in page
+    shown = page.split("```\n")[2]
+    assert all(f" {one.check} " in shown for one in findings(get_system(str(EXAMPLES / "own_system.py:Pendulum"))))
