@@ -135,7 +135,7 @@ class Monitor:
     def __init__(self, limits: Limits, level: float | tuple[float, ...], dt: float) -> None:
         if not isinstance(limits, Limits):
             raise ValueError(f"limits must be observers.Limits, got {shown(limits)}")
-        dt = check_dt(dt)
+        level, dt = noise_levels("the noise level", level, limits.mean.shape[1]), check_dt(dt)
         self._limits = limits.at(level)
         self._share = -np.expm1(-dt / limits.window)
         self._silent = np.round(limits.warm_up / dt)

@@ -5,7 +5,6 @@ command is called.
 """
 
 import _thread
-import ast
 import io
 import os
 import re
@@ -15,7 +14,6 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
-from importlib.resources import files
 from typing import Any, NoReturn
 
 # The module under training.commands and the class in it that are behind each command.
@@ -77,9 +75,7 @@ def main(arguments: list[str] | None = None) -> None:
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
                 sys.exit(": ".join(["kkl-gym", str(error), *extras]))
-            if isinstance(
-                error, BrokenPipeError
-            ):  # whoever read what is printed, as in a pipe to head, has seen enough
+            if isinstance(error, BrokenPipeError):  # who reads what is printed has seen enough, as head does
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
@@ -164,6 +160,9 @@ def _load(module: str, name: str) -> Callable[..., Any]:
 
 def _described(module: str, name: str) -> Callable[..., Any]:
     """In the place of a command that is not called: the summary of its class, read without importing the module."""
+    import ast  # here, as is the next, so that an interruption soon finds somebody who notices it
+    from importlib.resources import files
+
     source = files("training.commands").joinpath(f"{module}.py").read_text(encoding="utf-8")
     classes = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)}
 

@@ -9,6 +9,7 @@ import gymnasium as gym
 import meanings as means
 import numpy as np
 from bad_values import array_value, mapping_value, scalar_value
+from conftest import random_artifact
 
 import observers
 from kkl_gym import (
@@ -91,8 +92,8 @@ def moved(env):
 
 def observed(observer):
     """What follows from the state of an observer."""
-    shape, nu = observer.z.shape[:-1], observer.artifact.nu
-    return [observer.step(np.full((*shape, 1), 0.5), np.full((*shape, nu), 0.1)), observer.step(None), observer.z]
+    shape, ny, nu = observer.z.shape[:-1], observer.artifact.ny, observer.artifact.nu
+    return [observer.step(np.full((*shape, ny), 0.5), np.full((*shape, nu), 0.1)), observer.step(None), observer.z]
 
 
 def started(observer):
@@ -127,6 +128,12 @@ def limited():
 def observer(name="van_der_pol", rows=(), **options):
     made = observers.load(name, 0.2, **options)
     made.reset(np.full((*rows, 1), 0.4))
+    return made
+
+
+def two_outputs():
+    made = KKLObserver(random_artifact(outputs=2), (0.2, 0.1))
+    made.reset([0.3, 0.2])
     return made
 
 
@@ -169,7 +176,7 @@ def environments():
         for name, says, good, meaning, values in (
             ("dt", "dt", 0.02, means.real(lambda dt: 0 < dt < 10, optional=True), scalar_value),
             ("process_noise", "process_noise", 0.1, means.level, scalar_value),
-            ("measurement_noise", "measurement_noise", 0.2, means.levels, scalar_value),
+            ("measurement_noise", "measurement_noise", 0.2, means.levels(), scalar_value),
             ("observe", "observe", "output", means.one_of("state", "output"), scalar_value),
             ("parameters", "parameters?|rate", {"mu": 2.0}, means.parameters, mapping_value),
             ("start_box", "start_box", box, means.start_box, array_value),
@@ -225,7 +232,7 @@ def running():
         ("KKLObserver(artifact)", "artifact", ARTIFACT, means.instance(Artifact), lambda v: started(KKLObserver(v))),
     ))  # fmt: skip
     for name, good, meaning in (
-        ("measurement_noise", 0.2, means.real(lambda sigma: 0 <= sigma <= most)), ("process_noise", 0.1, means.level),
+        ("measurement_noise", 0.2, means.levels(most)), ("process_noise", 0.1, means.level),
         ("monitor", True, means.flag),
     ):  # fmt: skip
         yield from constructors(OBSERVERS, (
@@ -235,6 +242,7 @@ def running():
              lambda v, name=name: started(KKLObserver(ARTIFACT, **{name: v}))),
         ))  # fmt: skip
         if name != "monitor":
+            meaning = means.levels(most, optional=False) if name == "measurement_noise" else meaning
             row = (name, name, good, meaning, lambda o, v, name=name: setattr(o, name, v), scalar_value)
             yield from calls(OBSERVERS, "KKLObserver.", observer, observed, [row])
 
@@ -259,6 +267,17 @@ def running():
         ("reset x0", "x0", state, known, lambda o, v: o.reset([0.5], v), array_value),
         ("estimate x0", "x0", state, known, lambda o, v: o.estimate(Y, x0=v), array_value),
         ("step u", "u", np.zeros(1), zero, lambda o, v: o.step([0.3], v), array_value),
+    ))  # fmt: skip
+    pair, gaps = (
+        np.array([0.3, 0.1]),
+        means.array(lambda y: means.within((2,))(np.nan_to_num(y, nan=0.0)), optional=True),
+    )
+    yield from calls(OBSERVERS, "two outputs", two_outputs, observed, (
+        ("reset y", "y", pair, means.array(lambda y: y.ndim and means.within((*y.shape[:-1], 2))(y)),
+         lambda o, v: o.reset(v), array_value),
+        ("step y", "y", pair, gaps, lambda o, v: o.step(v), array_value),
+        ("measurement_noise", "measurement_noise", pair, means.two_levels,
+         lambda o, v: setattr(o, "measurement_noise", v), array_value),
     ))  # fmt: skip
     rows, two = np.array([True, False, True]), means.array(means.within((2, 1)))
     for monitor in (False, True):
@@ -286,7 +305,7 @@ LIMITS = {
     "high": np.array([[0.1], [2.1]]), "window": 0.1, "warm_up": 0.05, "false_alarms": 0.01, "duration": 50.0,
 }  # fmt: skip
 RIGHT_LIMITS = {
-    "levels": means.array(lambda v: v.shape == (2,) and v[0] == 0 < v[1] <= 1e30),
+    "levels": means.array(lambda v: v.shape in ((2,), (2, 1)) and v.flat[0] == 0 < v.flat[1] <= 1e30),
     "mean": means.array(lambda v: v.shape == (2, 1) and ((v > 0) & (v <= 1e30)).all()),
     "low": means.array(lambda v: v.shape == (2, 1) and ((v >= 0) & (v < LIMITS["high"])).all()),
     "high": means.array(lambda v: v.shape == (2, 1) and ((v > LIMITS["low"]) & (v <= 1e30)).all()),
@@ -316,7 +335,7 @@ def parts():
     """What observers are made of."""
     square = means.array(lambda v: v.shape == (2, 2) and (v.diagonal() < 0).all())
     column = means.array(lambda v: v.ndim == 2 and len(v) == 2 and v.size and (np.abs(v) < 1e301).all())
-    positive, level = means.real(lambda v: 0 < v < np.inf), means.real(lambda v: 0 <= v <= 1)
+    positive, level = means.real(lambda v: 0 < v < np.inf), means.levels(1.0, optional=False)
     known, point = Limits(**LIMITS), np.ones(2)
     yield from constructors(OBSERVERS, (
         ("LinearFilter(A)", "A|nz", A, square, lambda v: filtered(LinearFilter(v, B, 0.1)), array_value),
@@ -351,7 +370,7 @@ def wrappers():
         for name, says, good, meaning in (
             ("observer", "observer", PATH, lambda v: (v is None or is_map(v)[0], v)),
             ("estimate", "estimate", "z", means.one_of("x", "z")),
-            ("measurement_noise", "measurement_noise", 0.2, means.real(lambda v: 0 <= v <= most, optional=True)),
+            ("measurement_noise", "measurement_noise", 0.2, means.levels(most)),
             ("ignore_input", "ignore_input", True, means.flag),
             ("monitor", "monitor", True, means.flag),
             ("known_start", "known_start|forward map T", False, means.flag),

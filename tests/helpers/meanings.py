@@ -92,11 +92,22 @@ def level(value):
     return real(lambda sigma: 0 <= sigma <= 1e12, optional=True)(value)
 
 
-def levels(value):
-    """Levels of noise where there is one output."""
-    if isinstance(value, list | tuple | np.ndarray) and np.shape(value) == (1,):
-        return level(value[0]) if value[0] is not None else (False, None)
-    return level(value)
+def levels(most=1e12, optional=True):
+    """Levels of measurement noise where there is one output."""
+
+    def means(value):
+        alone = isinstance(value, list | tuple | np.ndarray) and np.shape(value) == (1,)
+        return real(lambda sigma: 0 <= sigma <= most, optional and not alone)(value[0] if alone else value)
+
+    return means
+
+
+def two_levels(value):
+    """Levels of measurement noise up to 1 and 2, one for each of two outputs or one for both."""
+    if isinstance(value, list | tuple | np.ndarray) and np.shape(value) == (2,):
+        both = [real(lambda sigma, most=most: 0 <= sigma <= most)(level) for level, most in zip(value, (1, 2))]
+        return all(right for right, _ in both), tuple(level for _, level in both)
+    return real(lambda sigma: 0 <= sigma <= 1)(value)
 
 
 def parameters(value):

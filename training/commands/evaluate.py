@@ -118,8 +118,6 @@ class Evaluate:
 
     def _evaluate(self, name: str, artifact: Artifact, system: System, progress: ProgressBars) -> list["pd.DataFrame"]:
         """Print an observer's tables, and what is left out of them; rows of the CSV file."""
-        import pandas as pd
-
         duration = system.duration if self.duration is None else self.duration
         runs = f"{self.trajectories} runs of {duration:g} s"
         smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}", artifact)
@@ -151,23 +149,28 @@ class Evaluate:
                     case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
                     smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
                     nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
-                    columns: dict[str, Any] = {
-                        "observer": who,
-                        "starts": starts,
-                        "driven": driven,
-                        "process_noise": self.process_noise,
-                        "measurement_noise": as_cell(level),
-                        "trajectory": np.arange(len(found.full)),
-                        "smape": found.full,
-                        "smape_late": found.late,
-                    }
-                    frames.append(pd.DataFrame(columns | by_state(found.nrmse)))
+                    frames.append(self._rows(found, {"observer": who, "starts": starts, "driven": driven}, level))
                 progress.advance(bar)
         if frames:
             progress.console.print(smape, nrmse)
         for reason in left_out:
             progress.say(f"{name}, left out: {reason}")
         return frames
+
+    def _rows(self, found: Errors, case: dict[str, Any], level: Level) -> "pd.DataFrame":
+        """Of the CSV file."""
+        import pandas as pd
+
+        columns = {
+            **case,
+            "process_noise": self.process_noise,
+            "measurement_noise": as_cell(level),
+            "trajectory": np.arange(len(found.full)),
+            "smape": found.full,
+            "smape_late": found.late,
+            **by_state(found.nrmse),
+        }
+        return pd.DataFrame(columns)
 
     def _trajectories(
         self,

@@ -621,14 +621,15 @@ def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeyp
     """Beside one that ships, in one folder."""
     script = tmp_path / "slow.py"
     script.write_text(SLOW)
-    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", replace(SHORT, duration=5.0))
+    monkeypatch.setattr(sizes, "QUICK_PROTOCOL", replace(SHORT, duration=1.0))
+    monkeypatch.setattr(training.benchmark.jobs, "step_time", lambda *_, **__: 1.0)
     out = tmp_path / "out"
     systems = ("van_der_pol", f"{script}:Slow", f"{script}:Two")
     Benchmark(quick=True, systems=systems, methods=("ekf",), out=out, jobs=1).run(quiet())
     jobs = [json.loads((out / "jobs" / name / "ekf" / "job.json").read_text()) for name in ("van_der_pol", "slow")]
     assert [job["budget"]["dt"] for job in jobs] == [0.01, 0.1]
     assert [job["budget"]["duration"] for job in jobs] == [20.0, 200.0]
-    assert [job["protocol"]["duration"] for job in jobs] == [5.0, 50.0]
+    assert [job["protocol"]["duration"] for job in jobs] == [1.0, 10.0]
     assert [job["validation"]["duration"] for job in jobs] == [20.0, 200.0]
     results = pd.read_csv(out / "results.csv")
     levels = results.groupby("system").noise.unique().map(list).to_dict()
