@@ -1,8 +1,6 @@
 """``kkl-gym check``."""
 
 import json
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -69,13 +67,3 @@ def test_a_problem_is_shown_with_advice_and_ends_with_status_1(capsys, tmp_path,
 def test_bad_options(options):
     with pytest.raises(SystemExit, match=r"must|no parameter"):
         main(["check", OSCILLATOR, *options])
-
-
-def test_help_imports_nothing_that_takes_time():
-    code = (
-        "import sys\nfrom training.cli import main\ntry:\n    main(['check', '--help'])\n"
-        "except SystemExit:\n    print({'torch', 'scipy', 'sympy'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "exit status" in done.stdout.replace("\n", " ")
-    assert done.stdout.endswith("set()\n")
