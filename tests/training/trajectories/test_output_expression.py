@@ -68,7 +68,7 @@ def deep(x):
 @pytest.mark.parametrize(
     ("h", "match"),
     [
-        (lambda self, x: (math.sin(x[0]),), r"test_expression\.py, line \d+.* kkl_gym\.elementary"),
+        (lambda self, x: (math.sin(x[0]),), r"test_output_expression\.py, line \d+.* kkl_gym\.elementary"),
         (lambda self, x: (np.sin(x[0]),), r"kkl_gym\.elementary"),
         (lambda self, x: (x[0] if x[0] > 0 else x[1],), r"kkl_gym\.elementary\.where"),
         (lambda self, x: (sympy.sinh(x[0]) if isinstance(x[0], sympy.Basic) else np.sinh(x[0]),), "'sinh' is unknown"),
