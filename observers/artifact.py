@@ -489,7 +489,7 @@ class Artifact:
             differ("the system", self.system, system)
         for name in sorted({*self.parameters, *parameters}):
             here, there = self.parameters.get(name), parameters.get(name)
-            if here is None or there is None or not math.isclose(here, there, rel_tol=1e-9, abs_tol=1e-12):
+            if here is None or there is None or not math.isclose(here, there, rel_tol=1e-9):
                 differ(f"the parameter {name} =", here, there)
         if not math.isclose(self.filter.dt, dt, rel_tol=1e-9):
             differ("the sampling interval dt =", self.filter.dt, dt)

@@ -508,6 +508,14 @@ def test_check_names_both_values(changed, match, make_artifact):
         make_artifact().check(**{**here, **changed})
 
 
+def test_check_tells_small_parameters_apart(make_artifact):
+    artifact = dataclasses.replace(make_artifact(), parameters={"C": 1e-12, "offset": 0.0})
+    here = {"system": "van_der_pol", "dt": 0.01, "ny": 1, "nu": 1}
+    artifact.check(parameters={"C": 1e-12 * (1 + 1e-10), "offset": 0.0}, **here)
+    with pytest.raises(ArtifactError, match=r"C = 1e-12, but the environment has 1\.5e-12"):
+        artifact.check(parameters={"C": 1.5e-12, "offset": 0.0}, **here)
+
+
 def test_a_map_of_free_motion_must_fit_the_one_of_driven_motion(make_artifact):
     artifact, autonomous = make_artifact(free_inverse=True), make_artifact(inputs=False)
     other = make_artifact("lorenz", free_inverse=True).free_inverse

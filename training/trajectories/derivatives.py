@@ -9,6 +9,8 @@ import numpy as np
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
 
+LARGEST = 1e9  # entry of Phi, with each state in units of X's width, beyond which a motion is lost
+
 # Functions in the derivatives that some releases of sympy do not print for NumPy, or for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
@@ -113,7 +115,7 @@ def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
 def with_sensitivity(system: System, driven: bool = True) -> System:
     """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
 
-    In discrete time the next Phi is that of the step, d step/dx Phi.
+    In discrete time the next Phi is that of the step, d step/dx Phi. A motion whose Phi grows beyond LARGEST is lost.
 
     Parameters
     ----------
@@ -133,8 +135,10 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
         If the equations do not take sympy symbols.
     """
     nx, nu = system.nx, system.nu if driven else 0
-    box: Box = (*system.X, *((0.0, 1.0),) * nx**2)
-    limits: Box = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+    low, high = system.box()
+    units = np.divide.outer(high - low, high - low).ravel().tolist()  # of Phi's entries
+    box: Box = (*system.X, *((0.0, unit) for unit in units))
+    limits: Box = (*system.bounds, *((-LARGEST * unit, LARGEST * unit) for unit in units))
     inputs = system.u_max if driven else ()
     joint = f"{system.name}-sensitivity"
     if system.discrete:

@@ -97,6 +97,36 @@ def test_sensitivity_is_the_derivative_of_the_flow(system):
         np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("discrete", [False, True])
+def test_sensitivity_is_in_any_units(discrete):
+    unit = 1e-11
+
+    class Continuous(Oscillator):
+        """Its second state in units a hundred thousand million times as large."""
+
+        name: ClassVar[str] = "odd-units"
+        X: ClassVar = ((-1.0, 1.0), (-unit, unit))
+        bounds: ClassVar = ((-9.0, 9.0), (-9.0 * unit, 9.0 * unit))
+        u_max: ClassVar[tuple[float, ...]] = ()
+
+        def f(self, x):
+            return x[1] / unit, -unit * x[0]
+
+    class Stepping(Continuous):
+        name: ClassVar[str] = "odd-steps"
+        dt = 0.05
+
+        def step(self, x, u):
+            return x[0] + self.dt * x[1] / unit, x[1] - self.dt * unit * x[0]
+
+    start = np.array([[0.1, 0.2 * unit, 1.0, 0.0, 0.0, 1.0]])
+    joint = with_sensitivity(Stepping() if discrete else Continuous())
+    Phi = simulate(joint, start, 10, 0.05)[-1, 0, 2:].reshape(2, 2)
+    cosine, sine = np.cos(0.5), np.sin(0.5)
+    rtol = 0.1 if discrete else 1e-9  # of Euler's steps
+    np.testing.assert_allclose(Phi, [[cosine, sine / unit], [-sine * unit, cosine]], rtol=rtol)
+
+
 @pytest.mark.parametrize(
     ("equations", "message"),
     [
