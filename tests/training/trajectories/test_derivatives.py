@@ -26,8 +26,22 @@ def test_output_matrix_of_linear_and_other_outputs():
         def h(self, x):
             return (x[0] * x[0],)
 
+    @dataclass(frozen=True)
+    class Small(Squared):
+        name: ClassVar[str] = "small"
+        X: ClassVar = ((-1e-13, 1e-13), (-1e-13, 1e-13))
+
+    @dataclass(frozen=True)
+    class Ratio(Squared):
+        name: ClassVar[str] = "ratio"
+        X: ClassVar = ((1, 2), (1, 2))
+
+        def h(self, x):
+            return (x[0] / x[1],)
+
     np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
-    assert output_matrix(Squared()) is None
+    for system in (Squared(), Small(), Ratio()):
+        assert output_matrix(system) is None
 
 
 @pytest.mark.parametrize("system", KINKED, ids=str)
