@@ -74,13 +74,13 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
     }
     if pipeline == "input-aware":
         spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
-        config = override(Config(pipeline, spectrum, **sizes), profile(system).settings)
+        config = override(Config(pipeline, eigenvalues=spectrum, **sizes), profile(system).settings)
         larger = {**LARGE, "inverse_steps": 244_140}
         return override(override(config, larger if name == "paper" else {}), changes)
     if name == "paper":
         config = Config(
             pipeline,
-            papers_spectrum(system),
+            eigenvalues=papers_spectrum(system),
             **sizes,
             trajectories=500,
             samples=5001,
