@@ -51,6 +51,8 @@ def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fra
         Exponents by name, for each product; p - k of them. A parameter that is told by itself is a product of its own.
     """
     p, k = hidden.shape
+    if p == k:
+        return []
     seen = np.linalg.svd(hidden)[0][:, k:].T if k else np.eye(p)
     rows: list[np.ndarray] = []
     pivots: list[int] = []
@@ -87,7 +89,7 @@ def sign_symmetries(system: System, parameters: Sequence[str]) -> list[tuple[str
     system : System
         Any system; without inputs, or with inputs that act as before on states that change sign.
     parameters : sequence of str
-        The parameters that are unknown.
+        The parameters that may change sign.
 
     Returns
     -------
