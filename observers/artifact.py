@@ -6,7 +6,7 @@
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -301,6 +301,9 @@ class Artifact:
         How it was made: method, preset, configuration, seed, measures.
     versions : mapping of str to str, optional
         Versions of the libraries that made it.
+    signals : mapping of str to sequence of str, optional
+        Of an observer that was learned from recorded states: names of the columns "measured", y, "inputs", u, and
+        "hidden", x. There are no equations behind it, and it fits no environment.
 
     Raises
     ------
@@ -323,6 +326,7 @@ class Artifact:
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    signals: Mapping[str, Sequence[str]] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, str):
@@ -364,8 +368,38 @@ class Artifact:
                 f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
                 f"outputs and {self.nx} states, or there is a C beside it"
             )
+        if self.signals is not None:
+            self._check_signals(self.signals)
         if self.limits is not None and (not self.knows_output or self.limits.mean.shape[1] != self.ny):
             raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
+
+    def require_system(self) -> None:
+        """See that there is a system behind the observer.
+
+        Raises
+        ------
+        ArtifactError
+            If it was learned from recorded states; the message says from which.
+        """
+        if self.signals is not None:
+            names = {role: ", ".join(of) for role, of in self.signals.items()}
+            given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
+            raise ArtifactError(
+                f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
+                f"{self.filter.dt:g} s. It has no equations, and fits no environment; observers.load(path) runs it on "
+                "samples"
+            )
+
+    def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
+        counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
+        if not isinstance(signals, Mapping) or set(signals) != set(counts):
+            raise ArtifactError(f"signals must name {', '.join(counts)}, got {shown(signals)}")
+        for role, count in counts.items():
+            names = signals[role]
+            if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+                raise ArtifactError(f"the signals {role} must be names, got {shown(names)}")
+            if len(names) != count:
+                raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
 
     @property
     def nx(self) -> int:
@@ -487,6 +521,7 @@ class Artifact:
                 "environment, or train an observer for it (kkl-gym train) and pass its path"
             )
 
+        self.require_system()
         if self.system != system:
             differ("the system", self.system, system)
         for name in sorted({*self.parameters, *parameters}):
@@ -531,6 +566,8 @@ class Artifact:
             described["free"] = _put_inverse(tensors, "free", self.free_inverse)
         if self.measurement_noise != self.inverse.within(USUAL_NOISE):
             described["measurement_noise"] = self.measurement_noise
+        if self.signals is not None:
+            described["signals"] = {role: list(names) for role, names in self.signals.items()}
         if self.C is not None:
             tensors["C"] = np.asarray(self.C, dtype=float)
         if self.h is not None:
@@ -604,6 +641,7 @@ class Artifact:
             measurement_noise=described.get("measurement_noise", USUAL_NOISE),
             training=described["training"],
             versions=described["versions"],
+            signals=described.get("signals"),
         )
 
 
