@@ -43,6 +43,18 @@ Parameters = Annotated[
         help_behavior_hint="(default: none)",
     ),
 ]
+OneParameter = Annotated[
+    tuple[str, float],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME=VALUE",
+        instance_from_str=lambda words: read_parameter(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda parameter: ["{}={:g}".format(*parameter)],
+    ),
+]
+# Each by an option of its own, which is given several times: words after one might as well be observers.
+RepeatedParameters = Annotated[tuple[OneParameter, ...], tyro.conf.UseAppendAction]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
 ]
@@ -87,6 +99,33 @@ OwnPolicy = Annotated[
         help_behavior_hint="",
     ),
 ]
+
+
+def read_parameter(text: str) -> tuple[str, float]:
+    """Read a parameter, written as ``mu=3.3``.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the parameter; nobody has looked for it.
+    value : float
+        Its value.
+
+    Raises
+    ------
+    ValueError
+        If it is not a name and a number with an equals sign between them.
+    """
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise ValueError(f"{text!r} is no parameter with its value: write NAME=VALUE, as in mu=3.3") from None
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:

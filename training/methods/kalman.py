@@ -13,7 +13,7 @@ from training.kalman import (
     measurement_covariance,
     unknown_start,
 )
-from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
@@ -43,11 +43,7 @@ class EKF(Method[Arrays]):
         """The filter, told the noise level."""
         Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
         R = measurement_covariance(system, noise)
-        return self.filter(self.model(system), dt, Q=Q, R=R)
-
-    def model(self, system: System) -> System:
-        """The equations that the filter believes in."""
-        return system
+        return self.filter(self.believed(system), dt, Q=Q, R=R)
 
 
 class UKF(EKF):
@@ -58,15 +54,11 @@ class UKF(EKF):
     filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
 
 
-class WrongEKF(EKF):
-    """The same filter, tuned the same way, with a model that is 10 % wrong."""
+class WrongEKF(WrongParameters, EKF):
+    """The same filter, tuned the same way, with every parameter 10 % too large."""
 
     name: ClassVar[str] = "ekf-wrong"
     label: ClassVar[str] = "EKF, model 10 % off"
-
-    def model(self, system: System) -> System:
-        """Every parameter 10 % too large."""
-        return system.replace({name: 1.1 * value for name, value in system.parameters.items()})
 
 
 class UntunedEKF(EKF):

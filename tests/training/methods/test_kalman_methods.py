@@ -9,10 +9,10 @@ from training.methods.kalman import DIFFUSION
 
 
 def test_wrong_models_are_ten_percent_off():
-    believed = get_method("ekf-wrong").model(get_system("lorenz"))
+    believed = get_method("ekf-wrong").believed(get_system("lorenz"))
     assert believed.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
     duffing = get_system("reverse_duffing")
-    assert get_method("ekf-wrong").model(duffing).parameters == {"a": 1.1, "b": 1.1}
+    assert get_method("ekf-wrong").believed(duffing).parameters == {"a": 1.1, "b": 1.1}
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])
