@@ -27,6 +27,8 @@ FORMATS = (1, 2, 3, 4)
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
+# Parameters that a system has been given since files for it were written that say none, and what they were then.
+_PARAMETERS_SINCE = {"reverse_duffing": {"a": 1.0, "b": 1.0}}
 _HOLDS = {"y": "first-order", "u": "zero-order"}  # what the filter takes signals for between samples
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
@@ -536,11 +538,13 @@ class Artifact:
             differ("the system", self.system, system)
         for name in sorted({*self.parameters, *parameters}):
             here, there = self.parameters.get(name), parameters.get(name)
-            low, high = self.parameter_ranges.get(name, (math.inf, -math.inf))
-            if there is not None and low - 1e-9 * abs(low) <= there <= high + 1e-9 * abs(high):
-                continue
-            if here is None or there is None or not math.isclose(here, there, rel_tol=1e-9, abs_tol=1e-12):
-                differ(f"the parameter {name} =", here, there)
+            if here is not None and there is not None:
+                low, high = self.parameter_ranges.get(name, (here, here))
+                if low - 1e-9 * abs(low) <= there <= high + 1e-9 * abs(high):
+                    continue
+            if name in self.parameter_ranges:
+                differ(f"the parameter {name} within", self.parameter_ranges[name], there)
+            differ(f"the parameter {name} =", here, there)
         if not math.isclose(self.filter.dt, dt, rel_tol=1e-9):
             differ("the sampling interval dt =", self.filter.dt, dt)
         if self.ny != ny:
@@ -641,11 +645,14 @@ class Artifact:
             limits = Limits(**arrays, **{name: described["limits"][name] for name in _LIMIT_SCALARS})
         if "free" in described:
             free_inverse = _get_inverse(tensors, "free", described["free"])
+        system, parameters = described["system"]["name"], described["system"]["parameters"]
+        if parameters == {}:
+            parameters = _PARAMETERS_SINCE.get(system, parameters)
         return cls(
             filter=LinearFilter(tensors["A"], tensors["B"], described["dt"], described["inputs"]),
             inverse=_get_inverse(tensors, "inverse", described["inverse"]),
-            system=described["system"]["name"],
-            parameters=described["system"]["parameters"],
+            system=system,
+            parameters=parameters,
             forward=forward,
             C=tensors.get("C"),
             h=Expression(described["h"]) if "h" in described else None,

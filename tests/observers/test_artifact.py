@@ -90,9 +90,25 @@ def test_saving_twice_gives_the_same_bytes(file, make_artifact, tmp_path):
 
 @pytest.mark.parametrize("name", sorted(set(shipped().values())))
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
-    """The formats are what they were: every array, key and digit."""
-    Artifact.read(resolve(name)).save(tmp_path / "again.safetensors")
+    """The formats are what they were: every array, key and digit; but reverse Duffing had no parameters then."""
+    artifact = Artifact.read(resolve(name))
+    if artifact.system == "reverse_duffing":
+        assert artifact.parameters == {"a": 1.0, "b": 1.0}
+        artifact = dataclasses.replace(artifact, parameters={})
+    artifact.save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == resolve(name).read_bytes()
+
+
+def test_files_from_before_reverse_duffing_had_parameters(make_artifact, tmp_path):
+    path = tmp_path / "old.safetensors"
+    dataclasses.replace(make_artifact("reverse_duffing"), parameters={}).save(path)
+    assert contents(path)[1]["system"]["parameters"] == {}
+    old, its = Artifact.read(path), {"dt": 0.01, "ny": 1, "nu": 1}
+    old.check("reverse_duffing", get_system("reverse_duffing").parameters, **its)
+    with pytest.raises(ArtifactError, match=r"made for the parameter b = 1\.0, but the environment has 1\.1"):
+        old.check("reverse_duffing", {"a": 1.0, "b": 1.1}, **its)
+    dataclasses.replace(make_artifact("lorenz"), parameters={}).save(path)
+    assert Artifact.read(path).parameters == {}
 
 
 def test_forward_map(make_artifact):
@@ -506,6 +522,14 @@ def test_check_names_both_values(changed, match, make_artifact):
     make_artifact(inputs=False).check(**here)
     with pytest.raises(ArtifactError, match=match):
         make_artifact().check(**{**here, **changed})
+
+
+def test_check_tells_small_parameters_apart(make_artifact):
+    artifact = dataclasses.replace(make_artifact(), parameters={"C": 1e-12, "offset": 0.0})
+    here = {"system": "van_der_pol", "dt": 0.01, "ny": 1, "nu": 1}
+    artifact.check(parameters={"C": 1e-12 * (1 + 1e-10), "offset": 0.0}, **here)
+    with pytest.raises(ArtifactError, match=r"C = 1e-12, but the environment has 1\.5e-12"):
+        artifact.check(parameters={"C": 1.5e-12, "offset": 0.0}, **here)
 
 
 def test_a_map_of_free_motion_must_fit_the_one_of_driven_motion(make_artifact):

@@ -1,10 +1,10 @@
 """Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from kkl_gym.system import Components, System
+from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.kalman import (
     ExtendedKalmanFilter,
@@ -65,10 +65,8 @@ class WrongEKF(EKF):
     label: ClassVar[str] = "EKF, model 10 % off"
 
     def model(self, system: System) -> System:
-        """Every parameter 10 % too large; a system without parameters runs 10 % too fast."""
-        if system.parameters:
-            return system.replace({name: 1.1 * value for name, value in system.parameters.items()})
-        return faster(system, 1.1)
+        """Every parameter 10 % too large."""
+        return system.replace({name: 1.1 * value for name, value in system.parameters.items()})
 
 
 class UntunedEKF(EKF):
@@ -90,18 +88,3 @@ class UntunedEKF(EKF):
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))
-
-
-def faster(system: System, factor: float) -> System:
-    """Let time run faster by a factor for a system."""
-
-    class Faster(type(system)):  # type: ignore[misc]
-        name = f"{system.name}-faster"
-
-        def f(self, x: Components) -> Components:
-            return [factor * fi for fi in system.f(x)]
-
-        def rate(self, x: Components) -> Any:
-            return factor * system.rate(x)
-
-    return Faster()
