@@ -144,9 +144,10 @@ class Config:
     map is fitted a second time beside the others; 0 for no second time."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
-    values, as a part of these. "all" stands for each that is not named."""
+    values, as a part of these. "all" stands for each that is not named. The map still gives the state alone, whichever
+    plant it is."""
     estimate_parameters: bool = False
-    """Whether the map gives the uncertain parameters too, behind the states."""
+    """Whether the map gives the uncertain parameters too, so that the observer identifies the plant while it runs."""
     cpu_seconds: Positive | None = None
     """CPU seconds after which the training of all networks together ends, steps done or not."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0

@@ -39,7 +39,7 @@ from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
 from training.trajectories.expression import output_expression
-from training.trajectories.parameters import relative_ranges, with_parameters
+from training.trajectories.parameters import blind, relative_ranges, with_parameters
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -124,7 +124,8 @@ def train(
     ------
     ValueError
         If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
-        folder, or if the system's trajectories leave its bounds, or the policy is none.
+        folder, or if the system's trajectories leave its bounds, the policy is none, or a parameter that is to be
+        uncertain is none of the system's.
     FloatingPointError
         If the loss stops being a number.
     """
@@ -134,12 +135,13 @@ def train(
     # Errors now, not in ten minutes.
     if config.pipeline == "spinn":
         check_continuous(system)
+    ranges = relative_ranges(system, config.uncertain)
     policy = None if config.policy is None else named_policy(system, config.policy)
     feedback = (policy or named_policy(system, "controller")) if config.closed_loop_trajectories else None
     if policy:
         identity["policy_actions"] = policy_fingerprint(policy, system)
     with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
-        run = _Run(system, config, folder, resume, device, progress, log, identity)
+        run = _Run(system, config, folder, resume, device, progress, log, identity, ranges)
         free = run.learn_free_inverse() if "free" in run.shares else None
         trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS, policy=policy))
         forward: ForwardMap | None = None
@@ -172,6 +174,7 @@ class _Run:
     progress: ProgressBars
     log: Log | None
     identity: dict[str, Any]
+    ranges: dict[str, tuple[float, float]]  # of uncertain parameters
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     samples: dict[str, int] = field(default_factory=dict)  # distinct ones, for certificates
@@ -179,7 +182,6 @@ class _Run:
     def __post_init__(self) -> None:
         system, config = self.system, self.config
         noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
-        self.ranges = relative_ranges(system, config.uncertain) if config.uncertain else {}
         self.plant = with_parameters(system, self.ranges)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.started = time.monotonic()
@@ -202,12 +204,12 @@ class _Run:
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
         """Training trajectories with a filter beside them."""
         config, report = self.config, self.progress.bar(f"simulating {what}", self.config.trajectories)
-        policy, nx = motions.policy, self.system.nx
+        policy = motions.policy
         motions = dataclasses.replace(
             motions,
             process_noise_share=self.process_noise_share,
             box_factor=config.box_factor,
-            policy=policy and (lambda x: policy(x[:, :nx])),  # which knows of no uncertain parameters behind the state
+            policy=policy and blind(policy, self.system.nx),
         )
         n, steps = config.trajectories, self.steps
         with self.timed("simulating"):

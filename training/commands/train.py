@@ -13,13 +13,14 @@ from rich.table import Table
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from training.commands.options import Parameters, SystemName
-from training.commands.settings import Settings
+from training.commands.settings import Settings, as_settings
 from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
 from training.progress import LOG, ProgressBars, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
+from training.trajectories.parameters import relative_ranges
 
 if TYPE_CHECKING:
     from training.dry_run import Estimate
@@ -121,7 +122,7 @@ class Train:
 
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
-        changes = (read_changes(self.config) if self.config else {}) | self.settings
+        changes = (read_changes(self.config) if self.config else {}) | as_settings(self.settings)
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.closed_loop:
@@ -182,11 +183,15 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
     sizes = [f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items()]
     spectrum = Spectrum(config.eigenvalues, config.pairs)
     rates = spectrum.poles.real
+    ranges = relative_ranges(system, config.uncertain)
+    uncertain = ", ".join(f"{parameter} from {low:g} to {high:g}" for parameter, (low, high) in ranges.items())
+    estimated = ", which the map estimates" if config.estimate_parameters else ""
     return [
         f"training an observer for {system.name}{own}: {', '.join(sizes)}",
         f"pipeline {config.pipeline}, preset {name}{given}",
         f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
         f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
+        *([f"each trajectory has its own parameters: {uncertain}{estimated}"] if ranges else []),
     ]
 
 

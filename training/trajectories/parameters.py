@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 from kkl_gym.equations import input_matrix
 from kkl_gym.system import Box, Components, System
 from observers.checks import shown
+from training.trajectories.controllers import Controller
 
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
@@ -61,7 +62,7 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
             raise ValueError(
                 f"{system.name} has no parameter {shown(name)} to be uncertain; it has {', '.join(known) or 'none'}"
             )
-    if not known:
+    if half_widths and not known:
         raise ValueError(f"{system.name} has no parameters that could be uncertain")
     widths = {name: half_widths.get(name, half_widths.get(EVERY, 0.0)) for name in known}
     ranges = {}
@@ -163,3 +164,8 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
                     return [*input_matrix(model(x), x[:nx]), *still]
 
     return WithParameters()
+
+
+def blind(policy: Controller, nx: int) -> Controller:
+    """A policy for a system of :func:`with_parameters` that sees the nx states alone."""
+    return lambda x: policy(x[:, :nx])
