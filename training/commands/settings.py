@@ -5,27 +5,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 
 import tyro
-from tyro.constructors import PrimitiveConstructorSpec
 
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS
 from training.config import Config, Pipeline, setting_types
 from training.presets import Preset, preset
-from training.trajectories.parameters import EVERY
 
 SHOWN = 3  # numbers of a setting that has many
-HalfWidth = Annotated[
-    tuple[str, float],
-    PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="NAME=SHARE",
-        instance_from_str=lambda words: read_half_width(words[0]),
-        is_instance=lambda value: True,
-        str_from_instance=lambda found: ["{}={:g}".format(*found)],
-    ),
-]
-# Settings that are written otherwise on the command line; :func:`as_settings` turns them into what they are.
-WRITTEN: dict[str, Any] = {"uncertain": Annotated[tuple[HalfWidth, ...], tyro.conf.UseAppendAction]}
+ELSEWHERE = ("pipeline", "uncertain")  # options of their own
 
 
 @dataclass(frozen=True)
@@ -70,62 +57,6 @@ def defaults() -> dict[str, str]:
     return texts | {"eigenvalues": "from the system"}
 
 
-def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
-
-    Parameters
-    ----------
-    text : str
-        What the user wrote.
-
-    Returns
-    -------
-    name : str
-        Of the parameter, or "all".
-    share : float
-        How far it may be from its value, as a part of that.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
-    name, _, share = text.rpartition("=")
-    try:
-        return name.strip() or EVERY, float(share)
-    except ValueError:
-        raise ValueError(
-            f"{text!r} does not say how uncertain a parameter is: write NAME=SHARE, as in mu=0.1, or a number for all"
-        ) from None
-
-
-def as_settings(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn options of the command line into settings.
-
-    Parameters
-    ----------
-    options : mapping of str to object
-        What the user gave.
-
-    Returns
-    -------
-    dict of str to object
-        Settings for :func:`training.config.override`.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is named twice.
-    """
-    settings = dict(options)
-    if "uncertain" in settings:
-        names = [name for name, _ in settings["uncertain"]]
-        if len({*names}) < len(names):
-            raise ValueError(f"--uncertain names a parameter twice: {', '.join(names)}")
-        settings["uncertain"] = dict(settings["uncertain"])
-    return settings
-
-
 def _of_systems(values: Mapping[str, Any]) -> str:
     usual = values[""]
     if usual not in [value for key, value in values.items() if key]:
@@ -154,13 +85,13 @@ def _options() -> Any:
     presets = defaults()
     options = {}
     for name, kind in setting_types().items():
-        if name == "pipeline":
+        if name in ELSEWHERE:
             continue
         argument = tyro.conf.arg(
             help=" ".join((described[name].description or "").split()),
             help_behavior_hint=f"(default: {presets[name]})",
         )
-        options[name] = Annotated[WRITTEN.get(name, kind), argument]
+        options[name] = Annotated[kind, argument]
     return TypedDict("Settings", options, total=False)  # type: ignore[operator]
 
 
@@ -169,4 +100,4 @@ if TYPE_CHECKING:
 else:
     Settings = _options()
 
-__all__ = ["Settings", "as_settings", "defaults", "read_half_width"]
+__all__ = ["Settings", "defaults"]

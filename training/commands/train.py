@@ -12,8 +12,8 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.commands.options import Parameters, SystemName
-from training.commands.settings import Settings, as_settings
+from training.commands.options import HalfWidths, Parameters, SystemName
+from training.commands.settings import Settings
 from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
 from training.progress import LOG, ProgressBars, progress_bars
@@ -47,6 +47,9 @@ class Train:
     closed_loop: bool = False
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
+    uncertain: HalfWidths = ()
+    """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all. Each
+    trajectory of the training then has its own (input-aware), and the observer serves every such plant."""
     monitor: bool = True
     """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
     takes no symbols."""
@@ -122,9 +125,14 @@ class Train:
 
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
-        changes = (read_changes(self.config) if self.config else {}) | as_settings(self.settings)
+        changes = (read_changes(self.config) if self.config else {}) | self.settings
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
+        if self.uncertain:
+            named = [name for name, _ in self.uncertain]
+            if len({*named}) < len(named):
+                raise ValueError(f"--uncertain names a parameter twice: {', '.join(named)}")
+            changes["uncertain"] = dict(self.uncertain)
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         return changes
