@@ -6,8 +6,10 @@ from typing import Any, ClassVar
 from kkl_gym.equations import input_matrix
 from kkl_gym.system import Box, Components, System
 from observers.checks import shown
+from training.trajectories.controllers import Controller
 
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
+EVERY = "all"  # in the place of a parameter's name
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
 
@@ -31,6 +33,49 @@ def with_values(system: System, values: Mapping[str, Any]) -> System:
     return changed
 
 
+def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Ranges about the values that a system's parameters have.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    half_widths : mapping of str to float
+        By the parameter's name, how far it may be from its value, as a part of that. "all" stands for each parameter
+        that is not named.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Low and high end of each parameter, in the system's own order.
+
+    Raises
+    ------
+    ValueError
+        If the system lacks a parameter, or one of them is 0 or has no room.
+    """
+    known = system.parameters
+    for name in half_widths:
+        if name not in known and name != EVERY:
+            raise ValueError(
+                f"{system.name} has no parameter {shown(name)} to be uncertain; it has {', '.join(known) or 'none'}"
+            )
+    if half_widths and not known:
+        raise ValueError(f"{system.name} has no parameters that could be uncertain")
+    widths = {name: half_widths.get(name, half_widths.get(EVERY, 0.0)) for name in known}
+    ranges = {}
+    for name, width in widths.items():
+        value = known[name]
+        if not width:
+            continue
+        if not value:
+            raise ValueError(
+                f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
+            )
+        ranges[name] = (value - width * abs(value), value + width * abs(value))
+    return ranges
+
+
 def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -> System:
     """A system whose states are x and then some of its parameters, with derivative zero.
 
@@ -47,7 +92,7 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
     Returns
     -------
     System
-        Of the same name, dt, noise and inputs.
+        Of the same name, dt, noise and inputs; the same system if there are no ranges.
 
     Raises
     ------
@@ -61,6 +106,8 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
             )
         if not low < high:
             raise ValueError(f"the range of {name} must go from low to high, got {shown((low, high))}")
+    if not ranges:
+        return system
     nx, names = system.nx, tuple(ranges)
     still = ((0.0,) * system.nu,) * len(names)
     constant = bool(system.nu) and type(system).g is System.g and not system.discrete
@@ -115,3 +162,8 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
                     return [*input_matrix(model(x), x[:nx]), *still]
 
     return WithParameters()
+
+
+def blind(policy: Controller, nx: int) -> Controller:
+    """A policy for a system of :func:`with_parameters` that sees the nx states alone."""
+    return lambda x: policy(x[:, :nx])

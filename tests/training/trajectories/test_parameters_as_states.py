@@ -5,12 +5,13 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from linear_system import Oscillator
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import Lorenz, VanDerPol
 from training.trajectories.derivatives import jacobian
-from training.trajectories.parameters import with_parameters
+from training.trajectories.parameters import relative_ranges, with_parameters
 
 
 @dataclass(frozen=True)
@@ -85,3 +86,29 @@ def test_symbols_pass():
 def test_what_makes_no_sense(ranges, message):
     with pytest.raises(ValueError, match=message):
         with_parameters(VanDerPol(), ranges)
+
+
+def test_ranges_about_the_values():
+    lorenz = Lorenz(beta=-2.0)
+    assert relative_ranges(lorenz, {"rho": 0.5}) == {"rho": (14.0, 42.0)}
+    found = relative_ranges(lorenz, {"all": 0.1, "rho": 0.5, "sigma": 0.0})
+    assert found == {"rho": (14.0, 42.0), "beta": (-2.2, -1.8)}
+    assert relative_ranges(lorenz, {}) == {}
+    assert with_parameters(lorenz, {}) is lorenz
+
+
+@pytest.mark.parametrize(
+    ("system", "widths", "message"),
+    [
+        (Lorenz(), {"nu": 0.1}, "no parameter 'nu' to be uncertain; it has sigma, rho, beta"),
+        (Lorenz(beta=0.0), {"all": 0.1}, "beta of lorenz is 0, which has no relative range: leave it out, beta=0"),
+    ],
+)
+def test_ranges_that_make_no_sense(system, widths, message):
+    with pytest.raises(ValueError, match=message):
+        relative_ranges(system, widths)
+
+
+def test_a_system_without_parameters_has_none_to_be_uncertain():
+    with pytest.raises(ValueError, match="oscillator has no parameters"):
+        relative_ranges(Oscillator(), {"all": 0.1})
