@@ -85,12 +85,9 @@ def test_another_plant_moves_and_nobody_knows(tmp_path):
     assert set(found.plant) == {"omega=2"}
     assert float(right[1][-2].split()[0]) < 0.1  # from X
     assert min(float(row[-2].split()[0]) for row in off[1:]) > 20.0
-    Evaluate((str(path),), **options, plant_error=1.0).run(
-        console := Console(width=300, record=True, file=io.StringIO())
-    )
-    text = console.export_text()
-    assert "4 runs of 30 s, plant omega=2, model omega=1\n" in text
-    assert "NRMSE in % after transient, median, plant omega=2, model omega=1\n" in text
+    Evaluate((str(path),), **options, plant_error=1.0).run(console := Console(record=True, file=io.StringIO()))
+    text = " ".join(console.export_text().split())
+    assert text.count("plant omega=2, model omega=1") == 2  # in each title
     assert off[1][-3] in text
 
 
