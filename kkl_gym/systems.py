@@ -276,8 +276,9 @@ def system_of(artifact: Artifact, given: str | None) -> System:
     ValueError
         If ``given`` is None and the system is not a shipped one, or if ``given`` cannot be found.
     observers.ArtifactError
-        If the artifact was made for another system.
+        If the artifact was made for another system, or for none.
     """
+    artifact.require_system()
     if given is None and artifact.system not in SYSTEMS:
         raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")
     base = get_system(given or artifact.system)

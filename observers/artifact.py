@@ -6,8 +6,8 @@
 import math
 import os
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ from observers.monitor import Limits
 from observers.network import MLP
 
 # The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
-# each of several outputs; the others are still written as the first.
-FORMATS = (1, 2, 3)
+# each of several outputs, the fourth maps that estimate parameters too; the others are still written as the first.
+FORMATS = (1, 2, 3, 4)
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
@@ -207,6 +207,24 @@ class InverseMap:
             raise ArtifactError(f"{name} = {value} does not fit a noise_gain of shape {self.noise_gain.shape}")
         return value
 
+    def part(self, outputs: slice) -> "InverseMap":
+        """Return the same map with some of its outputs alone.
+
+        Parameters
+        ----------
+        outputs : slice
+            Which of them.
+
+        Returns
+        -------
+        InverseMap
+            One that shares its arrays with this; this one if all are meant.
+        """
+        if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
+            return self
+        x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
+        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale)
+
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
         """Cut levels of measurement noise at the largest that the map is told.
 
@@ -297,15 +315,23 @@ class Artifact:
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
         they are told nothing else. It is cut at the largest that the maps are told.
+    parameter_ranges : mapping of str to (float, float), optional
+        Low and high end of parameters that are not known exactly: the observer was trained for systems with any
+        parameters within.
+    estimated_parameters : tuple of str, optional
+        Those of them that the maps estimate: their last outputs, in this order, behind the states.
     training : mapping, optional
         How it was made: method, preset, configuration, seed, measures.
     versions : mapping of str to str, optional
         Versions of the libraries that made it.
+    signals : mapping of str to sequence of str, optional
+        Of an observer that was learned from recorded states: names of the columns "measured", y, "inputs", u, and
+        "hidden", x. There are no equations behind it, and it fits no environment.
 
     Raises
     ------
     ArtifactError
-        If the parts do not fit together, or a parameter is no finite number.
+        If the parts do not fit together, a parameter is no finite number, or a range of one does not hold it.
     ValueError
         If the usual measurement noise is no number, or not one for each output, or the map cannot be told levels that
         differ.
@@ -321,18 +347,22 @@ class Artifact:
     limits: Limits | None = None
     free_inverse: InverseMap | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
+    parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    estimated_parameters: tuple[str, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    signals: Mapping[str, Sequence[str]] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, str):
             raise ArtifactError(f"the system's name must be a string, got {self.system!r}")
-        for name in ("parameters", "training", "versions"):
+        for name in ("parameters", "parameter_ranges", "training", "versions"):
             if not isinstance(getattr(self, name), Mapping):
                 raise ArtifactError(f"{name} must be a mapping, got {getattr(self, name)!r}")
         for name, value in self.parameters.items():
             if not is_finite(value):
                 raise ArtifactError(f"the parameter {name} must be a finite number, got {value!r}")
+        self._check_ranges()
         if self.inverse.whiten.shape[1] != self.filter.size or ("z_u" in self.inverse.features) != (self.filter.nu > 0):
             raise ArtifactError(
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
@@ -347,7 +377,8 @@ class Artifact:
         if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
         if free is not None and (
-            len(free.x_offset) != self.nx or free.measurement_noise_max != self.inverse.measurement_noise_max
+            free.mlp.outputs != self.inverse.mlp.outputs
+            or free.measurement_noise_max != self.inverse.measurement_noise_max
         ):
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if free is not None and _process(free) != _process(self.inverse):
@@ -364,13 +395,63 @@ class Artifact:
                 f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
                 f"outputs and {self.nx} states, or there is a C beside it"
             )
+        if self.signals is not None:
+            self._check_signals(self.signals)
         if self.limits is not None and (not self.knows_output or self.limits.mean.shape[1] != self.ny):
             raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
+
+    def require_system(self) -> None:
+        """See that there is a system behind the observer.
+
+        Raises
+        ------
+        ArtifactError
+            If it was learned from recorded states; the message says from which.
+        """
+        if self.signals is not None:
+            names = {role: ", ".join(of) for role, of in self.signals.items()}
+            given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
+            raise ArtifactError(
+                f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
+                f"{self.filter.dt:g} s. It has no equations, and fits no environment; observers.load(path) runs it on "
+                "samples"
+            )
+
+    def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
+        counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
+        if not isinstance(signals, Mapping) or set(signals) != set(counts):
+            raise ArtifactError(f"signals must name {', '.join(counts)}, got {shown(signals)}")
+        for role, count in counts.items():
+            names = signals[role]
+            if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+                raise ArtifactError(f"the signals {role} must be names, got {shown(names)}")
+            if len(names) != count:
+                raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
+
+    def _check_ranges(self) -> None:
+        """Raise an error unless there is a range about each uncertain parameter, and a state beside those estimated."""
+        for name, ends in self.parameter_ranges.items():
+            if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_finite, ends)):
+                raise ArtifactError(f"the range of the parameter {name} must be two finite numbers, got {shown(ends)}")
+            if name not in self.parameters or not ends[0] <= self.parameters[name] <= ends[1]:
+                raise ArtifactError(
+                    f"the range {shown(tuple(ends))} of {name} must hold its value; parameters: {dict(self.parameters)}"
+                )
+        if not {*self.estimated_parameters} <= {*self.parameter_ranges}:
+            raise ArtifactError(
+                f"estimated_parameters = {self.estimated_parameters} must be among those with a range, "
+                f"{tuple(self.parameter_ranges)}"
+            )
+        if self.nx < 1:
+            raise ArtifactError(
+                f"a map of {self.inverse.mlp.outputs} outputs has no room for a state beside "
+                f"{len(self.estimated_parameters)} parameters"
+            )
 
     @property
     def nx(self) -> int:
         """Number of states estimated."""
-        return len(self.inverse.x_offset)
+        return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
     @property
     def ny(self) -> int:
@@ -469,7 +550,7 @@ class Artifact:
         system : str
             Name of the system.
         parameters : mapping of str to float
-            Its physical parameters.
+            Its physical parameters; those with a range may lie anywhere within.
         dt : float
             Sampling interval in seconds.
         ny, nu : int
@@ -487,12 +568,18 @@ class Artifact:
                 "environment, or train an observer for it (kkl-gym train) and pass its path"
             )
 
+        self.require_system()
         if self.system != system:
             differ("the system", self.system, system)
         for name in sorted({*self.parameters, *parameters}):
             here, there = self.parameters.get(name), parameters.get(name)
-            if here is None or there is None or not math.isclose(here, there, rel_tol=1e-9, abs_tol=1e-12):
-                differ(f"the parameter {name} =", here, there)
+            if here is not None and there is not None:
+                low, high = self.parameter_ranges.get(name, (here, here))
+                if low - 1e-9 * abs(low) <= there <= high + 1e-9 * abs(high):
+                    continue
+            if name in self.parameter_ranges:
+                differ(f"the parameter {name} within", self.parameter_ranges[name], there)
+            differ(f"the parameter {name} =", here, there)
         if not math.isclose(self.filter.dt, dt, rel_tol=1e-9):
             differ("the sampling interval dt =", self.filter.dt, dt)
         if self.ny != ny:
@@ -516,9 +603,10 @@ class Artifact:
             If JSON cannot hold ``training``, ``versions`` or a number.
         """
         tensors = {"A": self.filter.A, "B": self.filter.B}
-        per_output = self.inverse.noise_gain.ndim == 2
+        told = (self.process_noise_max is not None, self.inverse.noise_gain.ndim == 2, bool(self.estimated_parameters))
+        level = max(number * there for number, there in enumerate(told, 1))
         described: dict[str, Any] = {
-            "format": FORMATS[2] if per_output else FORMATS[0] if self.process_noise_max is None else FORMATS[1],
+            "format": FORMATS[level],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
@@ -531,6 +619,12 @@ class Artifact:
             described["free"] = _put_inverse(tensors, "free", self.free_inverse)
         if self.measurement_noise != self.inverse.within(USUAL_NOISE):
             described["measurement_noise"] = self.measurement_noise
+        if self.signals is not None:
+            described["signals"] = {role: list(names) for role, names in self.signals.items()}
+        if self.parameter_ranges:
+            described["system"]["ranges"] = {name: list(ends) for name, ends in self.parameter_ranges.items()}
+        if self.estimated_parameters:
+            described["estimated_parameters"] = list(self.estimated_parameters)
         if self.C is not None:
             tensors["C"] = np.asarray(self.C, dtype=float)
         if self.h is not None:
@@ -602,8 +696,11 @@ class Artifact:
             limits=limits,
             free_inverse=free_inverse,
             measurement_noise=described.get("measurement_noise", USUAL_NOISE),
+            parameter_ranges={name: tuple(ends) for name, ends in described["system"].get("ranges", {}).items()},
+            estimated_parameters=tuple(described.get("estimated_parameters", ())),
             training=described["training"],
             versions=described["versions"],
+            signals=described.get("signals"),
         )
 
 

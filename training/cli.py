@@ -47,6 +47,7 @@ EXTRAS = {
     "train": {"filelock", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"},
     "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
     "plots": {"PIL", "matplotlib"},
+    "parquet": {"pyarrow"},
 }
 
 

@@ -1,0 +1,63 @@
+"""Recorded data as options of a command: the files, and which of their columns are what."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from kkl_gym.system import System
+from training.progress import ProgressBars
+from training.records import Record, Signals, read_records
+
+_BY_NAME = "(default: by the names of the columns)"
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
+
+    data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]", help_behavior_hint="")] = ()
+    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns."""
+    time: Annotated[str, tyro.conf.arg(metavar="COLUMN", help_behavior_hint="(default: t or time)")] = ""
+    """Column of the time in seconds."""
+    measured: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    """Measured outputs, with commas between them; y, or y1, y2, ... if they are not named."""
+    inputs: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    """Known inputs, each held until the next sample; u, or u1, u2, ... if they are not named."""
+    hidden: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
+    """Recorded states; x, or x1, x2, ... if they are not named. Of an angle, cos(COLUMN) and sin(COLUMN)."""
+
+    @property
+    def signals(self) -> Signals:
+        """The columns that are named; ValueError if one is twice."""
+        measured, inputs, hidden = (
+            tuple(name.strip() for name in names.split(",") if name.strip())
+            for names in (self.measured, self.inputs, self.hidden)
+        )
+        return Signals(self.time, measured, inputs, hidden)
+
+    def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
+        """Read the files.
+
+        Parameters
+        ----------
+        progress : ProgressBars
+            Where it is said what is odd.
+        system : System, optional
+            What was recorded, where that is known.
+
+        Returns
+        -------
+        list of Record
+            One of each file.
+
+        Raises
+        ------
+        ValueError
+            As :func:`training.records.read_records`.
+        """
+        with progress.phase("reading the records"):
+            return read_records(
+                self.data, signals=self.signals, system=system, warn=lambda text: progress.say(f"warning: {text}")
+            )

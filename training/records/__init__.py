@@ -1,0 +1,19 @@
+"""Recorded data: files of samples, the columns that are asked of them, what is checked, and uniform grids."""
+
+from training.records.checks import check_dt, check_memory
+from training.records.reading import read_records
+from training.records.record import Record
+from training.records.resampling import jitter, median_step, pieces, resampled
+from training.records.signals import Signals
+
+__all__ = [
+    "Record",
+    "Signals",
+    "check_dt",
+    "check_memory",
+    "jitter",
+    "median_step",
+    "pieces",
+    "read_records",
+    "resampled",
+]

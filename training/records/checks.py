@@ -1,0 +1,197 @@
+"""What may be wrong with records that are well formed: units, lengths, signals that stand still, steps of time."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from kkl_gym.system import System
+from training.records.record import Record
+from training.records.resampling import LONGEST_GAP, median_step
+
+Warn = Callable[[str], object]
+
+OTHER_UNITS = 100.0  # times what is expected: no motion does that, but a unit a thousand times smaller
+OTHER_SPREAD = 300.0  # times that of other records of the same signal
+OTHER_CLOCK = 30.0  # times the sampling interval of other records
+WHOLE_TURN = 0.9 * 2 * np.pi  # jumps from here to a whole turn are those of a wrapped angle
+ROWS = {"y": "measured", "u": "inputs", "x": "hidden"}
+
+
+def check_between_records(records: Sequence[Record], warn: Warn) -> None:
+    """See that records have the same columns, and that none seems to be in other units than the others.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one plant.
+    warn : callable
+        Told of spreads that differ.
+
+    Raises
+    ------
+    ValueError
+        If columns differ, or sampling intervals by a factor of 30.
+    """
+    first = records[0]
+    for record in records[1:]:
+        for role in ROWS.values():
+            here, there = getattr(record.signals, role), getattr(first.signals, role)
+            if here != there:
+                told = [", ".join(names) or "none" for names in (here, there)]
+                raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
+    steps = np.array([median_step(record) for record in records])
+    for record, step in zip(records, steps):
+        if not 1 / OTHER_CLOCK < step / np.median(steps) < OTHER_CLOCK:
+            raise ValueError(
+                f"{record.name}: column {record.signals.time}: steps of {step:g} s, but {np.median(steps):g} s in the "
+                "other files; is the time in other units than seconds?"
+            )
+    for letter, role in ROWS.items():
+        for j, column in enumerate(getattr(first.signals, role)):
+            spreads = np.array([np.nanstd(getattr(record, letter)[:, j]) for record in records])
+            usual = np.median(spreads[spreads > 0]) if (spreads > 0).any() else 1.0
+            if len(records) == 2 and spreads.all():
+                usual = spreads.min()
+            for record, spread in zip(records, spreads):
+                if spread and not 1 / OTHER_SPREAD < spread / usual < OTHER_SPREAD:
+                    warn(
+                        f"{record.name}: column {column} spreads over {spread / usual:.3g} times what it does in other "
+                        "files; is it in other units?"
+                    )
+
+
+def check_motion(records: Sequence[Record], warn: Warn) -> None:
+    """See that signals move, and that no angle jumps by whole turns.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With the same columns.
+    warn : callable
+        Told of an output that stands still in one record, and of jumps.
+
+    Raises
+    ------
+    ValueError
+        If an output or a hidden state stands still in all records.
+    """
+    for letter, role in (("y", "measured"), ("x", "hidden")):
+        for j, column in enumerate(getattr(records[0].signals, role)):
+            still = [bool(np.nanstd(getattr(record, letter)[:, j]) == 0) for record in records]
+            if all(still):
+                value = getattr(records[0], letter)[0, j]
+                raise ValueError(
+                    f"{records[0].name}: column {column}: {value:g} in all rows, and no other file says more; there is "
+                    "nothing to learn from what never moves"
+                )
+            for record, stands in zip(records, still):
+                values = getattr(record, letter)[:, j]
+                if stands:
+                    warn(f"{record.name}: column {column} never moves")
+                jumps = abs(np.diff(values))
+                turns = np.flatnonzero((jumps > WHOLE_TURN) & (jumps < 2 * np.pi + 0.1))
+                if len(turns) and np.nanmax(values) - np.nanmin(values) < 2 * np.pi + 0.1:
+                    warn(
+                        f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of an angle "
+                        f"that is wrapped; take cos({column}) and sin({column}), or unwrap it"
+                    )
+
+
+def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
+    """See that records have a system's numbers of signals, and sizes that it may reach.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With the same columns.
+    system : System
+        What was recorded.
+    warn : callable
+        Told of outputs and states that are a hundred times smaller than expected, and of inputs that were not recorded.
+
+    Raises
+    ------
+    ValueError
+        If a number of signals differs, or a signal is a hundred times larger than the system's declarations allow.
+    """
+    signals, first = records[0].signals, records[0].name
+    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
+    for role, count in counts.items():
+        found = getattr(signals, role)
+        if len(found) != count and (found or role == "measured"):
+            raise ValueError(
+                f"{first}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; name "
+                f"others by --{role}"
+            )
+    if system.nu and not signals.inputs:
+        warn(f"{first}: no column of inputs, which are taken for zero")
+    low, high = system.box()
+    sizes = {"y": np.array(system.output_range), "u": np.array(system.u_max), "x": high - low}
+    for record in records:
+        for letter, role in ROWS.items():
+            values = getattr(record, letter)
+            if values is None:
+                continue
+            largest = np.nanpercentile(abs(values - np.nanmedian(values, 0)), 99, axis=0)  # a few outliers aside
+            for column, size, expected in zip(getattr(record.signals, role), largest, sizes[letter], strict=True):
+                ratio = size / expected
+                told = (
+                    f"{record.name}: column {column} moves by {size:.3g}, {ratio:.3g} times what {system.name} declares"
+                )
+                if ratio > OTHER_UNITS:
+                    raise ValueError(f"{told} ({expected:.3g}); is it in other units?")
+                if letter != "u" and 0 < ratio < 1 / OTHER_UNITS:
+                    warn(f"{told} ({expected:.3g}); is it in other units?")
+
+
+def check_memory(records: Sequence[Record], seconds: float, warn: Warn) -> None:
+    """See that records are longer than what a filter remembers.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Any.
+    seconds : float
+        The filter's memory.
+    warn : callable
+        Told of records that are shorter where others are not.
+
+    Raises
+    ------
+    ValueError
+        If all records are shorter.
+    """
+    short = [record for record in records if record.duration < seconds]
+    told = [
+        f"{record.name}: column {record.signals.time}, row {len(record.t)}: the record ends after "
+        f"{record.duration:.3g} s, but the filter remembers {seconds:.3g} s"
+        for record in short
+    ]
+    if len(short) == len(records):
+        raise ValueError(f"{told[0]}, and no other is longer; record longer runs, or take faster eigenvalues")
+    for text in told:
+        warn(text)
+
+
+def check_dt(records: Sequence[Record], dt: float) -> None:
+    """See that records were sampled often enough for a sampling interval.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Any.
+    dt : float
+        Sampling interval in seconds of an observer, to which they are to be resampled.
+
+    Raises
+    ------
+    ValueError
+        If the median step of a record is more than 3 dt, or less than a thirtieth of it.
+    """
+    for record in records:
+        step = median_step(record)
+        if not dt / OTHER_CLOCK < step <= LONGEST_GAP * dt:
+            raise ValueError(
+                f"{record.name}: column {record.signals.time}: steps of {step:g} s do not fit dt = {dt:g} s; is the "
+                "time in seconds? If so, take an observer with another dt"
+            )

@@ -1,0 +1,79 @@
+"""From files to records."""
+
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kkl_gym.system import System
+from training.records.checks import check_against_system, check_between_records, check_motion
+from training.records.files import read_columns
+from training.records.record import Record, refuse_infinite
+from training.records.signals import Signals, column_of, values_of
+
+
+def read_records(
+    files: Iterable[str | Path],
+    *,
+    signals: Signals | None = None,
+    system: System | None = None,
+    warn: Callable[[str], object] | None = None,
+) -> list[Record]:
+    """Read records, one from each file, and check them.
+
+    Parameters
+    ----------
+    files : iterable of str or Path
+        NPZ, CSV or Parquet files, see :func:`training.records.files.read_columns`.
+    signals : Signals, optional
+        Which columns are what; by default they are found by their names.
+    system : System, optional
+        What was recorded: numbers of outputs, inputs and states have to fit it, and so do their sizes.
+    warn : callable, optional
+        Told what is odd where one can go on; by default a UserWarning.
+
+    Returns
+    -------
+    list of Record
+        In the order of the files.
+
+    Raises
+    ------
+    ValueError
+        If there is no file, one cannot be read, or its samples make no record; the message names file, column and row.
+        Rows are counted from 1, without the header.
+    OSError
+        If a file cannot be read.
+    ModuleNotFoundError
+        For a Parquet file without pyarrow, which the extra ``parquet`` brings.
+    """
+    paths = [Path(path) for path in files]
+    if not paths:
+        raise ValueError("name a file of recorded data: .npz, .csv or .parquet (--data)")
+    records = [_read(path, signals or Signals()) for path in paths]
+    told = warn or (lambda text: warnings.warn(text, stacklevel=4))
+    check_between_records(records, told)
+    check_motion(records, told)
+    if system is not None:
+        check_against_system(records, system, told)
+    return records
+
+
+def _read(path: Path, wanted: Signals) -> Record:
+    found = wanted
+
+    def choose(columns: Sequence[str]) -> Sequence[str]:
+        nonlocal found
+        found = wanted.found_in(path, columns)
+        return list(dict.fromkeys([found.time, *(column_of(signal, columns) for signal in found.all)]))
+
+    names, columns = read_columns(path, choose)
+    for name, values in columns.items():
+        refuse_infinite(str(path), name, values)
+
+    def stacked(signals: tuple[str, ...]) -> np.ndarray:
+        return np.stack([values_of(signal, names, columns[column_of(signal, names)]) for signal in signals], -1)
+
+    u, x = (stacked(signals) if signals else None for signals in (found.inputs, found.hidden))
+    return Record(str(path), columns[found.time], stacked(found.measured), u, x, found)

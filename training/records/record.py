@@ -1,0 +1,99 @@
+"""A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
+
+from dataclasses import dataclass, field
+from typing import NoReturn
+
+import numpy as np
+
+from training.records.signals import Signals
+
+
+@dataclass(frozen=True)
+class Record:
+    """Samples from one run of a plant.
+
+    Parameters
+    ----------
+    name : str
+        The file, for messages and figures.
+    t : ndarray, shape (n,)
+        Times in seconds, increasing; their steps may differ.
+    y : ndarray, shape (n, ny)
+        Outputs, NaN where a sample is missing.
+    u : ndarray, shape (n, nu), optional
+        Inputs, each held from its sample to the next.
+    x : ndarray, shape (n, nx), optional
+        States, NaN where one is missing.
+    signals : Signals, optional
+        Names of the columns; by default y1, y2, ..., u1, ..., x1, ....
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, there are fewer than two samples, time does not increase, a signal is missing in all of
+        them, an input in any, or a number is infinite. The message names column and row, counted from 1.
+    """
+
+    name: str
+    t: np.ndarray
+    y: np.ndarray
+    u: np.ndarray | None = None
+    x: np.ndarray | None = None
+    signals: Signals = field(default_factory=Signals)
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.t) != 1 or len(self.t) < 2:
+            raise ValueError(f"{self.name}: t must be two samples at least, got shape {np.shape(self.t)}")
+        self._check("t", np.asarray(self.t, dtype=float)[:, None], "time", ("t",))
+        back = np.flatnonzero(np.diff(self.t) <= 0)
+        if len(back):
+            row = int(back[0]) + 1
+            self._fail(
+                self.signals.time, row, f"time must increase, but {self.t[row]:g} comes after {self.t[row - 1]:g}"
+            )
+        for letter, role in (("y", "measured"), ("u", "inputs"), ("x", "hidden")):
+            values = getattr(self, letter)
+            if values is not None:
+                count = np.shape(values)[1] if np.ndim(values) == 2 else 0
+                self._check(letter, np.asarray(values, dtype=float), role, [f"{letter}{i + 1}" for i in range(count)])
+
+    def _check(self, letter: str, values: np.ndarray, role: str, names: "tuple[str, ...] | list[str]") -> None:
+        """See that an array is one of samples, with no more missing than may be, and give its columns names."""
+        if values.ndim != 2 or len(values) != len(self.t) or not values.shape[1]:
+            raise ValueError(
+                f"{self.name}: {letter} must have shape ({len(self.t)}, n) as there are {len(self.t)} times, "
+                f"got {values.shape}"
+            )
+        if not getattr(self.signals, role):
+            named = {**vars(self.signals), role: names[0] if role == "time" else tuple(names)}
+            object.__setattr__(self, "signals", Signals(**named))
+        if letter != "t":
+            object.__setattr__(self, letter, values)
+            names = getattr(self.signals, role)
+            if len(names) != values.shape[1]:
+                raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names}")
+        else:
+            object.__setattr__(self, "t", values[:, 0])
+            names = (self.signals.time,)
+        for name, column in zip(names, values.T, strict=True):
+            refuse_infinite(self.name, name, column)
+            missing = np.isnan(column)
+            if missing.all():
+                self._fail(name, 0, "no row holds a number")
+            if missing.any() and letter in "tu":
+                self._fail(name, int(missing.argmax()), "a number is missing, which may be in outputs and states alone")
+
+    def _fail(self, column: str, row: int, why: str) -> NoReturn:
+        raise ValueError(f"{self.name}: column {column}, row {row + 1}: {why}")
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first sample to the last."""
+        return float(self.t[-1] - self.t[0])
+
+
+def refuse_infinite(name: str, column: str, values: np.ndarray) -> None:
+    """Raise an error that names file, column and row if a value is infinite."""
+    infinite = np.flatnonzero(np.isinf(values))
+    if len(infinite):
+        raise ValueError(f"{name}: column {column}, row {infinite[0] + 1}: {values[infinite[0]]} is no sample")

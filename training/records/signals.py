@@ -1,0 +1,120 @@
+"""Which columns of a file are what: time, measured outputs, inputs and hidden states."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+TIMES = ("t", "time")  # what the time is called where nobody says it
+FUNCTIONS = {"cos": np.cos, "sin": np.sin}  # of a column that holds an angle
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The columns of records by what they are; what is left empty is found by its name.
+
+    A measured, an input or a hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle
+    in rad.
+
+    Parameters
+    ----------
+    time : str, default ""
+        Column of the time in seconds; by default ``t`` or ``time``.
+    measured : tuple of str, length ny, default ()
+        Outputs y; by default ``y``, or ``y1``, ``y2`` and so on.
+    inputs : tuple of str, length nu, default ()
+        Inputs u, each held from its sample to the next; by default ``u``, or ``u1``, ``u2``, ..., where there are any.
+    hidden : tuple of str, length nx, default ()
+        States x; by default ``x``, or ``x1``, ``x2``, ..., where there are any.
+
+    Raises
+    ------
+    ValueError
+        If a name is empty, or one signal is named twice.
+    """
+
+    time: str = ""
+    measured: tuple[str, ...] = ()
+    inputs: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for role in ("measured", "inputs", "hidden"):
+            names = getattr(self, role)
+            if isinstance(names, str) or not all(isinstance(name, str) and name for name in names):
+                raise ValueError(f"{role} must be names of columns, got {names!r}")
+            object.__setattr__(self, role, tuple(names))
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise ValueError(f"{role} names {', '.join(twice)} twice")
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """The measured, input and hidden signals, in this order."""
+        return self.measured + self.inputs + self.hidden
+
+    def found_in(self, path: object, columns: Sequence[str]) -> "Signals":
+        """Find in a file's columns what nobody has named, and see that all others are there.
+
+        Parameters
+        ----------
+        path : object
+            The file, for messages.
+        columns : sequence of str
+            Names of its columns.
+
+        Returns
+        -------
+        Signals
+            Nothing empty in it but inputs and hidden states that the file does not have.
+
+        Raises
+        ------
+        ValueError
+            If a column is missing; the message names it, and those that there are.
+        """
+        found = replace(
+            self,
+            time=self.time or next((name for name in TIMES if name in columns), TIMES[0]),
+            measured=self.measured or _numbered("y", columns) or ("y",),
+            inputs=self.inputs or _numbered("u", columns),
+            hidden=self.hidden or _numbered("x", columns),
+        )
+        options = {
+            "--time": (found.time,),
+            "--measured": found.measured,
+            "--inputs": found.inputs,
+            "--hidden": found.hidden,
+        }
+        for option, names in options.items():
+            for name in names:
+                if column_of(name, columns) not in columns:
+                    there = ", ".join(columns) or "none"
+                    raise ValueError(f"{path} has no column {column_of(name, columns)}; there are {there} ({option})")
+        return found
+
+
+def column_of(signal: str, columns: Sequence[str]) -> str:
+    """The column that a signal is made of: the signal itself, or what stands between the brackets of cos() or sin()."""
+    function = _function(signal, columns)
+    return signal if function is None else function[2].strip()
+
+
+def values_of(signal: str, columns: Sequence[str], column: np.ndarray) -> np.ndarray:
+    """A signal's values, (n,), from those of its column."""
+    function = _function(signal, columns)
+    return column if function is None else np.asarray(FUNCTIONS[function[1]](column))
+
+
+def _function(signal: str, columns: Sequence[str]) -> re.Match[str] | None:
+    """The cos() or sin() in a signal; a column may bear such a name itself."""
+    return None if signal in columns else re.fullmatch(rf"({'|'.join(FUNCTIONS)})\((.+)\)", signal)
+
+
+def _numbered(letter: str, columns: Sequence[str]) -> tuple[str, ...]:
+    """The columns of a letter alone, or with numbers, by their numbers."""
+    if letter in columns:
+        return (letter,)
+    found = [name for name in columns if re.fullmatch(rf"{letter}[0-9]+", name)]
+    return tuple(sorted(found, key=lambda name: int(name[1:])))
