@@ -122,8 +122,6 @@ OwnPolicy = Annotated[
 
 def read_parameter(text: str) -> tuple[str, float]:
     """Read a parameter, written as ``mu=3.3``.
-def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
 
     Parameters
     ----------
@@ -136,9 +134,6 @@ def read_half_width(text: str) -> tuple[str, float]:
         Of the parameter; nobody has looked for it.
     value : float
         Its value.
-        Of the parameter, or "all".
-    share : float
-        How far it may be from its value, as a part of that.
 
     Raises
     ------
@@ -150,6 +145,26 @@ def read_half_width(text: str) -> tuple[str, float]:
         return name.strip(), float(value)
     except ValueError:
         raise ValueError(f"{text!r} is no parameter with its value: write NAME=VALUE, as in mu=3.3") from None
+
+
+def read_half_width(text: str) -> tuple[str, float]:
+    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the parameter, or "all".
+    share : float
+        How far it may be from its value, as a part of that.
+
+    Raises
+    ------
+    ValueError
         If it is neither.
     """
     name, _, share = text.rpartition("=")
