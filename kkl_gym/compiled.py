@@ -201,10 +201,13 @@ def compiled_step(system: System) -> Step:
         return out
 
     # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.
+    u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None]
+    rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
     for points in _trials(system):
         rng, n = np.random.default_rng(0), points.shape[1]
-        at = points, rng.uniform(-1, 1, (nu, n)), rng.uniform(-1, 1, (nx, n))
-        if not np.allclose(substeps(*at, 0.01)[0], in_numpy(*at, 0.01)[0], rtol=1e-9, atol=1e-9, equal_nan=True):
+        u, w = u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n))
+        found, expected = (advance(points, u, w, system.dt)[0] for advance in (substeps, in_numpy))
+        if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
 

@@ -18,10 +18,20 @@ from observers.checks import mapping, shown
 class ReverseDuffing(System):
     """Reverse Duffing oscillator (paper, sec. 8, eq. rev_duff), y = x1, input on x2.
 
-    x1' = x2^3, x2' = -x1 + u. Conservative without input: x2^4/4 + x1^2/2 is constant, so motions are periodic,
-    with a period that grows as they shrink. Dimensionless; the origin is a degenerate equilibrium whose
-    linearisation cannot be stabilised.
+    x1' = a x2^3, x2' = -b x1 + u. Conservative without input: a x2^4/4 + b x1^2/2 is constant, so motions are
+    periodic, with a period that grows as they shrink. Dimensionless; the origin is a degenerate equilibrium whose
+    linearisation cannot be stabilised. The paper has no parameters; a = b = 1 is its system.
+
+    Parameters
+    ----------
+    a : float
+        How fast x2 drives x1.
+    b : float
+        How fast x1 drives x2 back.
     """
+
+    a: float = 1.0
+    b: float = 1.0
 
     name: ClassVar[str] = "reverse_duffing"
     X: ClassVar[Box] = ((-2, 2), (-2, 2))
@@ -35,13 +45,14 @@ class ReverseDuffing(System):
 
     def f(self, x: Components) -> Components:
         x1, x2 = x
-        return x2 * x2 * x2, -x1
+        return self.a * (x2 * x2 * x2), -self.b * x1  # exact at the paper's a = b = 1
 
     def h(self, x: Components) -> Components:
         return (x[0],)
 
     def rate(self, x: Components) -> Any:
-        return 1.0 + 2.0 * abs(x[1])  # above sqrt(3) |x2|, the frequency of the linearised motion
+        # Above sqrt(3 a b) |x2|, the frequency of the linearised motion. Time runs faster with sqrt(a b).
+        return math.sqrt(abs(self.a * self.b)) * (1.0 + 2.0 * abs(x[1]))
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -22,11 +22,13 @@ from observers.monitor import Limits
 from observers.network import MLP
 
 # The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
-# each of several outputs; the others are still written as the first.
-FORMATS = (1, 2, 3)
+# each of several outputs, the fourth maps that estimate parameters too; the others are still written as the first.
+FORMATS = (1, 2, 3, 4)
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
+# Parameters that a system has been given since files for it were written that say none, and what they were then.
+_PARAMETERS_SINCE = {"reverse_duffing": {"a": 1.0, "b": 1.0}}
 _HOLDS = {"y": "first-order", "u": "zero-order"}  # what the filter takes signals for between samples
 _KEY = "kkl-gym"
 _LIMITS = ("levels", "mean", "low", "high")
@@ -205,6 +207,24 @@ class InverseMap:
             raise ArtifactError(f"{name} = {value} does not fit a noise_gain of shape {self.noise_gain.shape}")
         return value
 
+    def part(self, outputs: slice) -> "InverseMap":
+        """Return the same map with some of its outputs alone.
+
+        Parameters
+        ----------
+        outputs : slice
+            Which of them.
+
+        Returns
+        -------
+        InverseMap
+            One that shares its arrays with this; this one if all are meant.
+        """
+        if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
+            return self
+        x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
+        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale)
+
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
         """Cut levels of measurement noise at the largest that the map is told.
 
@@ -295,6 +315,11 @@ class Artifact:
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
         they are told nothing else. It is cut at the largest that the maps are told.
+    parameter_ranges : mapping of str to (float, float), optional
+        Low and high end of parameters that are not known exactly: the observer was trained for systems with any
+        parameters within.
+    estimated_parameters : tuple of str, optional
+        Those of them that the maps estimate: their last outputs, in this order, behind the states.
     training : mapping, optional
         How it was made: method, preset, configuration, seed, measures.
     versions : mapping of str to str, optional
@@ -306,7 +331,7 @@ class Artifact:
     Raises
     ------
     ArtifactError
-        If the parts do not fit together, or a parameter is no finite number.
+        If the parts do not fit together, a parameter is no finite number, or a range of one does not hold it.
     ValueError
         If the usual measurement noise is no number, or not one for each output, or the map cannot be told levels that
         differ.
@@ -322,6 +347,8 @@ class Artifact:
     limits: Limits | None = None
     free_inverse: InverseMap | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
+    parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    estimated_parameters: tuple[str, ...] = ()
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     signals: Mapping[str, Sequence[str]] | None = None
@@ -329,12 +356,13 @@ class Artifact:
     def __post_init__(self) -> None:
         if not isinstance(self.system, str):
             raise ArtifactError(f"the system's name must be a string, got {self.system!r}")
-        for name in ("parameters", "training", "versions"):
+        for name in ("parameters", "parameter_ranges", "training", "versions"):
             if not isinstance(getattr(self, name), Mapping):
                 raise ArtifactError(f"{name} must be a mapping, got {getattr(self, name)!r}")
         for name, value in self.parameters.items():
             if not is_finite(value):
                 raise ArtifactError(f"the parameter {name} must be a finite number, got {value!r}")
+        self._check_ranges()
         if self.inverse.whiten.shape[1] != self.filter.size or ("z_u" in self.inverse.features) != (self.filter.nu > 0):
             raise ArtifactError(
                 f"features {self.inverse.features} over {self.inverse.whiten.shape[1]} values do not fit "
@@ -349,7 +377,8 @@ class Artifact:
         if free is not None and ("z_u" in free.features or free.whiten.shape[1] != nz or not self.filter.nu):
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
         if free is not None and (
-            len(free.x_offset) != self.nx or free.measurement_noise_max != self.inverse.measurement_noise_max
+            free.mlp.outputs != self.inverse.mlp.outputs
+            or free.measurement_noise_max != self.inverse.measurement_noise_max
         ):
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if free is not None and _process(free) != _process(self.inverse):
@@ -399,10 +428,30 @@ class Artifact:
             if len(names) != count:
                 raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
 
+    def _check_ranges(self) -> None:
+        """Raise an error unless there is a range about each uncertain parameter, and a state beside those estimated."""
+        for name, ends in self.parameter_ranges.items():
+            if not isinstance(ends, list | tuple) or len(ends) != 2 or not all(map(is_finite, ends)):
+                raise ArtifactError(f"the range of the parameter {name} must be two finite numbers, got {shown(ends)}")
+            if name not in self.parameters or not ends[0] <= self.parameters[name] <= ends[1]:
+                raise ArtifactError(
+                    f"the range {shown(tuple(ends))} of {name} must hold its value; parameters: {dict(self.parameters)}"
+                )
+        if not {*self.estimated_parameters} <= {*self.parameter_ranges}:
+            raise ArtifactError(
+                f"estimated_parameters = {self.estimated_parameters} must be among those with a range, "
+                f"{tuple(self.parameter_ranges)}"
+            )
+        if self.nx < 1:
+            raise ArtifactError(
+                f"a map of {self.inverse.mlp.outputs} outputs has no room for a state beside "
+                f"{len(self.estimated_parameters)} parameters"
+            )
+
     @property
     def nx(self) -> int:
         """Number of states estimated."""
-        return len(self.inverse.x_offset)
+        return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
     @property
     def ny(self) -> int:
@@ -501,7 +550,7 @@ class Artifact:
         system : str
             Name of the system.
         parameters : mapping of str to float
-            Its physical parameters.
+            Its physical parameters; those with a range may lie anywhere within.
         dt : float
             Sampling interval in seconds.
         ny, nu : int
@@ -524,8 +573,13 @@ class Artifact:
             differ("the system", self.system, system)
         for name in sorted({*self.parameters, *parameters}):
             here, there = self.parameters.get(name), parameters.get(name)
-            if here is None or there is None or not math.isclose(here, there, rel_tol=1e-9, abs_tol=1e-12):
-                differ(f"the parameter {name} =", here, there)
+            if here is not None and there is not None:
+                low, high = self.parameter_ranges.get(name, (here, here))
+                if low - 1e-9 * abs(low) <= there <= high + 1e-9 * abs(high):
+                    continue
+            if name in self.parameter_ranges:
+                differ(f"the parameter {name} within", self.parameter_ranges[name], there)
+            differ(f"the parameter {name} =", here, there)
         if not math.isclose(self.filter.dt, dt, rel_tol=1e-9):
             differ("the sampling interval dt =", self.filter.dt, dt)
         if self.ny != ny:
@@ -549,9 +603,10 @@ class Artifact:
             If JSON cannot hold ``training``, ``versions`` or a number.
         """
         tensors = {"A": self.filter.A, "B": self.filter.B}
-        per_output = self.inverse.noise_gain.ndim == 2
+        told = (self.process_noise_max is not None, self.inverse.noise_gain.ndim == 2, bool(self.estimated_parameters))
+        level = max(number * there for number, there in enumerate(told, 1))
         described: dict[str, Any] = {
-            "format": FORMATS[2] if per_output else FORMATS[0] if self.process_noise_max is None else FORMATS[1],
+            "format": FORMATS[level],
             "system": {"name": self.system, "parameters": dict(self.parameters)},
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
@@ -566,6 +621,10 @@ class Artifact:
             described["measurement_noise"] = self.measurement_noise
         if self.signals is not None:
             described["signals"] = {role: list(names) for role, names in self.signals.items()}
+        if self.parameter_ranges:
+            described["system"]["ranges"] = {name: list(ends) for name, ends in self.parameter_ranges.items()}
+        if self.estimated_parameters:
+            described["estimated_parameters"] = list(self.estimated_parameters)
         if self.C is not None:
             tensors["C"] = np.asarray(self.C, dtype=float)
         if self.h is not None:
@@ -623,17 +682,22 @@ class Artifact:
             limits = Limits(**arrays, **{name: described["limits"][name] for name in _LIMIT_SCALARS})
         if "free" in described:
             free_inverse = _get_inverse(tensors, "free", described["free"])
+        system, parameters = described["system"]["name"], described["system"]["parameters"]
+        if parameters == {}:
+            parameters = _PARAMETERS_SINCE.get(system, parameters)
         return cls(
             filter=LinearFilter(tensors["A"], tensors["B"], described["dt"], described["inputs"]),
             inverse=_get_inverse(tensors, "inverse", described["inverse"]),
-            system=described["system"]["name"],
-            parameters=described["system"]["parameters"],
+            system=system,
+            parameters=parameters,
             forward=forward,
             C=tensors.get("C"),
             h=Expression(described["h"]) if "h" in described else None,
             limits=limits,
             free_inverse=free_inverse,
             measurement_noise=described.get("measurement_noise", USUAL_NOISE),
+            parameter_ranges={name: tuple(ends) for name, ends in described["system"].get("ranges", {}).items()},
+            estimated_parameters=tuple(described.get("estimated_parameters", ())),
             training=described["training"],
             versions=described["versions"],
             signals=described.get("signals"),

@@ -66,7 +66,7 @@ def noise_level(name: str, level: Any) -> float:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
     level = float(level)
     if level > _LARGEST_LEVEL:
-        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {level!r}")
+        raise ValueError(f"{name} must not be beyond {_LARGEST_LEVEL:g}, got {level!r}: take larger units")
     return level
 
 

@@ -80,6 +80,12 @@ class MLP:
         """Width of the output."""
         return int(self.weights[-1].shape[0])
 
+    def part(self, outputs: slice) -> "MLP":
+        """The same network with some of its outputs alone."""
+        *weights, last = self.weights
+        *biases, bias = self.biases
+        return MLP([*weights, last[outputs]], [*biases, bias[outputs]], self.activation)
+
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate the network.
 

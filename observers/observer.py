@@ -112,9 +112,15 @@ class KKLObserver:
 
     def _tell(self) -> None:
         """Tell the maps the levels of noise."""
+        nx = self.artifact.nx
+        self._states = self._decoders(slice(nx))
+        self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
+
+    def _decoders(self, outputs: slice) -> "_Decoders":
+        """The maps, or what of their outputs is meant, at the levels of noise."""
         levels, free = (self._measurement_noise, self._process_noise), self.artifact.free_inverse
-        self._driven = _Decoder(self.artifact.inverse, *levels)
-        self._free = None if free is None else _Decoder(free, *levels)
+        driven = _Decoder(self.artifact.inverse.part(outputs), *levels)
+        return _Decoders(driven, None if free is None else _Decoder(free.part(outputs), *levels))
 
     @property
     def z(self) -> np.ndarray:
@@ -335,7 +341,32 @@ class KKLObserver:
             z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        return self._invert(z, age * self.artifact.filter.dt)
+        return self._states(z, age * self.artifact.filter.dt)
+
+    @property
+    def parameters_hat(self) -> np.ndarray:
+        """Estimates of the system's uncertain parameters as things stand, shape (..., number).
+
+        They are those of :attr:`observers.Artifact.estimated_parameters`, in its order; the network is evaluated anew.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        ValueError
+            If the artifact estimates no parameters.
+        """
+        if self._z is None:
+            raise RuntimeError("call reset(y0) before the observer is used")
+        return self._identifier()(self._z, self._age * self.artifact.filter.dt)
+
+    def _identifier(self) -> "_Decoders":
+        if self._parameters is None:
+            raise ValueError(
+                f"this observer for {self.artifact.system!r} estimates no parameters: train one that does "
+                "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
+            )
+        return self._parameters
 
     def _filled(
         self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, *, z: np.ndarray, before: np.ndarray, age: Any
@@ -350,7 +381,7 @@ class KKLObserver:
             return y
 
         def predicted(z: np.ndarray, age: Any) -> np.ndarray:
-            h = artifact.output(self._invert(z, age * linear.dt))
+            h = artifact.output(self._states(z, age * linear.dt))
             return np.where(gaps, np.where(np.isfinite(h), h, before), y)
 
         return predicted(linear.advance(z, before, u, predicted(z, age)), age + 1)  # as it is now, corrected once
@@ -379,6 +410,34 @@ class KKLObserver:
         ValueError
             As :meth:`reset` and :meth:`step`.
         """
+        return self._along(y, u, decoders=self._states, x0=x0)
+
+    def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
+        """Estimate the system's uncertain parameters along a whole record.
+
+        Parameters
+        ----------
+        y : array_like, shape (steps, ..., ny)
+            Outputs, as for :meth:`estimate`.
+        u : array_like, shape (steps - 1, ..., nu), optional
+            Inputs, as there.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., number)
+            What :attr:`parameters_hat` would be at each sample.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact estimates no parameters.
+        """
+        return self._along(y, u, decoders=self._identifier())
+
+    def _along(
+        self, y: np.ndarray, u: np.ndarray | None, *, decoders: "_Decoders", x0: np.ndarray | None = None
+    ) -> np.ndarray:
+        """What decoders make of the filter's states along a record."""
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
@@ -392,7 +451,7 @@ class KKLObserver:
             if u.ndim < 1 or len(u) not in (steps - 1, steps):
                 raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
         linear = self.artifact.filter
-        out = np.empty((*y.shape[:-1], self.artifact.nx))
+        out = np.empty((*y.shape[:-1], decoders.outputs))
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
         z, age0 = self._start(y[0], x0)
         for first in range(0, steps, rows):
@@ -406,25 +465,8 @@ class KKLObserver:
                     z = linear.advance(z, y[k - 1], held, y[k])
                 record[i] = z
             age = (age0 + np.arange(first, first + count)) * linear.dt
-            out[first : first + count] = self._invert(record, age.reshape(count, *(1 for _ in batch)))
+            out[first : first + count] = decoders(record, age.reshape(count, *(1 for _ in batch)))
         return out
-
-    def _invert(self, z: np.ndarray, age: Any) -> np.ndarray:
-        if self._free is None:
-            return self._driven(z, age)
-        nz = len(self.artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
-        if z.ndim == 1:  # a single sample: every call of numpy would be felt
-            return self._driven(z, age) if any(z[nz:].tolist()) else self._free(z[:nz], age)
-        driven = z[..., nz:].any(-1)
-        if driven.all():
-            return self._driven(z, age)
-        if not driven.any():
-            return self._free(z[..., :nz], age)
-        age = np.broadcast_to(age, driven.shape)
-        x_hat = np.empty((*driven.shape, self.artifact.nx))
-        x_hat[driven] = self._driven(z[driven], age[driven])
-        x_hat[~driven] = self._free(z[~driven][:, :nz], age[~driven])
-        return x_hat
 
     def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
         """The filter's first state, (..., size), and how many samples old it is."""
@@ -476,11 +518,36 @@ class KKLObserver:
         return u
 
 
+class _Decoders:
+    """The map of driven motion and, where there is one, that of free motion: each is asked where it holds."""
+
+    def __init__(self, driven: "_Decoder", free: "_Decoder | None") -> None:
+        self._driven, self._free, self.outputs = driven, free, driven.outputs
+
+    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
+        if self._free is None:
+            return self._driven(z, age)
+        nz = self._free.size  # behind it lies z_u, exactly 0 until an input acts
+        if z.ndim == 1:  # a single sample: every call of numpy would be felt
+            return self._driven(z, age) if any(z[nz:].tolist()) else self._free(z[:nz], age)
+        driven = z[..., nz:].any(-1)
+        if driven.all():
+            return self._driven(z, age)
+        if not driven.any():
+            return self._free(z[..., :nz], age)
+        age = np.broadcast_to(age, driven.shape)
+        out = np.empty((*driven.shape, self.outputs))
+        out[driven] = self._driven(z[driven], age[driven])
+        out[~driven] = self._free(z[~driven][:, :nz], age[~driven])
+        return out
+
+
 class _Decoder:
     """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
     def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
         self._inverse = inverse
+        self.size, self.outputs = inverse.whiten.shape[1], inverse.mlp.outputs
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]

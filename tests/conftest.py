@@ -29,9 +29,12 @@ def random_artifact(
     free_inverse=False,
     process=False,
     outputs=1,
+    estimated=False,
 ):
     """A whole observer for a system with weights that nobody trained; of several outputs each has a level of noise."""
     system = get_system(system)
+    uncertain = system.parameters if estimated else {}
+    scale = np.array([*system.scale, *uncertain.values()])
     rng = np.random.default_rng(0)
     nz = 2 * system.nx + 1
     A = -np.diag(np.linspace(1.0, 6.0, nz))
@@ -49,13 +52,13 @@ def random_artifact(
     levels = {"process_noise_unit": 0.01, "process_noise_max": 0.2} if process else {}
     each, largest = (outputs,) * (outputs > 1), tuple(range(1, outputs + 1)) if outputs > 1 else 1.0
     inverse = InverseMap(
-        mlp=random_mlp(rng, modes + noise * outputs + process + age, system.nx),
+        mlp=random_mlp(rng, modes + noise * outputs + process + age, len(scale)),
         features=told,
         z_offset=rng.normal(size=linear.size),
         whiten=rng.normal(size=(modes, linear.size)),
         noise_gain=rng.uniform(0.1, 1.0, (*each, modes)),
-        x_offset=rng.normal(size=system.nx),
-        x_scale=np.array(system.scale),
+        x_offset=rng.normal(size=len(scale)),
+        x_scale=scale,
         measurement_noise_unit=0.1,
         measurement_noise_max=largest if noise else np.inf,
         **levels,
@@ -74,19 +77,21 @@ def random_artifact(
         if forward
         else None,
         free_inverse=InverseMap(
-            mlp=random_mlp(rng, nz + noise * outputs + process, system.nx),
+            mlp=random_mlp(rng, nz + noise * outputs + process, len(scale)),
             features=tuple(name for name in told if name not in ("z_u", "age")),
             z_offset=rng.normal(size=nz),
             whiten=rng.normal(size=(nz, nz)),
             noise_gain=rng.uniform(0.1, 1.0, (*each, nz)),
-            x_offset=rng.normal(size=system.nx),
-            x_scale=np.array(system.scale),
+            x_offset=rng.normal(size=len(scale)),
+            x_scale=scale,
             measurement_noise_unit=0.2,
             measurement_noise_max=inverse.measurement_noise_max,
             **levels,
         )
         if free_inverse
         else None,
+        parameter_ranges={name: (0.9 * value, 1.1 * value) for name, value in uncertain.items()},
+        estimated_parameters=tuple(uncertain),
         training={"preset": "none", "seed": 0},
         versions={"numpy": np.__version__},
     )

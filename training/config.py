@@ -142,6 +142,12 @@ class Config:
     closed_loop_trajectories: Annotated[int, Field(ge=0)] = 0
     """Trajectories of a controller, or the policy, that acts on the estimate, on which the inverse of an input-aware
     map is fitted a second time beside the others; 0 for no second time."""
+    uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
+    """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
+    values, as a part of these. "all" stands for each that is not named. The map still gives the state alone, whichever
+    plant it is."""
+    estimate_parameters: bool = False
+    """Whether the map gives the uncertain parameters too, so that the observer identifies the plant while it runs."""
     cpu_seconds: Positive | None = None
     """CPU seconds after which the training of all networks together ends, steps done or not."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -156,6 +162,10 @@ class Config:
         for modes in (self.eigenvalues, self.pairs):
             if len(set(modes)) < len(modes):
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
+        if self.uncertain and self.pipeline != "input-aware":
+            raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
+        if self.estimate_parameters and not self.uncertain:
+            raise ValueError("estimate_parameters needs uncertain parameters, of which there are none")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):
             raise ValueError(
                 f"policy = {self.policy!r} needs the pipeline 'input-aware' with inputs; got {self.pipeline!r}, "

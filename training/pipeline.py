@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
 from training.trajectories.expression import output_expression
+from training.trajectories.parameters import blind, relative_ranges, with_parameters
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -48,6 +49,9 @@ SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory, at the pace of the shipped systems
+
+
+Recorded = TypeVar("Recorded", bound=Trajectories)
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def train(
     2. Free inverse (input-aware maps of a system with inputs, unless turned off or under a policy): trajectories
        without input are simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
     3. The training trajectories are simulated with the filter beside them; those of input-aware maps have process noise
-       and inputs, random ones or a policy's.
+       and inputs, random ones or a policy's. In all stages each trajectory has its own values of uncertain parameters.
     4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
        the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
        added to z.
@@ -120,7 +124,8 @@ def train(
     ------
     ValueError
         If there are checkpoints, but not ``resume`` or not of this configuration, if another process is at work in the
-        folder, or if the system's trajectories leave its bounds, or the policy is none.
+        folder, or if the system's trajectories leave its bounds, the policy is none, or a parameter that is to be
+        uncertain is none of the system's.
     FloatingPointError
         If the loss stops being a number.
     """
@@ -130,12 +135,13 @@ def train(
     # Errors now, not in ten minutes.
     if config.pipeline == "spinn":
         check_continuous(system)
+    ranges = relative_ranges(system, config.uncertain)
     policy = None if config.policy is None else named_policy(system, config.policy)
     feedback = (policy or named_policy(system, "controller")) if config.closed_loop_trajectories else None
     if policy:
         identity["policy_actions"] = policy_fingerprint(policy, system)
     with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
-        run = _Run(system, config, folder, resume, device, progress, log, identity)
+        run = _Run(system, config, folder, resume, device, progress, log, identity, ranges)
         free = run.learn_free_inverse() if "free" in run.shares else None
         trajectories = run.simulate(run.linear, system.name, Motions(kinds=DRIVEN if free else KINDS, policy=policy))
         forward: ForwardMap | None = None
@@ -168,6 +174,7 @@ class _Run:
     progress: ProgressBars
     log: Log | None
     identity: dict[str, Any]
+    ranges: dict[str, tuple[float, float]]  # of uncertain parameters
     losses: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     samples: dict[str, int] = field(default_factory=dict)  # distinct ones, for certificates
@@ -175,6 +182,8 @@ class _Run:
     def __post_init__(self) -> None:
         system, config = self.system, self.config
         noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
+        self.plant = with_parameters(system, self.ranges)
+        self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.started = time.monotonic()
         self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
         torch.manual_seed(config.seed)
@@ -195,14 +204,23 @@ class _Run:
     def simulate(self, linear: LinearFilter, what: str, motions: Motions) -> Trajectories:
         """Training trajectories with a filter beside them."""
         config, report = self.config, self.progress.bar(f"simulating {what}", self.config.trajectories)
+        policy = motions.policy
         motions = dataclasses.replace(
-            motions, process_noise_share=self.process_noise_share, box_factor=config.box_factor
+            motions,
+            process_noise_share=self.process_noise_share,
+            box_factor=config.box_factor,
+            policy=policy and blind(policy, self.system.nx),
         )
         n, steps = config.trajectories, self.steps
         with self.timed("simulating"):
-            return record(
-                self.system, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
+            found = record(
+                self.plant, linear, n=n, steps=steps, ages=self.ages, rng=self.rng, motions=motions, report=report
             )
+        return self.known(found)
+
+    def known(self, trajectories: Recorded) -> Recorded:
+        """Trajectories without the parameters that are not to be estimated."""
+        return dataclasses.replace(trajectories, x=trajectories.x[..., : self.system.nx + len(self.estimated)])
 
     def along(
         self, trajectories: Trajectories, linear: LinearFilter, error: np.ndarray | None = None
@@ -221,6 +239,7 @@ class _Run:
                 high_noise_emphasis=config.high_noise_emphasis,
                 process_noise_max=self.system.process_noise if self.process_noise_share else 0.0,
                 error=error,
+                parameters=len(self.estimated),
                 scaling=config.scaling,
             )
 
@@ -286,9 +305,10 @@ class _Run:
         """A network that gives x on the sampler's batches."""
         config = self.config
         inputs = sampler(torch.Generator(self.device).manual_seed(0))[0].shape[1]
-        network = Network(
-            inputs, self.system.nx, width=config.width, depth=config.depth, activation=config.activation
-        ).to(self.device)
+        outputs = self.system.nx + len(self.estimated)
+        network = Network(inputs, outputs, width=config.width, depth=config.depth, activation=config.activation).to(
+            self.device
+        )
         self.fit(stage, network, sampler)
         return network
 
@@ -302,7 +322,7 @@ class _Run:
         config = self.config
         steps = min(self.steps, round(CLOSED_LOOP_SECONDS * self.system.pace / config.dt))
         driven = record_closed_loop(
-            self.system,
+            self.plant,
             artifact,
             feedback,
             n=config.closed_loop_trajectories,
@@ -314,7 +334,7 @@ class _Run:
             process_noise_share=config.process_noise_share,
             report=self.progress.bar("closing the loop", config.closed_loop_trajectories),
         )
-        return ClosedLoopSampler(sampler, driven, dt=config.dt, device=self.device)
+        return ClosedLoopSampler(sampler, self.known(driven), dt=config.dt, device=self.device)
 
     def minimise(self, name: str, problem: Any, steps: int) -> None:
         """Train a stage's network within its share of the CPU time."""
@@ -353,6 +373,8 @@ class _Run:
             h=self.output_expression() if C is None else None,
             free_inverse=free,
             measurement_noise=self.system.measurement_noise,
+            parameter_ranges=self.ranges,
+            estimated_parameters=self.estimated,
             training={
                 **dataclasses.asdict(self.config),
                 **self.samples,

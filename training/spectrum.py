@@ -84,8 +84,8 @@ def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
 
 
 def papers_spectrum(system: System) -> tuple[float, ...]:
-    """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8)."""
-    return tuple(np.linspace(-1.5, -3.0, 2 * system.nx + 1).tolist())
+    """2 nx + 1 eigenvalues in [-3, -1.5] (paper, sec. 8), in one over the seconds of the system's pace."""
+    return tuple((np.linspace(-1.5, -3.0, 2 * system.nx + 1) / system.pace).tolist())
 
 
 def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "mag") -> Spectrum:

@@ -248,12 +248,15 @@ class KKLEstimator:
         Returns
         -------
         dict of str to ndarray
-            ``z``, and ``x_hat`` if it is shown: with ``estimate="z"`` the network is not evaluated. ``score`` with a
+            ``z``, and ``x_hat`` if it is shown, with ``parameters_hat`` beside it if the map estimates parameters: with
+            ``estimate="z"`` the network is not evaluated. ``score`` with a
             monitor, which evaluates the network in any case.
         """
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
+            if self.observer.artifact.estimated_parameters:
+                found["parameters_hat"] = self.observer.parameters_hat[... if rows is None else rows]
         if self._monitor:
             found["score"] = self.observer.score if rows is None else self.observer.score[rows]
         return found

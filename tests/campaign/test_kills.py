@@ -267,7 +267,10 @@ class Campaign:
             self.counts["lost"] += lost
             self.counts["lost more than one interval"] += lost > self.scenario.interval
             kept = now
-        self.counts["ended otherwise"] += self.scenario.result(out) != self.expected
+        for got, wanted in zip(self.scenario.result(out), self.expected, strict=True):
+            if got != wanted:
+                self.counts["ended otherwise"] += 1
+                self.problems.append(f"{out}: {str(got)[:500]} in place of {str(wanted)[:500]}")
         return done
 
 

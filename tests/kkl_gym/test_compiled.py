@@ -170,13 +170,16 @@ def test_numpy_where_equations_cannot_be_compiled(caplog):
 
 
 @compiles
-def test_equations_that_mean_something_else_to_symbols():
+@pytest.mark.parametrize(("unit", "second"), [(1.0, 1.0), (1e-12, 1.0), (1.0, 1e-9)])
+def test_equations_that_mean_something_else_to_symbols(unit, second):
     class Comparing(Unicycle):
         name = "comparing"
+        X = ((-unit, unit),) * 3
+        bounds = ((-9 * unit, 9 * unit),) * 3
 
         def f(self, x):
             still = x[0] == 1.0 * x[0]  # true for numbers; sympy compares how it is written
-            return (0.0 if np.all(still) else 1.0) + x[1], x[0], x[2]
+            return ((0.0 if np.all(still) else unit) + x[1]) / second, x[0] / second, x[2] / second
 
     with pytest.raises(ValueError, match="symbols"):
         compiled_step(Comparing())

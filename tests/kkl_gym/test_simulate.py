@@ -174,6 +174,15 @@ def test_energy_is_conserved():
     assert np.allclose(energy, energy[0], rtol=1e-7)
 
 
+def test_reverse_duffing_runs_as_fast_as_its_parameters_say():
+    x0 = np.random.default_rng(4).uniform(*ReverseDuffing().box(), (20, 2))
+    quick = simulate(ReverseDuffing(a=2, b=2), x0, 200, DT)
+    np.testing.assert_allclose(quick, simulate(ReverseDuffing(), x0, 400, DT)[::2], atol=1e-7)
+    # x1 alone does not tell a and b apart: with x2 in other units, a b^3 stays and so does the motion.
+    other = simulate(ReverseDuffing(a=8, b=0.5), x0 * [1.0, 0.5], 200, DT)
+    np.testing.assert_allclose(other * [1.0, 2.0], simulate(ReverseDuffing(), x0, 200, DT), atol=1e-7)
+
+
 def one_by_one(system, x0, u, w, dt):
     out = [x0]
     for uk, wk in zip(u.tolist(), w.tolist(), strict=True):

@@ -12,6 +12,8 @@ from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol,
 everyone = pytest.mark.parametrize("name", SYSTEMS)
 VARIANTS = {
     "duffing": ReverseDuffing(),
+    "duffing-fast": ReverseDuffing(a=4, b=9),
+    "duffing-negative": ReverseDuffing(a=-2, b=0.5),
     "vdp": VanDerPol(),
     "vdp-stiff": VanDerPol(mu=20),
     "rossler": Rossler(),
@@ -94,6 +96,7 @@ def test_sizes_fit(name):
 
 def test_equations_are_the_published_ones():
     assert ReverseDuffing().f((2.0, 3.0)) == (27.0, -2.0)
+    assert ReverseDuffing(a=2, b=5).f((2.0, 3.0)) == (54.0, -10.0)
     assert VanDerPol().f((2.0, 3.0)) == (3.0, -29.0)
     assert Rossler(a=1, b=2, c=3).f((4.0, 5.0, 6.0)) == (-11.0, 9.0, 8.0)
     assert Lorenz(sigma=2, rho=3, beta=4).f((5.0, 6.0, 7.0)) == (2.0, -26.0, 2.0)
@@ -183,8 +186,9 @@ def jacobian_at(system, point):
 
 def test_reverse_duffing_conserves_its_energy():
     sympy = pytest.importorskip("sympy")
-    x, f, _, _ = symbolic(ReverseDuffing())
-    energy = x[1] ** 4 / 4 + x[0] ** 2 / 2
+    a, b = 2.0, 0.5
+    x, f, _, _ = symbolic(ReverseDuffing(a, b))
+    energy = a * x[1] ** 4 / 4 + b * x[0] ** 2 / 2
     assert sympy.simplify(sum(sympy.diff(energy, xi) * fi for xi, fi in zip(x, f, strict=True))) == 0
 
 
@@ -205,8 +209,18 @@ def test_bad_parameters_are_named(parameters, match):
 
 
 def test_system_without_parameters_says_so():
-    with pytest.raises(ValueError, match="reverse_duffing has no parameter 'mu'; it has none"):
-        get_system("reverse_duffing", {"mu": 1.0})
+    class Bare(System):
+        name = "bare"
+        X, bounds = ((-1, 1),), ((-2, 2),)
+
+        def f(self, x):
+            return (-x[0],)
+
+        def h(self, x):
+            return (x[0],)
+
+    with pytest.raises(ValueError, match="bare has no parameter 'mu'; it has none"):
+        get_system(Bare, {"mu": 1.0})
 
 
 def test_systems_are_frozen_values():

@@ -26,6 +26,7 @@ KINDS = [
     {"free_inverse": True, "noise": False},
     {"outputs": 2},
     {"outputs": 3, "process": True, "free_inverse": True},
+    {"estimated": True, "process": True, "free_inverse": True},
 ]
 
 
@@ -60,6 +61,8 @@ def test_round_trip(system, options, make_artifact, tmp_path):
     again = Artifact.read(path)
     assert (again.system, again.parameters) == (system, get_system(system).parameters)
     assert (again.nx, again.ny, again.nu) == (artifact.nx, artifact.ny, artifact.nu)
+    assert again.parameter_ranges == artifact.parameter_ranges
+    assert again.estimated_parameters == artifact.estimated_parameters
     assert (again.training, again.versions) == (artifact.training, artifact.versions)
     assert again.filter.dt == artifact.filter.dt
     for part in ("transition", "early_y", "late_y", "held_u", "equilibrium"):
@@ -90,9 +93,25 @@ def test_saving_twice_gives_the_same_bytes(file, make_artifact, tmp_path):
 
 @pytest.mark.parametrize("name", sorted(set(shipped().values())))
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
-    """The formats are what they were: every array, key and digit."""
-    Artifact.read(resolve(name)).save(tmp_path / "again.safetensors")
+    """The formats are what they were: every array, key and digit; but reverse Duffing had no parameters then."""
+    artifact = Artifact.read(resolve(name))
+    if artifact.system == "reverse_duffing":
+        assert artifact.parameters == {"a": 1.0, "b": 1.0}
+        artifact = dataclasses.replace(artifact, parameters={})
+    artifact.save(tmp_path / "again.safetensors")
     assert (tmp_path / "again.safetensors").read_bytes() == resolve(name).read_bytes()
+
+
+def test_files_from_before_reverse_duffing_had_parameters(make_artifact, tmp_path):
+    path = tmp_path / "old.safetensors"
+    dataclasses.replace(make_artifact("reverse_duffing"), parameters={}).save(path)
+    assert contents(path)[1]["system"]["parameters"] == {}
+    old, its = Artifact.read(path), {"dt": 0.01, "ny": 1, "nu": 1}
+    old.check("reverse_duffing", get_system("reverse_duffing").parameters, **its)
+    with pytest.raises(ArtifactError, match=r"made for the parameter b = 1\.0, but the environment has 1\.1"):
+        old.check("reverse_duffing", {"a": 1.0, "b": 1.1}, **its)
+    dataclasses.replace(make_artifact("lorenz"), parameters={}).save(path)
+    assert Artifact.read(path).parameters == {}
 
 
 def test_forward_map(make_artifact):
@@ -359,7 +378,7 @@ def test_maps_of_free_and_driven_motion_are_told_the_same(make_artifact):
         dataclasses.replace(artifact, free_inverse=dataclasses.replace(artifact.free_inverse, process_noise_max=0.3))
 
 
-@pytest.mark.parametrize("number", [0, 4, "1", None])
+@pytest.mark.parametrize("number", [0, 5, "1", None])
 def test_other_formats(file, number):
     rewrite(file, lambda tensors, meta: meta.update(format=number))
     with raises_naming(file) as raised:
@@ -506,6 +525,14 @@ def test_check_names_both_values(changed, match, make_artifact):
     make_artifact(inputs=False).check(**here)
     with pytest.raises(ArtifactError, match=match):
         make_artifact().check(**{**here, **changed})
+
+
+def test_check_tells_small_parameters_apart(make_artifact):
+    artifact = dataclasses.replace(make_artifact(), parameters={"C": 1e-12, "offset": 0.0})
+    here = {"system": "van_der_pol", "dt": 0.01, "ny": 1, "nu": 1}
+    artifact.check(parameters={"C": 1e-12 * (1 + 1e-10), "offset": 0.0}, **here)
+    with pytest.raises(ArtifactError, match=r"C = 1e-12, but the environment has 1\.5e-12"):
+        artifact.check(parameters={"C": 1.5e-12, "offset": 0.0}, **here)
 
 
 def test_a_map_of_free_motion_must_fit_the_one_of_driven_motion(make_artifact):

@@ -49,3 +49,9 @@ def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
         measurement_noise = (0.0, 0.3)
 
     assert preset(Exact(), "input-aware", "fast").measurement_noise_max == pytest.approx((0.2, 0.6), rel=0.01)
+
+
+@pytest.mark.parametrize("pipeline", ["input-aware", "spinn"])
+def test_what_is_wrong_with_a_setting_is_told_by_its_name(pipeline):
+    with pytest.raises(ValueError, match=r"eigenvalues\.1"):
+        preset(Oscillator(), pipeline, "fast", changes={"eigenvalues": (-1.0, 2.0)})

@@ -193,7 +193,7 @@ def _train(job: Job, method: Method[Any], configuration: Configuration, budget: 
     if not (path.exists() and timing.exists()):
         folder = job.folder / name
         folder.mkdir(parents=True, exist_ok=True)
-        task = Task(get_system(job.system), budget, folder, job.seed, torch.device(job.device))
+        task = Task(method.believed(get_system(job.system)), budget, folder, job.seed, torch.device(job.device))
         try:
             trained = method.train(task, configuration)
         except FloatingPointError:

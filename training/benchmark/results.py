@@ -2,16 +2,20 @@
 
 import json
 from collections.abc import Iterable, Mapping
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from kkl_gym.systems import SYSTEMS
 from observers.storage import explained, write
 from training.benchmark.tables import draw, write_table
+from training.evaluation.levels import read_level, show_level
 from training.methods import ABLATION, METHODS
 
+FILES = ("results.csv", "methods.csv")  # a row for each trajectory, and for each method on each system
 NAMED = 4  # of the methods that are missing, by their names
 
 
@@ -25,31 +29,25 @@ def _full_set(found: Iterable[str]) -> list[str]:
     return list(METHODS)
 
 
-def collect(out: Path) -> None:
+def collect(out: Path, beside: Path | None = None) -> None:
     """Write one CSV file of all errors and one of all costs, from every job found in the folder.
 
     Parameters
     ----------
     out : Path
         Folder of the benchmark.
+    beside : Path, optional
+        Folder with the two CSV files of an earlier run, whose rows of other observers are taken over as they are.
 
     Raises
     ------
     ValueError
-        If they are not all of one benchmark, or a file is damaged.
+        If they are not all of one benchmark, or a file is damaged or missing.
     """
     errors, costs = [], []
     rules: dict[str, Any] = {}
 
-    systems, methods = list(SYSTEMS), _full_set(path.name for path in (out / "jobs").glob("*/*"))  # then the user's
-
-    def position(folder: Path) -> tuple[int, str, int, str]:
-        system, method = folder.parent.name, folder.name
-        first = systems.index(system) if system in systems else len(systems)
-        second = methods.index(method) if method in methods else len(methods)
-        return first, system, second, method
-
-    for folder in sorted((path.parent for path in (out / "jobs").glob("*/*/errors.csv")), key=position):
+    for folder in sorted(path.parent for path in (out / "jobs").glob("*/*/errors.csv")):
         with explained(folder, ValueError):
             errors.append(pd.read_csv(folder / "errors.csv"))
             info, job = (json.loads((folder / file).read_text()) for file in ("info.json", "job.json"))
@@ -77,8 +75,47 @@ def collect(out: Path) -> None:
                     f"{out} holds jobs of several benchmarks: {rule} = {value} in {folder}, "
                     f"{rules[rule]} elsewhere; remove the ones that do not belong there"
                 )
-    write(out / "results.csv", pd.concat(errors).to_csv(index=False, float_format="%.4g"))
-    write(out / "methods.csv", pd.DataFrame(costs).to_csv(index=False, float_format="%.4g"))
+    for name, found in zip(FILES, (pd.concat(errors), pd.DataFrame(costs))):
+        rows = _as_written(StringIO(found.to_csv(index=False, float_format="%.4g")))
+        if beside is not None:
+            with explained(beside / name, ValueError):
+                rows = _joined(rows, _as_written(beside / name))
+        write(out / name, _in_order(rows).to_csv(index=False))
+
+
+def _as_written(source: Path | StringIO) -> pd.DataFrame:
+    """A CSV file, every digit as it is there."""
+    return pd.read_csv(source, dtype=str, keep_default_na=False)
+
+
+def _joined(rows: pd.DataFrame, earlier: pd.DataFrame) -> pd.DataFrame:
+    """Rows of jobs, in the columns that the earlier ones have, and those of other observers as they are."""
+    here, there = (_conditions(frame, set(rows.system) & set(earlier.system)) for frame in (rows, earlier))
+    if here != there:
+        raise ValueError(
+            f"it is of another benchmark: {'; '.join(sorted(there))} there, {'; '.join(sorted(here))} here"
+        )
+    observers = set(zip(rows.system, rows.method))
+    others = [observer not in observers for observer in zip(earlier.system, earlier.method)]
+    return pd.concat([rows.reindex(columns=earlier.columns, fill_value=""), earlier[others]])
+
+
+def _conditions(frame: pd.DataFrame, systems: set[str]) -> set[str]:
+    """What rows of one benchmark have in common."""
+    if "budget" in frame:
+        return {f"budget {budget}, seed {seed}" for budget, seed in zip(frame.budget, frame.seed)}
+    cases = frame[frame.system.isin(systems)][["system", "starts", "noise"]].drop_duplicates()
+    return {f"{system} in {starts} at {show_level(read_level(noise))}" for system, starts, noise in cases.to_numpy()}
+
+
+def _in_order(rows: pd.DataFrame) -> pd.DataFrame:
+    """First what ships, in its order, then the user's systems and methods; rows of an observer stay as they are."""
+    places = [
+        {name: place for place, name in enumerate(dict.fromkeys([*shipped, *sorted(set(column))]))}
+        for shipped, column in ((SYSTEMS, rows.system), (_full_set(rows.method), rows.method))
+    ]
+    keys = [[place[name] for name in column] for place, column in zip(places, (rows.system, rows.method))]
+    return rows.iloc[np.lexsort(keys[::-1])]
 
 
 def _rules(job: Mapping[str, Any], system: str) -> dict[str, Any]:
@@ -92,6 +129,13 @@ def _rules(job: Mapping[str, Any], system: str) -> dict[str, Any]:
         rules[f"measurement_noise{own}"] = described.pop("measurement_noise")
         rules[name] = described | {"duration": f"{described['duration'] / dt:.0f} samples"}
     return rules | {name: job[name] for name in ("search", "seed", "version")}
+
+
+def check_results(folder: Path) -> None:
+    """Raise a ValueError unless a folder has the two CSV files."""
+    for name in FILES:
+        if not (folder / name).exists():
+            raise ValueError(f"{folder / name} does not exist; run the benchmark first")
 
 
 def report(out: Path) -> str:
@@ -112,10 +156,8 @@ def report(out: Path) -> str:
     ValueError
         If there are no CSV files.
     """
-    for name in ("results.csv", "methods.csv"):
-        if not (out / name).exists():
-            raise ValueError(f"{out / name} does not exist; run the benchmark first")
-    results, methods = pd.read_csv(out / "results.csv"), pd.read_csv(out / "methods.csv")
+    check_results(out)
+    results, methods = (pd.read_csv(out / name) for name in FILES)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
     partial, missing = _missing(methods)
     write_table(out / "table.md", results, methods, note=note + partial + missing)

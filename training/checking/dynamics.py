@@ -21,6 +21,7 @@ MANY = 0.5  # share of motions from X that leave the bounds
 FEW = 0.1  # share of motions that run away where wider bounds help
 WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
 ROOM = 1.1  # of bounds around those motions
+HELD = 1.0  # rate * dt from which on a regulator of continuous time may fail, since its actions are held
 COARSE, JERKY = 1.0, 0.5  # changes of y from sample to sample, in its standard deviations along a motion
 SMOOTH = 0.1  # that change with a good sampling interval
 IDLE = 1e-4  # that change where hardly any sample tells something new
@@ -188,7 +189,7 @@ def _way_out(subject: Subject, x: np.ndarray, *, unstable: bool) -> str:
     """What to change so that motions stay that have been followed in wider bounds, (steps + 1, n, nx)."""
     system = subject.system
     if subject.policy:
-        return "let the policy hold the system from all of X, widen the bounds, or shrink X"
+        return "let the policy hold the system from all of X, widen the bounds, shrink X, or take a smaller dt"
     held = np.isfinite(x[-1]).all(-1)
     if held.mean() >= 1 - FEW:
         reached = np.array([x[:, held].min((0, 1)), x[:, held].max((0, 1))]).T
@@ -217,7 +218,10 @@ def _policy(subject: Subject) -> str:
         stays = motions.stays[motions.rows("X")]
         if stays.mean() > MANY:
             return f"train with --policy controller, under which {stays.sum()} of {len(stays)} stay"
-    return "train under a policy of yours that holds the system: --policy script.py:function"
+    found = "train under a policy of yours that holds the system: --policy script.py:function"
+    if subject.system.discrete or subject.rate * subject.dt < HELD:
+        return found
+    return f"{found}, or take a smaller dt, at which the controller may do"
 
 
 def _wider(system: System) -> System:

@@ -36,8 +36,9 @@ class Benchmark:
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
-    """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, ekf, ukf, ekf-wrong, ekf-untuned; or classes of yours
-    as script.py:Class or module:Class."""
+    """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, ekf, ukf, ekf-wrong, default-wrong, spinn-wrong,
+    ekf-untuned; or classes of yours as script.py:Class or module:Class. Those that end in -wrong believe in parameters
+    10 % too large; a system must have some."""
     measurement_noise: NoiseLevels = None
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
@@ -46,6 +47,9 @@ class Benchmark:
     """Worker processes, of one thread each."""
     seed: int = 0
     """Seed of the test trajectories; training's is always 0."""
+    beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
+    """Folder with results.csv and methods.csv of the same benchmark, such as docs/results/benchmark: the rows of its
+    other observers are taken over, so that new ones stand beside them without training those again."""
     report: bool = False
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
@@ -68,11 +72,13 @@ class Benchmark:
             If an option makes no sense, the folder holds another benchmark, or jobs failed.
         """
         from training.benchmark.jobs import run_job, time_steps  # torch takes seconds to import
-        from training.benchmark.results import collect, report
+        from training.benchmark.results import check_results, collect, report
         from training.jobs import run_all
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
+        if self.beside is not None:
+            check_results(self.beside)
         with progress_bars(console, out / LOG) as progress:
             failures = []
             if not self.report:
@@ -95,7 +101,7 @@ class Benchmark:
                     except Exception as error:  # as in a job: whatever a method does wrong, the others go on
                         failures.append(f"{job.name}, timing: {error}")
                 if trained:
-                    collect(out)
+                    collect(out, self.beside)
             if self.report or trained:
                 with progress.phase("drawing the table and the figure"):
                     note = report(out)
@@ -111,7 +117,7 @@ class Benchmark:
         from training.benchmark.jobs import Job
         from training.benchmark.sizes import BUDGETS, PROTOCOL, QUICK_PROTOCOL, SEARCH, VALIDATION, paced_budget
         from training.benchmark.sizes import paced_protocol as paced
-        from training.methods import METHODS, get_method
+        from training.methods import METHODS, WrongParameters, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
         if self.jobs < 1 or not self.systems or not methods or levels == ():
@@ -131,10 +137,14 @@ class Benchmark:
             noise = tuple(noise_levels("measurement_noise", level, system.ny) for level in levels or ())
             noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
             for method in methods:
+                found = get_method(method)
+                if self.methods is None and isinstance(found, WrongParameters) and not system.parameters:
+                    continue
+                found.believed(system)  # refuses some systems, now rather than when its turn comes
                 job = Job(
                     system=given,
                     method=method,
-                    folder=out / "jobs" / system.name / get_method(method).name,
+                    folder=out / "jobs" / system.name / found.name,
                     budget=paced_budget(budget, system),
                     protocol=replace(paced(protocol, system), measurement_noise=noise),
                     search=search,

@@ -19,6 +19,7 @@ from training.commands.options import (
     Observers,
     OwnPolicy,
     OwnSystem,
+    RepeatedParameters,
     Seconds,
     read_observers,
     read_policy,
@@ -34,6 +35,7 @@ from training.evaluation.errors import (
 )
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
+from training.evaluation.plants import off_by, show_parameters
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.controllers import Controller
 
@@ -59,6 +61,10 @@ class Evaluate:
     there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
     Under a policy, those are driven in which it errs about the state and explores; in the others its inputs tell the
     state to an observer that has learned the policy.
+
+    The trajectories are those of the system that the observer was made for, or of a plant with other parameters, by
+    --plant or --plant-error. Observer and Kalman filter know nothing of that, and keep their own. Starts, policy,
+    inputs and levels of noise are as without.
     """
 
     observers: Observers
@@ -69,6 +75,10 @@ class Evaluate:
     """Standard deviations of the noise on each sample of y, a table row for each. 0.1,0.3 is one for each output."""
     process_noise: float = 0.0
     """Level of the process noise, in multiples of the system's scale per second; the environments' default is 0.05."""
+    plant: Annotated[RepeatedParameters, tyro.conf.arg(help_behavior_hint="(default: the observer's own)")] = ()
+    """A parameter of the plant that moves, such as mu=3.3; may be given several times."""
+    plant_error: Annotated[float | None, tyro.conf.arg(metavar="SHARE", help_behavior_hint="(default: none)")] = None
+    """In place of --plant: by what share every parameter of the plant is larger than the observer's; 0.1 is 10 %."""
     trajectories: int = 100
     """Number of trajectories from each domain."""
     duration: Seconds = None
@@ -76,7 +86,8 @@ class Evaluate:
     seed: int = 0
     """Seed of the trajectories and the noise; no seed gives any that training draws."""
     ekf: bool = False
-    """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise."""
+    """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
+    On another plant it knows those of the observer's model."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
@@ -105,9 +116,10 @@ class Evaluate:
         if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
             raise ValueError(f"csv = {self.csv} is a folder: name a file")
         frames: list[pd.DataFrame] = []
+        observers = [(*found, self._plant(found[-1])) for found in read_observers(self.observers, self.system)]
         with progress_bars(console) as progress:
-            for name, artifact, system in read_observers(self.observers, self.system):
-                frames += self._evaluate(name, artifact, system, progress)
+            for name, artifact, system, plant in observers:
+                frames += self._evaluate(name, artifact, system, plant, progress)
         if not frames:
             raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
@@ -116,12 +128,26 @@ class Evaluate:
             console.print(f"wrote {self.csv}")
         return found
 
-    def _evaluate(self, name: str, artifact: Artifact, system: System, progress: ProgressBars) -> list["pd.DataFrame"]:
+    def _plant(self, system: System) -> System | None:
+        """What moves, where it is not the system; ValueError if the options make no sense."""
+        changes = dict(self.plant)
+        if self.plant and self.plant_error is not None:
+            raise ValueError("give --plant or --plant-error, not both")
+        if len(changes) < len(self.plant):
+            raise ValueError(f"--plant names a parameter twice: {', '.join(name for name, _ in self.plant)}")
+        if self.plant_error is not None:
+            return off_by(system, self.plant_error)
+        return system.replace(changes) if changes else None
+
+    def _evaluate(
+        self, name: str, artifact: Artifact, system: System, plant: System | None, progress: ProgressBars
+    ) -> list["pd.DataFrame"]:
         """Print an observer's tables, and what is left out of them; rows of the CSV file."""
         duration = system.duration if self.duration is None else self.duration
+        on = f", plant {show_parameters(plant)}, model {show_parameters(system)}" if plant else ""
         runs = f"{self.trajectories} runs of {duration:g} s"
-        smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}", artifact)
-        nrmse = self._table(f"{name}: NRMSE in % after transient, median", artifact)
+        smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}{on}", artifact)
+        nrmse = self._table(f"{name}: NRMSE in % after transient, median{on}", artifact)
         for table, measures in ((smape, ("all steps", "after transient", "escaped")), (nrmse, system.state_names)):
             for measure in measures:
                 table.add_column(measure, justify="right")
@@ -129,13 +155,17 @@ class Evaluate:
         shown = Path(name).stem if self.ekf else name
         everyone: dict[str, Callable[..., Errors]] = {shown: partial(errors, artifact, system)}
         if self.ekf:
-            everyone["exact EKF"] = lambda runs, **how: kalman_errors(system, runs, artifact.filter.dt, **how)
+            everyone["EKF, same model" if plant else "exact EKF"] = lambda runs, **how: kalman_errors(
+                system, runs, artifact.filter.dt, **how
+            )
         policy = read_policy(artifact, system, self.policy)
         levels, left_out = self._levels(artifact, system)
         cases = CASES[: 3 if artifact.nu else 2] if levels else ()
         bar = progress.add_task(f"evaluating {name}", total=len(cases) * (1 + len(levels)))
         for starts, domain, driven in cases:
-            trajectories = self._trajectories(artifact, system, domain, duration=duration, driven=driven, policy=policy)
+            trajectories = self._trajectories(
+                artifact, system, domain, duration=duration, driven=driven, policy=policy, plant=plant
+            )
             if isinstance(trajectories, str):
                 progress.advance(bar, 1 + len(levels))
                 left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
@@ -149,7 +179,8 @@ class Evaluate:
                     case += [*([f"{self.process_noise:g}"] if self.process_noise else []), show_level(level)]
                     smape.add_row(*case, spread(found.full), spread(found.late), str(found.escaped))
                     nrmse.add_row(*case, *map(percent, np.median(found.nrmse, axis=0)))
-                    frames.append(self._rows(found, {"observer": who, "starts": starts, "driven": driven}, level))
+                    of = {"observer": who, **({"plant": show_parameters(plant)} if plant else {})}
+                    frames.append(self._rows(found, {**of, "starts": starts, "driven": driven}, level))
                 progress.advance(bar)
         if frames:
             progress.console.print(smape, nrmse)
@@ -181,6 +212,7 @@ class Evaluate:
         duration: float,
         driven: bool,
         policy: Controller | None,
+        plant: System | None,
     ) -> UnseenTrajectories | str:
         """Test trajectories, or why there are none."""
         try:
@@ -194,6 +226,7 @@ class Evaluate:
                 driven=driven,
                 process_noise=self.process_noise,
                 policy=policy,
+                plant=plant,
             )
         except NoStartsError as error:
             return str(error)

@@ -15,6 +15,7 @@ from observers.artifact import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
+from training.trajectories.parameters import EVERY
 
 SystemName = Annotated[
     tyro.conf.Positional[str],
@@ -42,6 +43,36 @@ Parameters = Annotated[
         help="Physical parameters that differ from the system's defaults, as in: --parameters rho 30.",
         help_behavior_hint="(default: none)",
     ),
+]
+OneParameter = Annotated[
+    tuple[str, float],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME=VALUE",
+        instance_from_str=lambda words: read_parameter(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda parameter: ["{}={:g}".format(*parameter)],
+    ),
+]
+# Each by an option of its own, which is given several times: words after one might as well be observers.
+RepeatedParameters = Annotated[tuple[OneParameter, ...], tyro.conf.UseAppendAction]
+# Each by an option of its own, which is given several times.
+HalfWidths = Annotated[
+    tuple[
+        Annotated[
+            tuple[str, float],
+            PrimitiveConstructorSpec(
+                nargs=1,
+                metavar="NAME=SHARE",
+                instance_from_str=lambda words: read_half_width(words[0]),
+                is_instance=lambda value: True,
+                str_from_instance=lambda found: ["{}={:g}".format(*found)],
+            ),
+        ],
+        ...,
+    ],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help_behavior_hint="(default: none)"),
 ]
 Observers = Annotated[
     tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[MAP [MAP ...]]", help_behavior_hint="")
@@ -87,6 +118,47 @@ OwnPolicy = Annotated[
         help_behavior_hint="",
     ),
 ]
+
+
+def read_parameter(text: str) -> tuple[str, float]:
+    """Read a parameter, written as ``mu=3.3``.
+def read_half_width(text: str) -> tuple[str, float]:
+    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the parameter; nobody has looked for it.
+    value : float
+        Its value.
+        Of the parameter, or "all".
+    share : float
+        How far it may be from its value, as a part of that.
+
+    Raises
+    ------
+    ValueError
+        If it is not a name and a number with an equals sign between them.
+    """
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise ValueError(f"{text!r} is no parameter with its value: write NAME=VALUE, as in mu=3.3") from None
+        If it is neither.
+    """
+    name, _, share = text.rpartition("=")
+    try:
+        return name.strip() or EVERY, float(share)
+    except ValueError:
+        raise ValueError(
+            f"{text!r} does not say how uncertain a parameter is: write NAME=SHARE, as in mu=0.1, or a number for all"
+        ) from None
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:

@@ -12,6 +12,7 @@ from training.config import Config, Pipeline, setting_types
 from training.presets import Preset, preset
 
 SHOWN = 3  # numbers of a setting that has many
+ELSEWHERE = ("pipeline", "uncertain")  # options of their own
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ def _of_presets(fast: str, paper: str) -> str:
 def _text(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if value is None or value == ():
+    if value is None or value in ((), {}):
         return "none"
     if isinstance(value, tuple):
         return f"{len(value)} of them" if len(value) > SHOWN else " ".join(map(_text, value))
@@ -84,7 +85,7 @@ def _options() -> Any:
     presets = defaults()
     options = {}
     for name, kind in setting_types().items():
-        if name == "pipeline":
+        if name in ELSEWHERE:
             continue
         argument = tyro.conf.arg(
             help=" ".join((described[name].description or "").split()),

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.commands.options import Parameters, SystemName
+from training.commands.options import HalfWidths, Parameters, SystemName
 from training.commands.settings import Settings
 from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
@@ -20,6 +20,7 @@ from training.progress import LOG, ProgressBars, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
+from training.trajectories.parameters import relative_ranges
 
 if TYPE_CHECKING:
     from training.dry_run import Estimate
@@ -46,6 +47,9 @@ class Train:
     closed_loop: bool = False
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
+    uncertain: HalfWidths = ()
+    """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all. Each
+    trajectory of the training then has its own (input-aware), and the observer serves every such plant."""
     monitor: bool = True
     """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
     takes no symbols."""
@@ -124,6 +128,11 @@ class Train:
         changes = (read_changes(self.config) if self.config else {}) | self.settings
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
+        if self.uncertain:
+            named = [name for name, _ in self.uncertain]
+            if len({*named}) < len(named):
+                raise ValueError(f"--uncertain names a parameter twice: {', '.join(named)}")
+            changes["uncertain"] = dict(self.uncertain)
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         return changes
@@ -182,11 +191,15 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
     sizes = [f"{count} {what}{'' if count == 1 else 's'}" for what, count in counts.items()]
     spectrum = Spectrum(config.eigenvalues, config.pairs)
     rates = spectrum.poles.real
+    ranges = relative_ranges(system, config.uncertain)
+    uncertain = ", ".join(f"{parameter} from {low:g} to {high:g}" for parameter, (low, high) in ranges.items())
+    estimated = ", which the map estimates" if config.estimate_parameters else ""
     return [
         f"training an observer for {system.name}{own}: {', '.join(sizes)}",
         f"pipeline {config.pipeline}, preset {name}{given}",
         f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
         f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
+        *([f"each trajectory has its own parameters: {uncertain}{estimated}"] if ranges else []),
     ]
 
 

@@ -14,6 +14,7 @@ from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.noise import draw_process_noise, noisy_output
+from training.trajectories.parameters import blind, with_parameters
 from training.trajectories.policy import under_policy
 from training.trajectories.signals import random_inputs
 
@@ -39,7 +40,8 @@ def calibrate(
     """Find limits for an observer's monitor.
 
     Sound trajectories are simulated from starts in X with the system's process noise, half of them under random inputs
-    if the map knows inputs, at several noise levels. Each limit is the one that a new trajectory exceeds with a sixth
+    if the map knows inputs, at several noise levels. Where the observer was trained for a range of parameters, each has
+    its own. Each limit is the one that a new trajectory exceeds with a sixth
     of the probability ``false_alarms`` (and of an output's share in it). A margin makes up for finding it among few.
 
     Parameters
@@ -87,7 +89,8 @@ def calibrate(
     if trajectories is not None and trajectories < least:
         raise ValueError(f"{trajectories} trajectories are too few for {false_alarms:g}: take {least}")
     rng = generator(Stream.CALIBRATION, seed)
-    x, u = sound_trajectories(artifact, system, n=trajectories or least, duration=duration, rng=rng, policy=policy)
+    plant, policy = with_parameters(system, artifact.parameter_ranges), policy and blind(policy, system.nx)
+    x, u = sound_trajectories(artifact, plant, n=trajectories or least, duration=duration, rng=rng, policy=policy)
     largest = np.asarray(artifact.inverse.measurement_noise_max)
     if not np.isfinite(largest).all():
         largest = LARGEST * np.asarray(artifact.measurement_noise)
@@ -95,7 +98,7 @@ def calibrate(
     rows = []
     for done, level in enumerate(levels, 1):
         report(done)
-        rows.append(_limits(artifact, system, x=x, u=u, level=level, share=share, rng=rng))
+        rows.append(_limits(artifact, plant, x=x, u=u, level=level, share=share, rng=rng))
     mean, low, high = (np.array(each) for each in zip(*rows, strict=True))
     return dataclasses.replace(
         artifact, limits=Limits(levels, mean, low, high, window, warm_up, false_alarms, duration)

@@ -1,6 +1,6 @@
 """Estimation errors of an observer on trajectories that its training never saw."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -66,12 +66,15 @@ class UnseenTrajectories:
         Which of the trajectories drawn these are.
     process_noise : float
         Level of their process noise, in multiples of the system's scale per second.
+    plant : System, optional
+        What moved, where it was not the system that the observer was made for.
     """
 
     x: np.ndarray
     u: np.ndarray
     inside: np.ndarray
     process_noise: float = 0.0
+    plant: System | None = None
 
     @property
     def escaped(self) -> int:
@@ -94,7 +97,7 @@ class UnseenTrajectories:
             Those of them that stayed.
         """
         inside = self.inside[:n]
-        return UnseenTrajectories(self.x[:, : inside.sum()], self.u[:, : inside.sum()], inside, self.process_noise)
+        return replace(self, x=self.x[:, : inside.sum()], u=self.u[:, : inside.sum()], inside=inside)
 
 
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
@@ -151,13 +154,15 @@ def unseen_trajectories(
     stream: Stream = Stream.EVALUATION,
     process_noise: float = 0.0,
     policy: Controller | None = None,
+    plant: System | None = None,
 ) -> UnseenTrajectories:
     """Simulate test trajectories, whose random numbers training never draws.
 
     Parameters
     ----------
     system : System
-        What moves.
+        What observers are made for: it moves, unless a plant does, and says where starts are, and what noise, inputs
+        and pace are usual.
     dt : float
         Sampling interval in seconds.
     n : int
@@ -176,17 +181,25 @@ def unseen_trajectories(
         Level of the process noise, in multiples of the system's scale per second.
     policy : callable, optional
         Acts on the system, see :func:`training.trajectories.policy.under_policy`; by default nothing does.
+    plant : System, optional
+        What moves in the place of the system, such as the same with other parameters
+        (:meth:`kkl_gym.System.replace`, :func:`training.evaluation.plants.off_by`).
 
     Returns
     -------
     UnseenTrajectories
-        Those that stayed within the system's declared bounds, and which these are.
+        Those that stayed within the declared bounds of what moves, and which these are.
 
     Raises
     ------
     ValueError
-        On an unknown domain, or unless n, duration, seed and level make sense.
+        On an unknown domain, or unless n, duration, seed and level make sense, or if the plant has other numbers of
+        states, inputs or outputs than the system.
     """
+    moving = plant or system
+    sizes, expected = ((each.nx, each.nu, each.ny) for each in (moving, system))
+    if sizes != expected:
+        raise ValueError(f"a plant of {sizes} states, inputs and outputs does not fit {system.name}, of {expected}")
     if n < 1 or seed < 0:
         raise ValueError(f"cannot simulate {n} trajectories from seed {seed}")
     check_duration(duration, dt)
@@ -205,11 +218,11 @@ def unseen_trajectories(
         w = draw_process_noise(system, process_noise, n=n, steps=steps, rng=generator(stream, seed, 2))
     if policy:
         exploring, own = generator(stream, seed, 3), np.full(n, not driven)
-        x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w)
+        x, u = under_policy(system, policy, x0, steps=steps, dt=dt, rng=exploring, own=own, w=w, plant=plant)
     else:
-        x = simulate(system, x0, steps, dt, u=u if driven else None, w=w)
+        x = simulate(moving, x0, steps, dt, u=u if driven else None, w=w)
     inside = np.isfinite(x[-1]).all(-1)
-    return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise)
+    return UnseenTrajectories(x[:, inside], u[:, inside], inside, process_noise, plant)
 
 
 def errors(
@@ -221,7 +234,7 @@ def errors(
     seed: int,
     skip: float | None = None,
 ) -> Errors:
-    """Errors of an observer on test trajectories. It is told the levels of noise.
+    """Errors of an observer on test trajectories. It is told the levels of noise, and nothing of another plant.
 
     Parameters
     ----------
@@ -266,12 +279,12 @@ def kalman_errors(
 ) -> Errors:
     """Errors of an extended Kalman filter on the trajectories and the noise that :func:`errors` takes.
 
-    It knows the equations, the inputs and both levels of noise, and that starts are uniform in X.
+    It knows the system's equations, the inputs and both levels of noise, and that starts are uniform in X.
 
     Parameters
     ----------
     system : System
-        What moves.
+        What it takes for what moves.
     trajectories : UnseenTrajectories
         What it is to follow.
     dt : float
@@ -307,7 +320,7 @@ def kalman_errors(
 
 def _measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
     rng = generator(Stream.EVALUATION, seed, 1)
-    return noisy_output(system, trajectories.x, measurement_noise=level, rng=rng)
+    return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
 
 
 def _errors(trajectories: UnseenTrajectories, x_hat: np.ndarray, dt: float, skip: float | None) -> Errors:

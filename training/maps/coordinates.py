@@ -8,6 +8,7 @@ from observers import LinearFilter
 
 # A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
 SMALLEST_MODE = 1e-7
+STILL = 1e-12  # of a component's size: a standard deviation below it is rounding
 
 
 @dataclass(frozen=True)
@@ -51,13 +52,18 @@ def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
     Coordinates
         Without the directions that hold rounding errors only.
     """
-    offset, scale = z.mean(0), z.std(0)
-    scale = np.where(scale > 0, scale, 1.0)
+    offset, scale = z.mean(0), spread(z)
     _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)
     keep = singular > SMALLEST_MODE * singular[0]
     whiten = directions[keep] / singular[keep, None] * np.sqrt(len(z)) / scale
     variances, rotation = np.linalg.eigh(whiten @ noise @ whiten.T)
     return Coordinates(offset, rotation.T @ whiten, np.sqrt(np.maximum(variances, 0.0)))
+
+
+def spread(z: np.ndarray) -> np.ndarray:
+    """Standard deviations of a filter's states (n, size), in any units; 1 where one does not move."""
+    deviation = z.std(0)
+    return np.where(deviation > STILL * np.abs(z).max(0), deviation, 1.0)
 
 
 def settling_time(linear: LinearFilter) -> float:

@@ -9,6 +9,7 @@ from torch import nn
 
 from kkl_gym.system import System
 from observers import ForwardMap, LinearFilter
+from training.maps.coordinates import spread
 from training.maps.least_squares import output_layer
 from training.maps.networks import Network, tensor
 from training.maps.pde import along, on_tensors, residual
@@ -96,7 +97,7 @@ class ForwardProblem(nn.Module):
         x, z = pairs
         self.network, self.system, self.linear = network.to(device), system, linear
         self.scale = scale
-        self.z_offset, self.z_scale = z.mean(0), np.maximum(z.std(0), 1e-12)
+        self.z_offset, self.z_scale = z.mean(0), spread(z)
         self._xo, self._xs = tensor(scale.offset, device), tensor(scale.scale, device)
         self._zo, self._zs = tensor(self.z_offset, device), tensor(self.z_scale, device)
         self._A, self._B = tensor(linear.A, device), tensor(linear.B, device)

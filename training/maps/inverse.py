@@ -13,7 +13,7 @@ class InverseProblem(nn.Module):
     Parameters
     ----------
     network : Network
-        From a batch's inputs to scaled states.
+        From a batch's inputs to scaled states, and parameters where some are estimated.
     sampler : Sampler
         Where batches are from.
     device : torch.device
@@ -35,8 +35,9 @@ class InverseProblem(nn.Module):
         self.network = network
         self.sampler = sampler
         self._lipschitz_penalty = lipschitz_penalty
-        self.register_buffer("error", torch.ones(sampler.cells, device=device))
-        self.register_buffer("visited", torch.zeros(sampler.cells, dtype=torch.bool, device=device))
+        cells = sampler.cells * (2 if sampler.parameters else 1)
+        self.register_buffer("error", torch.ones(cells, device=device))
+        self.register_buffer("visited", torch.zeros(cells, dtype=torch.bool, device=device))
         self.error: torch.Tensor
         self.visited: torch.Tensor
         if lipschitz_penalty:
@@ -60,7 +61,11 @@ class InverseProblem(nn.Module):
             mean square errors in scaled states, which falls.
         """
         inputs, x, weight, cell = self.sampler(generator)
-        square = weight * ((self.network(inputs) - x) ** 2).mean(-1)
+        apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
+        square = weight * apart[:, :nx].mean(-1)
+        if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
+            square = torch.cat([square, apart[:, nx:].mean(-1)])
+            cell = torch.cat([cell, cell + self.sampler.cells])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
         mean = torch.zeros_like(self.error).index_add_(0, cell, detached) / count.clamp(min=1.0)

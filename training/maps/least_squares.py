@@ -8,6 +8,7 @@ from scipy.linalg import qr, solve_triangular
 
 from kkl_gym.system import System
 from observers import MLP, ForwardMap, LinearFilter
+from training.maps.coordinates import spread
 from training.maps.pde import along
 
 POINTS = 8  # collocation points for each random feature
@@ -125,10 +126,10 @@ def solve_forward(
         report=report,
     )
     z = value.numpy() @ solved[:, :-1].T + solved[:, -1]
-    middle, spread = z.mean(0), np.maximum(z.std(0), 1e-12)
+    middle, size = z.mean(0), spread(z)
     mlp = MLP(
-        [weights.astype(np.float32), (solved[:, :-1] / spread[:, None]).astype(np.float32)],
-        [biases.astype(np.float32), ((solved[:, -1] - middle) / spread).astype(np.float32)],
+        [weights.astype(np.float32), (solved[:, :-1] / size[:, None]).astype(np.float32)],
+        [biases.astype(np.float32), ((solved[:, -1] - middle) / size).astype(np.float32)],
         "tanh",
     )
-    return ForwardMap(mlp, offset, scale, middle, spread)
+    return ForwardMap(mlp, offset, scale, middle, size)

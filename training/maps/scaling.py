@@ -22,14 +22,17 @@ class StateScale:
         Their standard deviation, or half their range; 1 where that is 0.
     relative : bool
         Whether errors count relative to the state's size.
+    nx : int, optional
+        How many of the values are of the state, which come first; by default all.
     """
 
     offset: np.ndarray
     scale: np.ndarray
     relative: bool
+    nx: int | None = None
 
     @classmethod
-    def of(cls, x: np.ndarray, scaling: Scaling) -> Self:
+    def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
         """Find the scale of some states.
 
         Parameters
@@ -38,6 +41,8 @@ class StateScale:
             The states.
         scaling : {"relative", "range"}
             As in a configuration.
+        nx : int, optional
+            As for the class.
 
         Returns
         -------
@@ -50,7 +55,7 @@ class StateScale:
         else:
             low, high = x.min(axes), x.max(axes)
             offset, scale = (low + high) / 2, (high - low) / 2
-        return cls(offset, np.where(scale > 0, scale, 1.0), scaling == "relative")
+        return cls(offset, np.where(scale > 0, scale, 1.0), scaling == "relative", nx)
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Scale states (..., nx)."""
@@ -60,4 +65,4 @@ class StateScale:
         """Of the errors at states (..., nx), (...,)."""
         if not self.relative:
             return np.ones(x.shape[:-1])
-        return np.asarray(1.0 / (((x / self.scale) ** 2).mean(-1) + LEAST))
+        return np.asarray(1.0 / (((x / self.scale)[..., : self.nx] ** 2).mean(-1) + LEAST))

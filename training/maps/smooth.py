@@ -54,7 +54,7 @@ def decoder(artifact: Artifact, measurement_noise: float | tuple[float, ...], pr
     Smooth
         Filter states, (n, size), to estimates, (n, nx).
     """
-    inverse = artifact.free_inverse or artifact.inverse
+    inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
     told = inverse.noise_features(measurement_noise, process_noise)
     if "age" in inverse.features:

@@ -22,11 +22,11 @@ from training.methods.ablation import (
     Tuned,
 )
 from training.methods.autoencoder import AE
-from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task
+from training.methods.base import Budget, CausalObserver, Configuration, Data, Method, Task, WrongParameters
 from training.methods.dmf import DMF, DMFNoise
 from training.methods.gru import GRU
 from training.methods.kalman import EKF, UKF, UntunedEKF, WrongEKF
-from training.methods.kkl import SPINN, Default
+from training.methods.kkl import SPINN, Default, WrongDefault, WrongSPINN
 from training.methods.node import NODE, NODENoise
 
 METHODS: dict[str, type[Method[Any]]] = {
@@ -43,6 +43,8 @@ METHODS: dict[str, type[Method[Any]]] = {
         EKF,
         UKF,
         WrongEKF,
+        WrongDefault,
+        WrongSPINN,
         UntunedEKF,
     )
 }
@@ -105,4 +107,15 @@ def get_method(name: str) -> Method[Any]:
     return found()
 
 
-__all__ = ["ABLATION", "METHODS", "Budget", "CausalObserver", "Configuration", "Data", "Method", "Task", "get_method"]
+__all__ = [
+    "ABLATION",
+    "METHODS",
+    "Budget",
+    "CausalObserver",
+    "Configuration",
+    "Data",
+    "Method",
+    "Task",
+    "WrongParameters",
+    "get_method",
+]

@@ -10,6 +10,7 @@ from torch import nn
 
 from kkl_gym.system import System, typical_rate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
+from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
 from training.maps.pde import along, on_tensors
 from training.methods.base import Configuration, Task
@@ -106,7 +107,7 @@ class _Problem(nn.Module):
         linear = LinearFilter(middle * self.D, middle * self.F, budget.dt)
         late = data.ages[data.ages >= data.ages[-1] // 2]
         z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), late).reshape(-1, linear.size)
-        self.z_offset, self.z_scale = tensor(z.mean(0), device), tensor(np.maximum(z.std(0), 1e-12), device)
+        self.z_offset, self.z_scale = tensor(z.mean(0), device), tensor(spread(z), device)
         self._D, self._F = tensor(self.D, device), tensor(self.F, device)
         self._xo, self._xs = tensor(self.x_offset, device), tensor(self.x_scale, device)
         self._states = tensor(states, device)

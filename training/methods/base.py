@@ -15,6 +15,7 @@ from torch import nn
 from kkl_gym.system import System
 from observers import storage
 from training.evaluation.levels import Level
+from training.evaluation.plants import off_by
 from training.jobs import describe
 from training.maps.optimise import Loss, Stage, optimise
 from training.progress import progress_bars
@@ -22,6 +23,8 @@ from training.seeds import Stream, generator
 from training.trajectories.record import recording_ages, trajectories
 
 _KEY = "kkl-gym-method"
+
+WRONG = 0.1  # by what share every parameter is too large for methods that believe in wrong ones
 
 Trained = TypeVar("Trained")
 Configuration = Mapping[str, Any]
@@ -267,6 +270,26 @@ class Method(ABC, Generic[Trained]):
         """
         return ({},)
 
+    def believed(self, system: System) -> System:
+        """Say what it is trained on and takes for the truth: the system, unless a method is to be wrong about it.
+
+        Parameters
+        ----------
+        system : System
+            To be observed.
+
+        Returns
+        -------
+        System
+            The model.
+
+        Raises
+        ------
+        ValueError
+            If there is nothing about the system that the method could be wrong about.
+        """
+        return system
+
     def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
         """Say what the full training is given, after a short one did best.
 
@@ -371,3 +394,14 @@ class Method(ABC, Generic[Trained]):
         if described.get("method") != self.name:
             raise ValueError(f"{path} was written by method {described.get('method')!r}, not {self.name!r}")
         return arrays  # type: ignore[return-value]
+
+
+class WrongParameters:
+    """First base of a method that is another one with every parameter too large; its second base is the other one.
+
+    Its configurations are compared on trajectories of the true system.
+    """
+
+    def believed(self, system: System) -> System:
+        """The same equations with other parameters."""
+        return off_by(system, WRONG)

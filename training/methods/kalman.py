@@ -1,10 +1,10 @@
 """Kalman filters with the exact model, or a wrong one, as methods of the benchmark."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from kkl_gym.system import Components, System
+from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.kalman import (
     ExtendedKalmanFilter,
@@ -13,7 +13,7 @@ from training.kalman import (
     measurement_covariance,
     unknown_start,
 )
-from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task
+from training.methods.base import Arrays, CausalObserver, Configuration, Method, Task, WrongParameters
 
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
@@ -43,11 +43,7 @@ class EKF(Method[Arrays]):
         """The filter, told the noise level."""
         Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
         R = measurement_covariance(system, noise)
-        return self.filter(self.model(system), dt, Q=Q, R=R)
-
-    def model(self, system: System) -> System:
-        """The equations that the filter believes in."""
-        return system
+        return self.filter(self.believed(system), dt, Q=Q, R=R)
 
 
 class UKF(EKF):
@@ -58,17 +54,11 @@ class UKF(EKF):
     filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
 
 
-class WrongEKF(EKF):
-    """The same filter, tuned the same way, with a model that is 10 % wrong."""
+class WrongEKF(WrongParameters, EKF):
+    """The same filter, tuned the same way, with every parameter 10 % too large."""
 
     name: ClassVar[str] = "ekf-wrong"
     label: ClassVar[str] = "EKF, model 10 % off"
-
-    def model(self, system: System) -> System:
-        """Every parameter 10 % too large; a system without parameters runs 10 % too fast."""
-        if system.parameters:
-            return system.replace({name: 1.1 * value for name, value in system.parameters.items()})
-        return faster(system, 1.1)
 
 
 class UntunedEKF(EKF):
@@ -90,18 +80,3 @@ class UntunedEKF(EKF):
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))
-
-
-def faster(system: System, factor: float) -> System:
-    """Let time run faster by a factor for a system."""
-
-    class Faster(type(system)):  # type: ignore[misc]
-        name = f"{system.name}-faster"
-
-        def f(self, x: Components) -> Components:
-            return [factor * fi for fi in system.f(x)]
-
-        def rate(self, x: Components) -> Any:
-            return factor * system.rate(x)
-
-    return Faster()

@@ -10,7 +10,7 @@ from observers import Artifact, KKLObserver
 from observers.artifact import resolve
 from training.config import Config
 from training.evaluation.levels import Level
-from training.methods.base import Budget, CausalObserver, Configuration, Method, Task
+from training.methods.base import Budget, CausalObserver, Configuration, Method, Task, WrongParameters
 from training.pipeline import train
 from training.presets import preset
 from training.spectrum import evenly_spaced
@@ -106,6 +106,13 @@ class Default(KKLMethod):
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
 
 
+class WrongDefault(WrongParameters, Default):
+    """The package's own, trained with every parameter 10 % too large."""
+
+    name: ClassVar[str] = "default-wrong"
+    label: ClassVar[str] = "kkl-gym default, model 10 % off"
+
+
 class Shipped(KKLMethod):
     """The maps that ship, whatever they cost: ``kkl-gym benchmark --methods training.methods.kkl:Shipped``."""
 
@@ -145,3 +152,10 @@ class SPINN(KKLMethod):
         changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
         config = within(preset(task.system, "spinn", "fast", changes=changes), task.budget, task.seed)
         return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class WrongSPINN(WrongParameters, SPINN):
+    """The paper's, trained with every parameter 10 % too large."""
+
+    name: ClassVar[str] = "spinn-wrong"
+    label: ClassVar[str] = "SPINN, model 10 % off"

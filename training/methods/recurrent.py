@@ -7,6 +7,7 @@ from torch.nn.functional import smooth_l1_loss
 
 from observers import LinearFilter
 from training.evaluation.levels import Level
+from training.maps.coordinates import spread
 from training.maps.networks import Network, tensor
 from training.methods.base import Data
 
@@ -97,7 +98,7 @@ class Decoder(nn.Module):
         super().__init__()
         y = data.y[:, :500].astype(float)
         z = linear.run(y, np.zeros((len(y) - 1, y.shape[1], 0)), data.ages).reshape(-1, linear.size)
-        self.z_offset, scale = z.mean(0), np.maximum(z.std(0), 1e-12)
+        self.z_offset, scale = z.mean(0), spread(z)
         _, singular, directions = np.linalg.svd((z - self.z_offset) / scale, full_matrices=False)
         gain = np.sqrt(len(z)) / np.hypot(singular, SOFT_FLOOR * singular[0])
         self.whiten = gain[:, None] * directions / scale

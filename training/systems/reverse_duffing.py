@@ -13,10 +13,10 @@ from training.trajectories.controllers import Controller
 
 
 def homogeneous(system: System) -> Controller:
-    """The feedback u = x1 - 2 (x2 + cbrt(x1)), cut at the input bound, for x1' = x2^3, x2' = -x1 + u.
+    """The feedback u = b x1 - 2 (x2 + cbrt(a x1)), cut at the input bound, for x1' = a x2^3, x2' = -b x1 + u.
 
-    The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -x1 cancelled, x2
-    follows -cbrt(x1), on which x1' = -x1.
+    The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -b x1 cancelled,
+    x2 follows -cbrt(a x1), on which x1' = -a^2 x1.
 
     Parameters
     ----------
@@ -29,10 +29,11 @@ def homogeneous(system: System) -> Controller:
         States, of shape (n, 2), in; actions in [-1, 1], of shape (n, 1), out.
     """
     (u_max,) = system.u_max
+    a, b = (system.parameters[name] for name in ("a", "b"))
 
     def act(x: np.ndarray) -> np.ndarray:
         x1, x2 = x[:, :1], x[:, 1:]
-        action: np.ndarray = np.clip((x1 - 2.0 * (x2 + np.cbrt(x1))) / u_max, -1.0, 1.0)
+        action: np.ndarray = np.clip((b * x1 - 2.0 * (x2 + np.cbrt(a * x1))) / u_max, -1.0, 1.0)
         return action
 
     return act

@@ -9,6 +9,9 @@ import numpy as np
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import Box, Components, System
 
+LARGEST = 1e9  # entry of Phi, with each state in units of X's width, beyond which a motion is lost
+ROUNDING = 1e-9  # of an output's size: what may be left of a linear one
+
 # Functions in the derivatives that some releases of sympy do not print for NumPy, or for arrays of one shape only.
 _IN_NUMPY = {
     "largest": lambda *values: functools.reduce(np.maximum, values),
@@ -113,7 +116,7 @@ def _of_step(system: System) -> list[dict[int, Callable[..., Any]]]:
 def with_sensitivity(system: System, driven: bool = True) -> System:
     """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
 
-    In discrete time the next Phi is that of the step, d step/dx Phi.
+    In discrete time the next Phi is that of the step, d step/dx Phi. A motion whose Phi grows beyond LARGEST is lost.
 
     Parameters
     ----------
@@ -133,8 +136,10 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
         If the equations do not take sympy symbols.
     """
     nx, nu = system.nx, system.nu if driven else 0
-    box: Box = (*system.X, *((0.0, 1.0),) * nx**2)
-    limits: Box = (*system.bounds, *((-1e9, 1e9),) * nx**2)
+    low, high = system.box()
+    units = np.divide.outer(high - low, high - low).ravel().tolist()  # of Phi's entries
+    box: Box = (*system.X, *((0.0, unit) for unit in units))
+    limits: Box = (*system.bounds, *((-LARGEST * unit, LARGEST * unit) for unit in units))
     inputs = system.u_max if driven else ()
     joint = f"{system.name}-sensitivity"
     if system.discrete:
@@ -199,6 +204,8 @@ def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: C
 
 def output_matrix(system: System) -> np.ndarray | None:
     """C, (ny, nx), if the output is h(x) = C x, else None."""
-    C = system.output(np.eye(system.nx)).T
     x = system.draw_starts(np.random.default_rng(0), 100)
-    return C if np.allclose(system.output(x), x @ C.T, rtol=1e-9, atol=1e-12) else None
+    with np.errstate(all="ignore"):  # of ratios and logarithms, which need not exist at 0 and 1
+        C, y = system.output(np.eye(system.nx)).T, system.output(x)
+        linear = np.abs(y - x @ C.T) <= ROUNDING * np.abs(y).max(0)
+    return C if linear.all() else None

@@ -27,6 +27,7 @@ def under_policy(
     own: np.ndarray,
     w: np.ndarray | None = None,
     report: Callable[[int], object] | None = None,
+    plant: System | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories under a policy that errs about the state and explores.
 
@@ -37,7 +38,7 @@ def under_policy(
     Parameters
     ----------
     system : System
-        What is simulated.
+        What is simulated, unless a plant is; how large errors are and how fast they change is that of the system.
     policy : callable
         States (n, nx) to actions (n, nu) in [-1, 1].
     x0 : ndarray, shape (n, nx)
@@ -54,6 +55,8 @@ def under_policy(
         Process noise, held over each interval.
     report : callable, optional
         Told now and then the number of intervals that are done.
+    plant : System, optional
+        What is simulated in the place of the system, with the same states and inputs.
 
     Returns
     -------
@@ -85,7 +88,7 @@ def under_policy(
         u[k] = np.clip(action + exploration[k], -1.0, 1.0) * u_max
         return u[k]
 
-    return simulate(system, x0, steps, dt, u=act, w=w, report=report), u
+    return simulate(plant or system, x0, steps, dt, u=act, w=w, report=report), u
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:

@@ -19,7 +19,7 @@ from rich.console import Console
 
 import training.benchmark.jobs
 import training.benchmark.sizes as sizes
-from kkl_gym import get_system
+from kkl_gym import SYSTEMS, get_system
 from training.benchmark import protocol as protocol_module
 from training.benchmark.jobs import OTHER, Job, run_job
 from training.benchmark.protocol import Protocol, measure, run, step_time, validate, with_shared_noise
@@ -93,6 +93,21 @@ class Broken(Constant):
 
     def train(self, task, configuration):
         return 1 / 0
+"""
+
+
+WRONG = """
+
+from training.methods import WrongParameters
+
+
+class Wrong(WrongParameters, Constant):
+    name = "wrong"
+
+    def train(self, task, configuration):
+        with (Path(__file__).parent / "trainings").open("a") as log:
+            print(task.system.parameters, file=log)
+        return {"mean": task.data.x.mean((0, 1))}
 """
 
 
@@ -425,6 +440,32 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     assert "in train" in (out / "jobs" / "lorenz" / "broken" / "failure.txt").read_text()
 
 
+def test_wrong_methods_are_trained_on_another_system_than_they_see(toy, tiny, tmp_path, monkeypatch):
+    name, trainings = toy
+    script = Path(name.rpartition(":")[0])
+    script.write_text(script.read_text() + WRONG)
+    seen, measured = training.benchmark.jobs.measure, []
+    monkeypatch.setattr(
+        training.benchmark.jobs, "measure", lambda *its, **how: measured.append(its[2].parameters) or seen(*its, **how)
+    )
+    Benchmark(quick=True, systems=("van_der_pol",), methods=(f"{script}:Wrong",), out=tmp_path / "out", jobs=1).run(
+        quiet()
+    )
+    assert trainings.read_text().splitlines() == ["{'mu': 3.3000000000000003}"]
+    assert measured == [{"mu": 3.0}]
+
+
+def test_wrong_methods_need_parameters(tiny, tmp_path):
+    pendulum = tmp_path / "slow.py"
+    pendulum.write_text(SLOW)
+    options = {"quick": True, "systems": (f"{pendulum}:Slow",), "out": tmp_path / "out", "jobs": 1}
+    with pytest.raises(ValueError, match="slow has no parameters that could be off"):
+        Benchmark(methods=("ekf", "ekf-wrong"), **options).run(quiet())
+    assert not (tmp_path / "out" / "jobs").exists()
+    jobs = Benchmark(**options)._jobs("quick", tmp_path / "out")
+    assert [job.method for job in jobs] == [method for method in METHODS if not method.endswith("-wrong")]
+
+
 def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):
     name, _ = toy
     out = tmp_path / "out"
@@ -583,13 +624,49 @@ def test_drawing_leaves_the_users_matplotlib_alone(monkeypatch):
 
 
 def test_a_report_says_which_observers_are_missing(tmp_path):
-    methods = pd.read_csv(RESULTS / "benchmark" / "methods.csv")
+    one = pd.read_csv(RESULTS / "benchmark" / "methods.csv").iloc[:1]
+    every = [one.assign(system=system, method=method) for system in SYSTEMS for method in METHODS]
+    methods = pd.concat(every)
     missing = (methods.method.isin(["gru", "node"]) & (methods.system == "lorenz")) | (methods.method == "dmf")
     methods[~missing].to_csv(tmp_path / "methods.csv", index=False)
     shutil.copy(RESULTS / "benchmark" / "results.csv", tmp_path)
     Benchmark(report=True, out=tmp_path).run(quiet())
     page = (tmp_path / "table.md").read_text()
-    assert "Partial: 50 of 56 observers. Missing: dmf; node on lorenz; gru on lorenz.\n" in page
+    there = f"Partial: {len(every) - 6} of {len(every)} observers."
+    assert f"{there} Missing: dmf; node on lorenz; gru on lorenz.\n" in page
+
+
+def test_new_rows_stand_beside_those_of_an_earlier_run(toy, tiny, tmp_path):
+    """As they were, digit by digit; what an observer's new job found takes the place of its old rows."""
+    name, trainings = toy
+    earlier, out = tmp_path / "earlier", tmp_path / "out"
+    Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=earlier, jobs=1).run(quiet())
+    for file in ("results.csv", "methods.csv"):
+        header, *rows = (earlier / file).read_text().splitlines(True)
+        both = [row.replace("lorenz", system) for system in ("rossler", "van_der_pol") for row in rows]
+        (earlier / file).write_text("".join([header, *both]))
+    Benchmark(systems=("rossler",), methods=("ekf-untuned", name), out=out, beside=earlier, jobs=1).run(quiet())
+    methods, results = (pd.read_csv(out / file) for file in ("methods.csv", "results.csv"))
+    expected = [("van_der_pol", "ekf-untuned"), ("rossler", "ekf-untuned"), ("rossler", "constant")]
+    assert list(zip(methods.system, methods.method)) == expected
+    assert list(dict.fromkeys(zip(results.system, results.method))) == expected
+    old, new = ((folder / "results.csv").read_text().splitlines() for folder in (earlier, out))
+    kept = [line for line in old if line.startswith("van_der_pol")]
+    assert new[1 : 1 + len(kept)] == kept
+    assert not set(new[1:]) & {line for line in old if line.startswith("rossler")}
+    assert set(trainings.read_text().split()) == {"rossler", "0.0", "1.0", "2.0"}
+    with pytest.raises(ValueError, match=r"earlier.methods.csv: it is of another benchmark: budget tiny, seed 0 there"):
+        collect(_of_seed_one(out), earlier)
+    with pytest.raises(ValueError, match=r"results.csv does not exist; run the benchmark first"):
+        Benchmark(systems=("lorenz",), methods=(name,), out=out, beside=tmp_path, jobs=1).run(quiet())
+
+
+def _of_seed_one(out):
+    for path in out.glob("jobs/*/*/job.json"):
+        job = json.loads(path.read_text())
+        job["protocol"]["seed"] = 1
+        path.write_text(json.dumps(job))
+    return out
 
 
 def test_levels_of_noise_by_both_names(toy, tiny, tmp_path):

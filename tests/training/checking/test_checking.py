@@ -307,6 +307,17 @@ class Weak(Upright):
     u_max = (0.01,)
 
 
+class Fast(Upright):
+    """Falls too fast for a controller that acts every 0.1 s."""
+
+    name = "fast"
+    u_max = (1000.0,)
+    dt = 0.1
+
+    def f(self, x):
+        return x[1], 400.0 * x[0]
+
+
 class Adrift(Upright):
     name = "adrift"
     u_max = ()
@@ -318,6 +329,8 @@ def test_a_system_that_no_random_input_holds():
     assert "50 of 50 free and 50 of 50 driven leave them" in found.found
     assert "train with --policy controller, under which 100 of 100 stay" in found.advice
     assert "--policy script.py:function" in one(Weak(), "bounds", duration=5.0).advice
+    assert "smaller dt" not in one(Weak(), "bounds", duration=5.0).advice
+    assert "or take a smaller dt" in one(Fast(), "bounds", duration=5.0).advice
     assert one(Adrift(), "bounds", duration=5.0).advice.endswith("10 times as wide: shrink X")
     assert "no error can be predicted for motions without input" in one(Upright(), "observability", "note").found
 

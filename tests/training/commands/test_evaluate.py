@@ -1,5 +1,6 @@
 """``kkl-gym evaluate``."""
 
+import dataclasses
 import io
 from pathlib import Path
 
@@ -12,6 +13,23 @@ from rich.console import Console
 from training.cli import main
 from training.commands.evaluate import Evaluate
 
+TURNING = """
+from dataclasses import dataclass
+
+import kkl_gym.elementary as e
+from linear_system import Autonomous
+
+
+@dataclass(frozen=True)
+class Turning(Autonomous):
+    omega: float = 1.0
+
+    name, dt = "turning", 0.05
+
+    def step(self, x, u):
+        c, s = e.cos(self.omega * self.dt), e.sin(self.omega * self.dt)
+        return c * x[0] + s * x[1], c * x[1] - s * x[0]
+"""
 COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,smape,smape_late"
 RESULTS = Path(__file__).parents[3] / "docs" / "results"
 
@@ -50,6 +68,50 @@ def test_an_exact_kalman_filter_stands_beside_the_observer(saved):
     (smape, nrmse), _ = printed((saved(),), trajectories=2, duration=2.0, ekf=True)
     assert smape[0][:2] == nrmse[0][:2] == ["observer", "starts"]
     assert [row[0] for row in smape[1:]] == [row[0] for row in nrmse[1:]] == [Path(saved()).stem, "exact EKF"] * 6
+
+
+def test_another_plant_moves_and_nobody_knows(tmp_path):
+    """The oscillator turns at rate 1 in the exact observer's model, and twice as fast as a plant."""
+    script, path = tmp_path / "turning.py", tmp_path / "map.safetensors"
+    script.write_text(TURNING)
+    dataclasses.replace(linear_system.exact_observer(name="turning"), parameters={"omega": 1.0}).save(path)
+    options = {"system": f"{script}:Turning", "trajectories": 4, "duration": 30.0, "measurement_noise": (0.0,)}
+    csv = tmp_path / "errors.csv"
+    (right, _), _ = printed((str(path),), **options)
+    (off, _), _ = printed((str(path),), **options, plant=(("omega", 2.0),), ekf=True, csv=csv)
+    assert [row[0] for row in off[1:]] == ["map", "EKF, same model"] * 2
+    found = pd.read_csv(csv)
+    assert found.columns[:2].tolist() == ["observer", "plant"]
+    assert set(found.plant) == {"omega=2"}
+    assert float(right[1][-2].split()[0]) < 0.1  # from X
+    assert min(float(row[-2].split()[0]) for row in off[1:]) > 20.0
+    Evaluate((str(path),), **options, plant_error=1.0).run(
+        console := Console(width=300, record=True, file=io.StringIO())
+    )
+    text = console.export_text()
+    assert "4 runs of 30 s, plant omega=2, model omega=1\n" in text
+    assert "NRMSE in % after transient, median, plant omega=2, model omega=1\n" in text
+    assert off[1][-3] in text
+
+
+@pytest.mark.parametrize(("words", "message"), [
+    ("lorenz --plant mu=3.3", r"lorenz has no parameter 'mu'; it has sigma, rho, beta"),
+    ("van_der_pol lorenz --plant mu=3.3", r"lorenz has no parameter 'mu'"),
+    ("lorenz --plant rho=nan", r"parameter rho of lorenz must be a finite number, got nan"),
+    ("lorenz --plant rho=1 --plant rho=2", r"--plant names a parameter twice: rho, rho"),
+    ("lorenz --plant-error inf", r"must be a finite number, as 0.1 is, got inf"),
+    ("lorenz --plant-error 0.1 --plant rho=30", r"give --plant or --plant-error, not both"),
+])  # fmt: skip
+def test_impossible_plants(words, message):
+    with pytest.raises(SystemExit, match=message):
+        main(["evaluate", *words.split()])
+
+
+@pytest.mark.parametrize("words", ["rho", "rho=", "rho=x"])
+def test_a_parameter_has_a_name_and_a_value(words, capsys):
+    with pytest.raises(SystemExit):
+        main(["evaluate", "lorenz", "--plant", words])
+    assert f"'{words}' is no parameter with its value: write NAME=VALUE, as in mu=3.3" in capsys.readouterr().err
 
 
 def printed(observers, **options):

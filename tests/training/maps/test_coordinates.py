@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from training.maps.coordinates import coordinates
+from training.maps.coordinates import coordinates, spread
 
 
 def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
@@ -15,3 +15,9 @@ def test_coordinates_make_the_signal_white_and_the_noise_diagonal():
     assert (np.diff(found.noise_gain) >= 0).all()
     flat = coordinates(z[:, [0, 0, 0]], noise)
     assert len(flat.noise_gain) == 1  # two modes hold nothing but rounding
+
+
+def test_spread_is_in_any_units_and_takes_rounding_for_rest():
+    z = np.random.default_rng(0).normal(size=(1000, 3)) * [1e-20, 1.0, 1e-15] + [0.0, 1e6, 1.0]
+    np.testing.assert_allclose(spread(z), [1e-20, 1.0, 1.0], rtol=0.1)
+    assert (spread(np.zeros((10, 2))) == 1.0).all()

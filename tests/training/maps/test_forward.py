@@ -76,10 +76,10 @@ def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature(box_
     assert np.sqrt((error**2).mean()) < 1e-3 * np.sqrt((truth**2).mean())
 
 
-def problem_of_the_oscillator(**options):
+def problem_of_the_oscillator(unit=1.0, **options):
     """An untrained T of the linear oscillator, with exact pairs."""
     system, linear = Autonomous(), Spectrum((-1.0,), ((-0.5, 2.0),)).filter(1, 0.01)
-    x = np.random.default_rng(0).uniform(-1, 1, (3000, 2))
+    x = unit * np.random.default_rng(0).uniform(-1, 1, (3000, 2))
     exact = sylvester(linear.A, linear.B)
     torch.manual_seed(0)
     problem = ForwardProblem(
@@ -97,10 +97,11 @@ def problem_of_the_oscillator(**options):
     return problem, exact
 
 
-def test_solved_output_layer_minimises_the_risk_over_it():
-    problem, exact = problem_of_the_oscillator()
+@pytest.mark.parametrize("unit", [1.0, 1e-14])
+def test_solved_output_layer_minimises_the_risk_over_it(unit):
+    problem, exact = problem_of_the_oscillator(unit)
     problem.solve_output_layer(np.random.default_rng(0))
-    x = np.random.default_rng(1).uniform(-1, 1, (500, 2))
+    x = unit * np.random.default_rng(1).uniform(-1, 1, (500, 2))
     expected = x @ exact.T
     assert np.abs(problem.forward_map()(x) - expected).max() < 2e-3 * np.abs(expected).max()
 

@@ -4,21 +4,15 @@ import numpy as np
 import pytest
 
 from kkl_gym import get_system
-from kkl_gym.simulate import simulate
 from training.methods import get_method
-from training.methods.kalman import DIFFUSION, faster
+from training.methods.kalman import DIFFUSION
 
 
 def test_wrong_models_are_ten_percent_off():
-    believed = get_method("ekf-wrong").model(get_system("lorenz"))
+    believed = get_method("ekf-wrong").believed(get_system("lorenz"))
     assert believed.parameters == pytest.approx({"sigma": 11.0, "rho": 30.8, "beta": 8.8 / 3})
     duffing = get_system("reverse_duffing")
-    np.testing.assert_allclose(
-        get_method("ekf-wrong").model(duffing).f([0.3, 0.5]), 1.1 * np.array(duffing.f([0.3, 0.5]))
-    )
-    quick = faster(duffing, 2.0)
-    x = np.array([[0.5, -0.3]])
-    np.testing.assert_allclose(simulate(quick, x, 10, 0.01)[-1], simulate(duffing, x, 20, 0.01)[-1], rtol=1e-9)
+    assert get_method("ekf-wrong").believed(duffing).parameters == {"a": 1.1, "b": 1.1}
 
 
 @pytest.mark.parametrize("name", ["ekf", "ukf"])

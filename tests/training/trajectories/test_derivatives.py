@@ -26,8 +26,22 @@ def test_output_matrix_of_linear_and_other_outputs():
         def h(self, x):
             return (x[0] * x[0],)
 
+    @dataclass(frozen=True)
+    class Small(Squared):
+        name: ClassVar[str] = "small"
+        X: ClassVar = ((-1e-13, 1e-13), (-1e-13, 1e-13))
+
+    @dataclass(frozen=True)
+    class Ratio(Squared):
+        name: ClassVar[str] = "ratio"
+        X: ClassVar = ((1, 2), (1, 2))
+
+        def h(self, x):
+            return (x[0] / x[1],)
+
     np.testing.assert_array_equal(output_matrix(get_system("rossler")), [[0.0, 1.0, 0.0]])
-    assert output_matrix(Squared()) is None
+    for system in (Squared(), Small(), Ratio()):
+        assert output_matrix(system) is None
 
 
 @pytest.mark.parametrize("system", KINKED, ids=str)
@@ -95,6 +109,36 @@ def test_sensitivity_is_the_derivative_of_the_flow(system):
         step = eps * np.eye(nx)[j]
         difference = np.subtract(*(simulate(system, x + one, 1, dt, u=u)[1] for one in (step, -step))) / (2 * eps)
         np.testing.assert_allclose(Phi[..., j], difference, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+def test_sensitivity_is_in_any_units(discrete):
+    unit = 1e-11
+
+    class Continuous(Oscillator):
+        """Its second state in units a hundred thousand million times as large."""
+
+        name: ClassVar[str] = "odd-units"
+        X: ClassVar = ((-1.0, 1.0), (-unit, unit))
+        bounds: ClassVar = ((-9.0, 9.0), (-9.0 * unit, 9.0 * unit))
+        u_max: ClassVar[tuple[float, ...]] = ()
+
+        def f(self, x):
+            return x[1] / unit, -unit * x[0]
+
+    class Stepping(Continuous):
+        name: ClassVar[str] = "odd-steps"
+        dt = 0.05
+
+        def step(self, x, u):
+            return x[0] + self.dt * x[1] / unit, x[1] - self.dt * unit * x[0]
+
+    start = np.array([[0.1, 0.2 * unit, 1.0, 0.0, 0.0, 1.0]])
+    joint = with_sensitivity(Stepping() if discrete else Continuous())
+    Phi = simulate(joint, start, 10, 0.05)[-1, 0, 2:].reshape(2, 2)
+    cosine, sine = np.cos(0.5), np.sin(0.5)
+    rtol = 0.1 if discrete else 1e-9  # of Euler's steps
+    np.testing.assert_allclose(Phi, [[cosine, sine / unit], [-sine * unit, cosine]], rtol=rtol)
 
 
 @pytest.mark.parametrize(

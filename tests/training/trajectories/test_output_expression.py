@@ -76,6 +76,10 @@ def deep(x):
             lambda self, x: (x[0] if isinstance(x[0], sympy.Basic) else 2 * x[0],),
             "not the same on symbols as on arrays",
         ),
+        (
+            lambda self, x: (1e-13 * (x[0] if isinstance(x[0], sympy.Basic) else 2 * x[0]),),
+            "not the same on symbols as on arrays",
+        ),
         (lambda self, x: deep(x), "at most 24 levels"),
     ],
 )

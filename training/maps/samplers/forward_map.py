@@ -38,11 +38,14 @@ class ForwardMapSampler:
     ----------
     coordinates : Coordinates
         In which the network sees z.
+    parameters : int
+        0: none are estimated here.
     scale : StateScale
         Of the states.
     """
 
     cells = 1
+    parameters = 0
 
     def __init__(
         self,

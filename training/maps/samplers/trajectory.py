@@ -58,6 +58,8 @@ class TrajectorySampler:
         system's scale per second.
     error : ndarray, shape (size, size), optional
         Covariance of an error of z that is there at every noise level, where z comes from a learned T.
+    parameters : int, default 0
+        How many of the last components of ``data.x`` are parameters that are estimated beside the state.
     scaling : {"relative", "range"}, default "relative"
         Of states and their errors, see :class:`training.maps.scaling.StateScale`.
 
@@ -67,6 +69,8 @@ class TrajectorySampler:
         In which the network sees z.
     noise_gain : ndarray, shape (modes,) or (ny, modes)
         Standard deviation of each coordinate's noise where that of the output, or of each of several, is 1.
+    parameters : int
+        As given.
     scale : StateScale
         Of the states.
     measurement_noise_max, measurement_noise_unit : ndarray, shape (ny,)
@@ -97,6 +101,7 @@ class TrajectorySampler:
         high_noise_emphasis: float = 2.0,
         process_noise_max: float = 0.0,
         error: np.ndarray | None = None,
+        parameters: int = 0,
         scaling: Scaling = "relative",
     ) -> None:
         m, n, size = data.z.shape
@@ -112,7 +117,8 @@ class TrajectorySampler:
         self.noise_gain = gain
         if ny > 1:
             self.noise_gain = np.sqrt(np.maximum(np.einsum("ma,jab,mb->jm", whiten, each, whiten), 0.0))
-        self.scale = StateScale.of(data.x, scaling)
+        self.parameters = parameters
+        self.scale = StateScale.of(data.x, scaling, nx=data.x.shape[-1] - parameters)
         self.process_noise_max = process_noise_max
         self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))

@@ -1,0 +1,200 @@
+"""Trainings for plants whose parameters are known roughly."""
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from small_runs import CPU, toy
+
+import training.pipeline
+from kkl_gym import VanDerPol
+from kkl_gym.system import System
+from observers import LinearFilter
+from training import calibrate, errors, train, unseen_trajectories
+from training.config import Config
+from training.evaluation.parameters import parameter_errors
+from training.maps.inverse import InverseProblem
+from training.maps.networks import Network
+from training.maps.samplers import TrajectorySampler
+from training.trajectories.parameters import with_parameters
+from training.trajectories.record import record, recording_ages
+
+
+@dataclass(frozen=True)
+class Spring(System):
+    """x1' = x2, x2' = -stiffness x1 + u: its frequency is the root of the stiffness."""
+
+    stiffness: float = 4.0
+
+    name: ClassVar[str] = "spring"
+    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
+    bounds: ClassVar = ((-9.0, 9.0), (-18.0, 18.0))
+    u_max: ClassVar = (0.5,)
+    G: ClassVar = ((0.0,), (1.0,))
+    dt: ClassVar = 0.05
+    process_noise: ClassVar = 0.0
+    measurement_noise: ClassVar = 0.05
+
+    def f(self, x):
+        return x[1], -self.stiffness * x[0]
+
+    def h(self, x):
+        return (x[0],)
+
+
+@cache
+def trained(**uncertain):
+    """An observer of free motion, for one plant or many."""
+    system = Spring()
+    own = {"inputs": False, "trajectories": 200, "duration": 15.0, "inverse_steps": 1200, "width": 32}
+    own |= {"uncertain": uncertain, "estimate_parameters": True} if uncertain else {}
+    config = toy(system, eigenvalues=(-0.4, -0.8, -1.6, -3.2, -6.4), **own)
+    with TemporaryDirectory() as folder:
+        return train(system, config, Path(folder), device=CPU).artifact
+
+
+def test_an_observer_for_uncertain_plants_holds_on_another():
+    system = Spring()
+    plant = system.replace({"stiffness": 4.4})
+    late = {}
+    for name, artifact in {"one": trained(), "many": trained(stiffness=0.1)}.items():
+        assert artifact.nx == 2
+        for what, moving in {"model": system, "plant": plant}.items():
+            runs = unseen_trajectories(moving, 0.05, n=20, duration=15.0, seed=3)
+            late[name, what] = np.median(errors(artifact, moving, runs, measurement_noise=0.05, seed=3).late)
+    assert late["many", "plant"] < 0.4 * late["one", "plant"]
+    assert late["many", "model"] < 1.5 * late["one", "model"]
+
+
+def test_it_identifies_the_plant_while_it_runs():
+    system, artifact = Spring(), trained(stiffness=0.1)
+    assert artifact.estimated_parameters == ("stiffness",)
+    assert artifact.parameter_ranges == {"stiffness": (3.6, 4.4)}
+    drawn = 10.0 / np.sqrt(3)  # in percent, of who only knows the range
+    how = {"plants": 30, "duration": 15.0, "seed": 5}
+    clean, noisy = (parameter_errors(artifact, system, measurement_noise=level, **how)[0] for level in (0.0, 0.05))
+    assert clean < 0.2 * drawn
+    assert clean < noisy < 0.7 * drawn
+
+
+def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate(monkeypatch, tmp_path):
+    class ReachedError(Exception):
+        pass
+
+    seen = {}
+
+    def spy_record(plant, *arguments, **named):
+        seen["plant"] = plant
+        return record(plant, *arguments, **named)
+
+    def spy_sampler(data, *arguments, **named):
+        seen["x"], seen["parameters"] = data.x, named["parameters"]
+        raise ReachedError
+
+    monkeypatch.setattr(training.pipeline, "record", spy_record)
+    monkeypatch.setattr(training.pipeline, "TrajectorySampler", spy_sampler)
+    config = toy(VanDerPol(), uncertain={"mu": 0.1})
+    for estimated in (False, True):
+        with pytest.raises(ReachedError):
+            train(VanDerPol(), replace(config, estimate_parameters=estimated), tmp_path / str(estimated), device=CPU)
+        assert seen["plant"].state_names == ("x1", "x2", "mu")
+        assert seen["x"].shape[-1] == 2 + estimated
+        assert seen["parameters"] == estimated
+    mu = seen["x"][..., 2]
+    assert (mu == mu[0]).all()
+    assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
+
+
+def test_in_closed_loop_the_plant_is_uncertain_and_the_controller_nominal(monkeypatch, tmp_path):
+    seen, acted = {}, []
+
+    def spy(plant, artifact, controller, **named):
+        seen["plant"] = plant
+
+        def noted(x_hat):
+            acted.append(x_hat.shape[1])
+            return controller(x_hat)
+
+        seen["data"] = original(plant, artifact, noted, **named)
+        return seen["data"]
+
+    original = training.pipeline.record_closed_loop
+    monkeypatch.setattr(training.pipeline, "record_closed_loop", spy)
+    few = {"closed_loop_trajectories": 12, "inverse_steps": 3, "duration": 2.0, "free_inverse": False}
+    config = toy(VanDerPol(), uncertain={"all": 0.1}, estimate_parameters=True, **few)
+    found = train(VanDerPol(), config, tmp_path, device=CPU).artifact
+    assert seen["plant"].state_names == ("x1", "x2", "mu")
+    assert set(acted) == {2}
+    mu = seen["data"].x[0, :, 2]
+    assert 0.05 < mu.std() < 0.3
+    assert (found.nx, found.estimated_parameters) == (2, ("mu",))
+
+
+def test_under_a_policy_it_sees_the_states_alone(tmp_path):
+    config = toy(VanDerPol(), uncertain={"mu": 0.1}, policy="controller", inverse_steps=2, duration=1.0)
+    assert train(VanDerPol(), config, tmp_path, device=CPU).artifact.nx == 2
+
+
+def test_parameters_leave_states_as_they_are():
+    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
+    plant, ages = with_parameters(VanDerPol(), {"mu": (2.7, 3.3)}), recording_ages(100, 20)
+    data = record(plant, linear, n=20, steps=100, ages=ages, rng=np.random.default_rng(0))
+
+    def problem(data, parameters):
+        how = {"measurement_noise_max": 1.0, "batch": 256, "device": CPU, "parameters": parameters}
+        sampler = TrajectorySampler(data, linear, **how)
+        torch.manual_seed(0)
+        inputs = len(sampler.coordinates.noise_gain) + 2
+        return InverseProblem(Network(inputs, 2 + parameters, width=8, depth=1, activation="tanh"), sampler, CPU)
+
+    states, both = problem(replace(data, x=data.x[..., :2]), 0), problem(data, 1)
+    alone, beside = (each.sampler(torch.Generator().manual_seed(0)) for each in (states, both))
+    for part in ("inputs", "weight", "cell"):
+        torch.testing.assert_close(getattr(alone, part), getattr(beside, part))
+    torch.testing.assert_close(alone.x, beside.x[:, :2])
+    with torch.no_grad():  # the same map of states, and one of parameters that is far off
+        for mine, other in zip(states.network.parameters(), both.network.parameters()):
+            other.copy_(mine if mine.shape == other.shape else torch.cat([mine, 100.0 + 0.0 * mine[:1]]))
+    for each in (states, both):
+        each.loss(torch.Generator().manual_seed(0))
+    cells = states.sampler.cells
+    torch.testing.assert_close(states.error, both.error[:cells])
+    assert (both.error[cells:][both.visited[cells:]] > 10.0).all()
+
+
+def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():
+    artifact = trained()
+    how = {"false_alarms": 0.2, "duration": 10.0, "seed": 0}
+    one = calibrate(artifact, Spring(), **how).limits
+    many = calibrate(replace(artifact, parameter_ranges={"stiffness": (3.2, 4.8)}), Spring(), **how).limits
+    assert (many.mean[0] > 3 * one.mean[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"uncertain": {"mu": 1.0}}, "less than 1"),
+        ({"uncertain": {"mu": -0.1}}, "greater than or equal to 0"),
+        ({"estimate_parameters": True}, "needs uncertain parameters"),
+        ({"uncertain": {"mu": 0.1}, "pipeline": "spinn", "forward_steps": 9}, "needs the pipeline 'input-aware'"),
+    ],
+)
+def test_settings_that_make_no_sense(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Config(**{"pipeline": "input-aware", "eigenvalues": (-1.0,), **settings})
+
+
+def test_a_name_that_is_no_parameter_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match="no parameter 'nu' to be uncertain; it has mu"):
+        train(VanDerPol(), toy(VanDerPol(), uncertain={"nu": 0.1}), tmp_path / "run", device=CPU)
+    assert not (tmp_path / "run").exists()
+
+
+def test_who_estimates_no_parameters_is_not_asked_how_well():
+    with pytest.raises(ValueError, match="estimates no parameters"):
+        parameter_errors(trained(), Spring(), plants=2, duration=1.0, measurement_noise=0.0, seed=0)

@@ -1,0 +1,114 @@
+"""A system whose parameters are states."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from linear_system import Oscillator
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from kkl_gym.systems import Lorenz, VanDerPol
+from training.trajectories.derivatives import jacobian
+from training.trajectories.parameters import relative_ranges, with_parameters
+
+
+@dataclass(frozen=True)
+class Motor(System):
+    """One whose input matrix and output hold parameters."""
+
+    gain: float = 2.0
+    offset: float = 0.5
+    name: ClassVar[str] = "motor"
+    X: ClassVar = ((-1.0, 1.0),)
+    bounds: ClassVar = ((-9.0, 9.0),)
+    u_max: ClassVar = (1.0,)
+
+    def f(self, x):
+        return (-x[0],)
+
+    def g(self, x):
+        return ((self.gain,),)
+
+    def h(self, x):
+        return (x[0] + self.offset,)
+
+
+@dataclass(frozen=True)
+class Decay(System):
+    """One in discrete time."""
+
+    part: float = 0.9
+    name: ClassVar[str] = "decay"
+    X: ClassVar = ((-1.0, 1.0),)
+    bounds: ClassVar = ((-9.0, 9.0),)
+    dt: ClassVar = 0.1
+
+    def step(self, x, u):
+        return (self.part * x[0],)
+
+    def h(self, x):
+        return (x[0],)
+
+
+def test_each_motion_is_that_of_its_own_parameters():
+    system = Lorenz()
+    both = with_parameters(system, {"rho": (20.0, 40.0), "beta": (2.0, 3.0)})
+    start = both.draw_starts(np.random.default_rng(0), 3)
+    x = simulate(both, start, 50, 0.01)
+    for row, x0 in enumerate(start):
+        own = system.replace({"rho": x0[3], "beta": x0[4]})
+        np.testing.assert_allclose(x[:, row, :3], simulate(own, x0[None, :3], 50, 0.01)[:, 0], rtol=1e-6)
+        np.testing.assert_array_equal(x[:, row, 3:], np.broadcast_to(x0[3:], (51, 2)))
+
+
+def test_parameters_of_inputs_and_outputs():
+    system = with_parameters(Motor(), {"gain": (1.0, 3.0), "offset": (0.0, 1.0)})
+    x = simulate(system, np.array([[0.0, 3.0, 0.25]]), 1, 0.5, u=np.full((1, 1, 1), 0.7))
+    assert x[1, 0, 0] == pytest.approx(3.0 * 0.7 * (1 - np.exp(-0.5)), rel=1e-6)
+    assert system.output(x[1, 0])[0] == pytest.approx(x[1, 0, 0] + 0.25)
+
+
+def test_in_discrete_time():
+    x = simulate(with_parameters(Decay(), {"part": (0.5, 0.99)}), np.array([[1.0, 0.5]]), 3, 0.1)
+    assert x[3, 0, 0] == 0.125
+
+
+def test_symbols_pass():
+    rows = jacobian(with_parameters(VanDerPol(), {"mu": (2.0, 4.0)}).f, 3)
+    assert rows[1][2](2.0, 3.0, 7.0) == (1 - 4.0) * 3.0
+
+
+@pytest.mark.parametrize(
+    ("ranges", "message"), [({"nu": (1, 2)}, "no parameter 'nu'"), ({"mu": (2, 2)}, "low to high")]
+)
+def test_what_makes_no_sense(ranges, message):
+    with pytest.raises(ValueError, match=message):
+        with_parameters(VanDerPol(), ranges)
+
+
+def test_ranges_about_the_values():
+    lorenz = Lorenz(beta=-2.0)
+    assert relative_ranges(lorenz, {"rho": 0.5}) == {"rho": (14.0, 42.0)}
+    found = relative_ranges(lorenz, {"all": 0.1, "rho": 0.5, "sigma": 0.0})
+    assert found == {"rho": (14.0, 42.0), "beta": (-2.2, -1.8)}
+    assert relative_ranges(lorenz, {}) == {}
+    assert with_parameters(lorenz, {}) is lorenz
+
+
+@pytest.mark.parametrize(
+    ("system", "widths", "message"),
+    [
+        (Lorenz(), {"nu": 0.1}, "no parameter 'nu' to be uncertain; it has sigma, rho, beta"),
+        (Lorenz(beta=0.0), {"all": 0.1}, "beta of lorenz is 0, which has no relative range: leave it out, beta=0"),
+    ],
+)
+def test_ranges_that_make_no_sense(system, widths, message):
+    with pytest.raises(ValueError, match=message):
+        relative_ranges(system, widths)
+
+
+def test_a_system_without_parameters_has_none_to_be_uncertain():
+    with pytest.raises(ValueError, match="oscillator has no parameters"):
+        relative_ranges(Oscillator(), {"all": 0.1})

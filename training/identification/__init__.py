@@ -1,0 +1,1 @@
+"""Parameters and observers from records of outputs."""

@@ -1,0 +1,131 @@
+"""What measured outputs cannot tell about parameters and states."""
+
+import itertools
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from kkl_gym.system import System
+from training.trajectories.parameters import with_parameters
+
+NOTHING = 1e-7  # of the largest eigenvalue of the information: below, a direction leaves the outputs as they are
+HARDLY = 1.0  # standard error, over the parameter itself, from which on nothing is known of it
+PART = 0.05  # of a direction that a parameter must have to be in it
+LARGEST_DENOMINATOR, ROUNDING = 6, 0.03  # of exponents that are written as fractions
+MOST_SIGNS = 12  # states and parameters, beyond which signs are not tried out
+POINTS = 64
+
+
+def hidden_directions(information: np.ndarray) -> np.ndarray:
+    """Find the changes of parameters that leave the outputs as they are, or nearly.
+
+    Parameters
+    ----------
+    information : ndarray, shape (p, p)
+        Fisher information of the parameters, each in units of its own size.
+
+    Returns
+    -------
+    ndarray, shape (p, k)
+        Orthonormal columns; none if the outputs tell all parameters.
+    """
+    values, vectors = np.linalg.eigh(information)
+    hidden = (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)
+    return vectors[:, hidden]
+
+
+def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:
+    """Products of powers of parameters that outputs tell, where they do not tell all parameters one by one.
+
+    Parameters
+    ----------
+    names : sequence of str, length p
+        The parameters.
+    hidden : ndarray, shape (p, k)
+        As :func:`hidden_directions` finds them at these parameters, in units of their own size.
+
+    Returns
+    -------
+    list of dict of str to Fraction or float
+        Exponents by name, for each product; p - k of them. A parameter that is told by itself is a product of its own.
+    """
+    p, k = hidden.shape
+    if p == k:
+        return []
+    seen = np.linalg.svd(hidden)[0][:, k:].T if k else np.eye(p)
+    rows: list[np.ndarray] = []
+    pivots: list[int] = []
+    for _ in range(p - k):  # Gauss-Jordan, the largest entry of what is left first
+        left = np.abs(seen)
+        left[: len(rows)] = 0.0
+        row, column = np.unravel_index(left.argmax(), left.shape)
+        seen[[len(rows), row]] = seen[[row, len(rows)]]
+        seen[len(rows)] /= seen[len(rows), column]
+        for other in range(len(seen)):
+            if other != len(rows):
+                seen[other] -= seen[other, column] * seen[len(rows)]
+        rows.append(seen[len(rows)])
+        pivots.append(int(column))
+    found = []
+    for row in seen:
+        row = np.where(np.abs(row) < PART, 0.0, row)
+        smallest = np.abs(row[row != 0]).min()
+        scaled = row / (smallest * np.sign(row[np.flatnonzero(row)[0]]))
+        found.append({name: _fraction(value) for name, value in zip(names, scaled, strict=True) if value})
+    return found
+
+
+def written(powers: dict[str, Fraction | float]) -> str:
+    """A product as text, such as ``a b^3``."""
+    return " ".join(name if power == 1 else f"{name}^{_power(power)}" for name, power in powers.items())
+
+
+def sign_symmetries(system: System, parameters: Sequence[str]) -> list[tuple[str, ...]]:
+    """States and parameters that may change sign together without any change of the outputs.
+
+    Parameters
+    ----------
+    system : System
+        Any system; without inputs, or with inputs that act as before on states that change sign.
+    parameters : sequence of str
+        The parameters that may change sign.
+
+    Returns
+    -------
+    list of tuple of str
+        Names of what changes sign, for each symmetry.
+    """
+    values = system.parameters
+    ranges = {name: _around(values[name]) for name in parameters}
+    both = with_parameters(system, ranges)
+    if both.nx > MOST_SIGNS or both.discrete:
+        return []
+    x = both.draw_starts(np.random.default_rng(0), POINTS)
+    f, h = both.drift(x), both.output(x)
+    found = []
+    for signs in itertools.product((1.0, -1.0), repeat=both.nx):
+        s = np.array(signs)
+        if (s > 0).all():
+            continue
+        with np.errstate(all="ignore"):
+            same = np.allclose(both.output(s * x), h, rtol=1e-9) and np.allclose(both.drift(s * x), s * f, rtol=1e-9)
+        if same:
+            found.append(tuple(name for name, sign in zip(both.state_names, signs, strict=True) if sign < 0))
+    return [one for one in found if not any(set(other) < set(one) for other in found)]
+
+
+def _around(value: float) -> tuple[float, float]:
+    size = 0.1 * abs(value) or 1.0
+    return value - size, value + size
+
+
+def _fraction(value: float) -> Fraction | float:
+    near = Fraction(float(value)).limit_denominator(LARGEST_DENOMINATOR)
+    return near if near and abs(float(near) - value) <= ROUNDING * abs(value) else float(value)
+
+
+def _power(power: Fraction | float) -> str:
+    if isinstance(power, Fraction):
+        return str(power.numerator) if power.denominator == 1 else f"({power})"
+    return f"{power:.3g}"

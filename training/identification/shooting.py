@@ -1,0 +1,308 @@
+"""Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.trajectories.parameters import with_parameters
+
+STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
+SETTLING, RESETTLING = 12, 4  # Levenberg-Marquardt steps of starts before parameters move, and after each step
+WORSE = 1.2  # times the mean square of before, from which on a window's start is looked for again
+ROUNDS = 40  # Gauss-Newton steps at one length of windows
+CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
+SMALL_STEP = 0.02  # of the standard errors, below which the parameters are done with
+FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
+OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
+MOST_ROWS = 60_000  # motions simulated at once
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Equally long stretches of records, each with a start of its own.
+
+    Parameters
+    ----------
+    y : ndarray, shape (steps + 1, n, ny)
+        Measured outputs; NaN where one is missing.
+    u : ndarray, shape (steps, n, nu)
+        Inputs that acted.
+    x0 : ndarray, shape (n, nx)
+        Estimates of the state at their starts.
+    """
+
+    y: np.ndarray
+    u: np.ndarray
+    x0: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What shooting found.
+
+    Parameters
+    ----------
+    parameters : dict of str to float
+        The parameters that were unknown.
+    windows : Windows
+        With the starts found.
+    residuals : ndarray, shape (steps + 1, n, ny)
+        Measured minus predicted outputs; NaN where one is missing or a motion left the bounds.
+    noise : ndarray, shape (ny,)
+        Their standard deviations.
+    information : ndarray, shape (p, p)
+        Fisher information of the parameters in units of ``unit``, where starts are unknown.
+    unit : ndarray, shape (p,)
+        Of each parameter.
+    used : ndarray of bool, shape (n,)
+        Windows that the model explains; the others count little or nothing.
+    cost : float
+        Mean square of the residuals of those windows, over each output's variance.
+    starts_by_parameters : ndarray, shape (number used, nx, p)
+        How the starts that fit best, over X's half-widths, follow the parameters, over their units.
+    """
+
+    parameters: dict[str, float]
+    windows: Windows
+    residuals: np.ndarray
+    noise: np.ndarray
+    information: np.ndarray
+    unit: np.ndarray
+    used: np.ndarray
+    cost: float
+    starts_by_parameters: np.ndarray
+
+    @property
+    def standard_errors(self) -> np.ndarray:
+        """Of the parameters, (p,); those of directions that outputs do not tell are huge or infinite."""
+        values, vectors = np.linalg.eigh(self.information)
+        with np.errstate(divide="ignore"):
+            return self.unit * np.sqrt((vectors**2 / np.maximum(values, 0.0)).sum(1))
+
+
+class Shooting:
+    """The least squares of one set of windows.
+
+    Parameters
+    ----------
+    system : System
+        The model, whose other parameters are right.
+    dt : float
+        Sampling interval in seconds.
+    limits : mapping of str to (float, float)
+        Lowest and highest value of each unknown parameter.
+    unit : ndarray, shape (p,)
+        Size of a change of each parameter.
+    """
+
+    def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
+        self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
+        self.low, self.high = np.array(list(limits.values()), dtype=float).T
+        self.half = np.array([(high - low) / 2 for low, high in system.X])
+
+    def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
+        ranges = {
+            name: (value - unit, value + unit)
+            for name, value, unit in zip(self.names, theta.mean(0), self.unit, strict=True)
+        }
+        both = with_parameters(self.system.replace(dict(zip(self.names, theta.mean(0), strict=True))), ranges)
+        starts = np.concatenate([x0, theta], 1)
+        parts = []
+        for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
+            x = simulate(both, starts[rows], len(u), self.dt, u=u[:, rows] if u.shape[-1] else None)
+            parts.append(both.output(x))
+        return np.concatenate(parts, 1)
+
+    def derivatives(
+        self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
+    ) -> np.ndarray:
+        """Derivatives (steps + 1, n, ny, nx + p) by starts, over X's half-widths, and parameters, over their units."""
+        n, nx = x0.shape
+        size = np.concatenate([self.half, self.unit]) * STEP
+        moved = len(size) if parameters else nx
+        at = np.concatenate([x0, np.tile(theta, (n, 1))], 1)
+        flat = (at + np.diag(size)[:moved, None]).reshape(-1, len(size))
+        beside = self.outputs(flat[:, nx:], flat[:, :nx], np.tile(u, (1, moved, 1)))
+        return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
+
+
+@dataclass
+class _Motions:
+    """Starts of windows with what follows from them.
+
+    Parameters
+    ----------
+    x0 : ndarray, shape (n, nx)
+        The starts.
+    y, r : ndarray, shape (steps + 1, n, ny)
+        Predicted outputs, and residuals, which are zero where nothing was measured.
+    each : ndarray, shape (n,)
+        Mean squares of each window's residuals, over the outputs' variances; inf where it leaves the bounds.
+    """
+
+    x0: np.ndarray
+    y: np.ndarray
+    r: np.ndarray
+    each: np.ndarray
+
+    def take(self, others: "_Motions", rows: np.ndarray, of: np.ndarray) -> None:
+        """Replace some rows by rows of others."""
+        self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
+        self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
+
+
+class _Problem:
+    """The least squares of one set of windows."""
+
+    def __init__(self, shooting: Shooting, windows: Windows) -> None:
+        self.shooting, self.windows = shooting, windows
+        spread = np.nanvar(windows.y.reshape(-1, windows.y.shape[-1]), axis=0)
+        self.weight = 1.0 / np.where(spread > 0, spread, 1.0)
+        low, high = np.array(shooting.system.bounds, dtype=float).T
+        self.low, self.high = low + 1e-6 * (high - low), high - 1e-6 * (high - low)
+        self.there = np.isfinite(windows.y)
+        self.count = np.maximum(self.there.sum((0, 2)), 1)
+        self.rows = np.arange(len(windows.x0))
+
+    def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> _Motions:
+        """Motions of some windows from starts, which are put within the bounds."""
+        x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
+        y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
+        r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
+        lost = (~np.isfinite(y) & there).any((0, 2))
+        return _Motions(x0, y, r, np.where(lost, np.inf, (r**2 * self.weight).sum((0, 2)) / self.count[rows]))
+
+    def normal(
+        self, theta: np.ndarray, at: _Motions, rows: np.ndarray, *, parameters: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """J'J (m, d, d) and J'r (m, d) of some windows, by starts and, if wanted, parameters."""
+        J = self.derivatives(theta, at, rows, parameters=parameters)
+        Jw = J * self.weight[:, None]
+        H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
+        return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
+
+    def derivatives(self, theta: np.ndarray, at: _Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
+        """J (steps + 1, m, ny, d) of some windows, zero where nothing was measured."""
+        u = self.windows.u[:, rows]
+        J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
+        there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
+        return np.where(there, J, 0.0)
+
+    def settle(self, theta: np.ndarray, at: _Motions, rows: np.ndarray, rounds: int) -> None:
+        """Move starts of some windows to where they fit best, each by itself (Levenberg-Marquardt)."""
+        nx, damping = at.x0.shape[1], np.full(len(at.x0), FIRST_DAMPING)
+        H, g = np.zeros((len(at.x0), nx, nx)), np.zeros((len(at.x0), nx))
+        moved = rows = rows[np.isfinite(at.each[rows])]
+        for _ in range(rounds):
+            if not len(rows):
+                return
+            if len(moved):
+                H[moved], g[moved] = self.normal(theta, at, moved, parameters=False)
+            x0 = (
+                at.x0[rows]
+                + self.shooting.half * np.linalg.solve(_damped(H[rows], damping[rows]), g[rows, :, None])[..., 0]
+            )
+            tried = self.follow(theta, x0, rows)
+            better = tried.each < at.each[rows]
+            going = tried.each < (1.0 - CONVERGED) * at.each[rows]
+            at.take(tried, rows[better], np.flatnonzero(better))
+            damping[rows] *= np.where(better, 0.1, 10.0)
+            moved, rows = rows[going], rows[going | ~better]
+
+
+def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
+    """Starts (n, nx) of windows that fit best with given parameters."""
+    problem = _Problem(shooting, windows)
+    motions = problem.follow(theta, windows.x0, problem.rows)
+    problem.settle(theta, motions, problem.rows, SETTLING)
+    return motions.x0
+
+
+def explained(each: np.ndarray) -> np.ndarray:
+    """Which windows a model explains, by the mean squares of their residuals."""
+    median = np.median(each)
+    deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
+    return np.isfinite(each) & (each <= median + OUTLIER * deviation)
+
+
+def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision: float = SMALL_STEP) -> Fit:
+    """Least squares over parameters and starts at one length of windows.
+
+    Parameters
+    ----------
+    shooting : Shooting
+        The problem.
+    theta : ndarray, shape (p,)
+        Parameters to begin with.
+    windows : Windows
+        The data, with starts to begin with.
+    precision : float
+        Size of a step, in standard errors of the parameters, from which on they are good enough.
+
+    Returns
+    -------
+    Fit
+        What was found.
+    """
+    problem, nx, damping = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING
+    at = problem.follow(theta, windows.x0, problem.rows)
+    problem.settle(theta, at, problem.rows, SETTLING)
+    for _ in range(ROUNDS):
+        used = explained(at.each)
+        H, g = problem.normal(theta, at, problem.rows, parameters=True)
+        step, better = np.inf, False
+        while damping < MOST_DAMPING and not better:
+            D = _damped(H, damping)
+            along = np.linalg.solve(D[:, :nx, :nx], np.concatenate([D[:, :nx, nx:], g[:, :nx, None]], -1))
+            cross = D[:, nx:, :nx]
+            S = (D[:, nx:, nx:] - cross @ along[..., :-1])[used].sum(0)
+            s = (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0)
+            new = np.clip(theta + np.linalg.lstsq(S, s, rcond=1e-12)[0] * shooting.unit, shooting.low, shooting.high)
+            change = (new - theta) / shooting.unit
+            x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
+            tried = problem.follow(new, x0, problem.rows)
+            problem.settle(new, tried, np.flatnonzero(tried.each > WORSE * at.each), RESETTLING)
+            # Windows that chaos has thrown off count no more than what lies beyond the worst that is explained.
+            if np.minimum(tried.each[used], 2 * at.each[used].max()).sum() < at.each[used].sum():
+                step = float(np.sqrt(max(change @ S @ change, 0.0) / max(at.each[used].mean(), 1e-300)))
+                theta, at, better = new, tried, True
+            damping = max(damping / 10.0, 1e-12) if better else damping * 10.0
+        if not better or step < precision:
+            break
+    return _fit(problem, theta, at)
+
+
+def _damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
+    """Matrices (n, d, d) with their diagonals made larger by a part, so that they can be solved for."""
+    diagonal = np.einsum("naa->na", H)
+    more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
+    return H + more[:, :, None] * np.eye(H.shape[-1])
+
+
+def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
+    shooting, nx, used = problem.shooting, at.x0.shape[1], explained(at.each)
+    J = problem.derivatives(theta, at, np.flatnonzero(used))
+    there = problem.there[:, used] & (J != 0).any(-1)
+    count = there.sum((0, 1))
+    free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
+    noise = np.sqrt(np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free)
+    Jw = J / np.maximum(noise, 1e-300)[:, None]
+    H = np.einsum("knya,knyb->nab", Jw, Jw, optimize=True)
+    cross = H[:, nx:, :nx]
+    by_starts = np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True)
+    information = (H[:, nx:, nx:] - cross @ by_starts @ cross.transpose(0, 2, 1)).sum(0)
+    return Fit(
+        parameters=dict(zip(shooting.names, theta.tolist(), strict=True)),
+        windows=replace(problem.windows, x0=at.x0),
+        residuals=np.where(problem.there, at.r, np.nan),
+        noise=noise,
+        information=information,
+        unit=shooting.unit,
+        used=used,
+        cost=float(np.mean(at.each[used])),
+        starts_by_parameters=-by_starts @ cross.transpose(0, 2, 1),
+    )

@@ -1,0 +1,178 @@
+"""Windows that grow: shooting over longer and longer stretches of records, as long as they say more."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from training.identification.shooting import Fit, Shooting, Windows, settled, shoot
+from training.records import Record
+
+FIRST_LENGTH = 100  # samples of the first windows, fewer where records are short
+LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
+GAIN = 0.8  # standard errors at twice the length, over those before, from which on longer windows are not worth it
+
+MOST_SAMPLES = 6400  # of a window
+
+Starts = dict[tuple[int, int], np.ndarray]
+"""Estimates of the state (nx,) by record and sample."""
+Guess = Callable[[Record, np.ndarray], np.ndarray]
+"""Record and samples in, estimates of the states there, (n, nx), out."""
+
+
+def fit_windows(
+    shooting: Shooting,
+    theta: np.ndarray,
+    records: Sequence[Record],
+    guess: Guess,
+    *,
+    first: int,
+    report: Callable[[str], object] = lambda line: None,
+) -> Fit:
+    """Fit parameters and starts on windows of growing length.
+
+    Short windows find their way from rough guesses; long ones say more. Chaos and process noise, which no start
+    explains for long, set an end to their length.
+
+    Parameters
+    ----------
+    shooting : Shooting
+        The problem.
+    theta : ndarray, shape (p,)
+        Parameters to begin with.
+    records : sequence of Record
+        Without gaps, on the grid of the shooting.
+    guess : callable
+        Record and samples in, estimates of the states there, (n, nx), out.
+    first : int
+        The first sample of each record for which there is a guess.
+    report : callable, optional
+        Told what was found at each length.
+
+    Returns
+    -------
+    Fit
+        At the length that says most.
+    """
+    longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
+    length = min(FIRST_LENGTH, longest)
+    starts: Starts = {}
+    for index, record in enumerate(records):
+        at = np.arange(first, len(record.y) - length, length)
+        starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
+    best = shoot(shooting, theta, windows(records, starts, length))
+    report(described(best, length))
+    while 2 * length <= longest:
+        length *= 2
+        found = dict(zip(starts, best.windows.x0, strict=True))
+        starts = {
+            (index, k): x
+            for (index, k), x in found.items()
+            if (k - first) % length == 0 and k + length < len(records[index].y)
+        }
+        theta = np.array(list(best.parameters.values()))
+        fit = shoot(shooting, theta, windows(records, starts, length))
+        if fit.used.mean() < LEAST_USED or fit.cost > 2 * best.cost:
+            break
+        report(described(fit, length))
+        before, best = best, fit
+        if (fit.standard_errors > GAIN * before.standard_errors).all():
+            break
+    return best
+
+
+def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
+    """Cut windows of one length out of records.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Without gaps.
+    starts : mapping of (int, int) to ndarray
+        Estimates of the state by record and first sample of each window.
+    length : int
+        Samples from a window's first to its last.
+
+    Returns
+    -------
+    Windows
+        In the order of the starts.
+    """
+
+    def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
+        return np.stack([values[index][k : k + samples] for index, k in starts], 1)
+
+    inputs = [np.zeros((len(record.y), 0)) if record.u is None else record.u for record in records]
+    return Windows(cut([record.y for record in records], length + 1), cut(inputs, length), np.array([*starts.values()]))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Outputs of a window of a record that took no part in the fit, predicted from the window's first half.
+
+    Parameters
+    ----------
+    record : Record
+        Of which it is a part.
+    first : int
+        The window's first sample.
+    y : ndarray, shape (steps + 1, ny)
+        Predicted outputs.
+    fitted : int
+        Samples from which the start of the motion was found; the others are foretold.
+    """
+
+    record: Record
+    first: int
+    y: np.ndarray
+    fitted: int
+
+    @property
+    def residuals(self) -> np.ndarray:
+        """Measured minus predicted outputs, (steps + 1, ny)."""
+        return np.asarray(self.record.y[self.first : self.first + len(self.y)] - self.y)
+
+
+def predict(
+    shooting: Shooting, theta: np.ndarray, records: Sequence[Record], guess: Guess, *, first: int, length: int
+) -> list[Prediction]:
+    """Predict the outputs of records from half of a window at their beginning.
+
+    Parameters
+    ----------
+    shooting : Shooting
+        The problem.
+    theta : ndarray, shape (p,)
+        Parameters found.
+    records : sequence of Record
+        Any that took no part.
+    guess : callable
+        As for :func:`fit_windows`.
+    first : int
+        As there.
+    length : int
+        Samples of a window.
+
+    Returns
+    -------
+    list of Prediction
+        One for each record that is long enough.
+    """
+    chosen = [record for record in records if len(record.y) > first + length]
+    if not chosen:
+        return []
+    fitted = length // 2
+    starts = {(i, first): guess(record, np.array([first]))[0] for i, record in enumerate(chosen)}
+    x0 = settled(shooting, theta, windows(chosen, starts, fitted))
+    whole = windows(chosen, starts, length)
+    y = shooting.outputs(np.tile(theta, (len(x0), 1)), x0, whole.u)
+    return [Prediction(record, first, y[:, i], fitted) for i, record in enumerate(chosen)]
+
+
+def described(fit: Fit, length: int) -> str:
+    """A line about a fit."""
+    values = ", ".join(
+        f"{name} = {value:.6g} +- {error:.2g}"
+        for (name, value), error in zip(fit.parameters.items(), fit.standard_errors)
+    )
+    return f"windows of {length} samples: {values}; residuals {', '.join(f'{noise:.3g}' for noise in fit.noise)}"

@@ -1,0 +1,169 @@
+"""A system's parameters as further states, which do not move."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from kkl_gym.equations import input_matrix
+from kkl_gym.system import Box, Components, System
+from observers.checks import shown
+from training.trajectories.controllers import Controller
+
+STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
+EVERY = "all"  # in the place of a parameter's name
+ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
+
+
+def with_values(system: System, values: Mapping[str, Any]) -> System:
+    """A system with parameters that need not be numbers.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    values : mapping of str to array, tensor or symbol
+        Parameters by name.
+
+    Returns
+    -------
+    System
+        One whose equations work with these values. It is good for nothing else.
+    """
+    changed = object.__new__(type(system))  # past the class's own check, which asks for floats
+    changed.__dict__.update(system.__dict__, **values)
+    return changed
+
+
+def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Ranges about the values that a system's parameters have.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    half_widths : mapping of str to float
+        By the parameter's name, how far it may be from its value, as a part of that. "all" stands for each parameter
+        that is not named.
+
+    Returns
+    -------
+    dict of str to (float, float)
+        Low and high end of each parameter, in the system's own order.
+
+    Raises
+    ------
+    ValueError
+        If the system lacks a parameter, or one of them is 0 or has no room.
+    """
+    known = system.parameters
+    for name in half_widths:
+        if name not in known and name != EVERY:
+            raise ValueError(
+                f"{system.name} has no parameter {shown(name)} to be uncertain; it has {', '.join(known) or 'none'}"
+            )
+    if half_widths and not known:
+        raise ValueError(f"{system.name} has no parameters that could be uncertain")
+    widths = {name: half_widths.get(name, half_widths.get(EVERY, 0.0)) for name in known}
+    ranges = {}
+    for name, width in widths.items():
+        value = known[name]
+        if not width:
+            continue
+        if not value:
+            raise ValueError(
+                f"the parameter {name} of {system.name} is 0, which has no relative range: leave it out, {name}=0"
+            )
+        ranges[name] = (value - width * abs(value), value + width * abs(value))
+    return ranges
+
+
+def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -> System:
+    """A system whose states are x and then some of its parameters, with derivative zero.
+
+    An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
+    states are derivatives by parameters as well.
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    ranges : mapping of str to (float, float)
+        Low and high end of each parameter that becomes a state, in this order. Starts are uniform in them.
+
+    Returns
+    -------
+    System
+        Of the same name, dt, noise and inputs; the same system if there are no ranges.
+
+    Raises
+    ------
+    ValueError
+        If the system lacks a parameter, or a range is empty.
+    """
+    for name, (low, high) in ranges.items():
+        if name not in system.parameters:
+            raise ValueError(
+                f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
+            )
+        if not low < high:
+            raise ValueError(f"the range of {name} must go from low to high, got {shown((low, high))}")
+    if not ranges:
+        return system
+    nx, names = system.nx, tuple(ranges)
+    still = ((0.0,) * system.nu,) * len(names)
+    constant = bool(system.nu) and type(system).g is System.g and not system.discrete
+
+    def model(x: Components) -> System:
+        return with_values(system, dict(zip(names, x[nx:], strict=True)))
+
+    class WithParameters(System):
+        name = system.name
+        state_names: ClassVar[tuple[str, ...]] = (*system.state_names, *names)
+        X: ClassVar[Box] = (*system.X, *((float(low), float(high)) for low, high in ranges.values()))
+        X_centre: ClassVar[tuple[float, ...]] = (*system.X_centre, *((a + b) / 2 for a, b in ranges.values()))
+        bounds: ClassVar[Box] = (
+            *system.bounds,
+            *(((a + b) / 2 - ROOM * (b - a), (a + b) / 2 + ROOM * (b - a)) for a, b in ranges.values()),
+        )
+        u_max: ClassVar[tuple[float, ...]] = system.u_max
+        G: ClassVar[tuple[tuple[float, ...], ...]] = (*system.G, *still) if constant else ()
+        scale: ClassVar[tuple[float, ...]] = (*system.scale, *(STILL,) * len(names))
+        dt = system.dt
+        process_noise = system.process_noise
+        measurement_noise = system.measurement_noise
+
+        def draw_starts(self, rng: Any, n: int, factor: float = 1.0) -> Any:
+            x = super().draw_starts(rng, n)  # parameters keep to their ranges, and states to what the system draws
+            x[:, :nx] = system.draw_starts(rng, n, factor)
+            return x
+
+        @property
+        def target(self) -> tuple[float, ...]:
+            return (*system.target, *(getattr(system, name) for name in names))
+
+        def h(self, x: Components) -> Components:
+            return model(x).h(x[:nx])
+
+        def rate(self, x: Components) -> Any:
+            return system.rate(x[:nx])  # near enough, and a formula for it may decide on its parameters
+
+        if system.discrete:
+
+            def step(self, x: Components, u: Components) -> Components:
+                return [*model(x).step(x[:nx], u), *x[nx:]]
+
+        else:
+
+            def f(self, x: Components) -> Components:
+                return [*model(x).f(x[:nx]), *(0.0 * value for value in x[nx:])]
+
+            if system.nu and not constant:
+
+                def g(self, x: Components) -> Sequence[Components]:
+                    return [*input_matrix(model(x), x[:nx]), *still]
+
+    return WithParameters()
+
+
+def blind(policy: Controller, nx: int) -> Controller:
+    """A policy for a system of :func:`with_parameters` that sees the nx states alone."""
+    return lambda x: policy(x[:, :nx])
