@@ -169,7 +169,15 @@ def adapt(
     config = override(_settings_of(observer), settings or {})
     dt = observer.filter.dt
     found = _parameters(
-        system, unknown, records, folder, dt=dt, steps=0, seed=config.seed, resume=resume, console=console,
+        system,
+        unknown,
+        records,
+        folder,
+        dt=dt,
+        steps=0,
+        seed=config.seed,
+        resume=resume,
+        console=console,
         observer=observer,
     )
     return _observer(found, config, folder, noise=None, resume=resume, console=console)
@@ -203,8 +211,16 @@ def _parameters(
         progress_bars(console, folder / LOG) as progress,
     ):
         found = estimate_parameters(
-            system, unknown, uniform, folder,
-            progress=progress, observer=observer, seed=seed, steps=steps, log=log, resume=resume,
+            system,
+            unknown,
+            uniform,
+            folder,
+            progress=progress,
+            observer=observer,
+            seed=seed,
+            steps=steps,
+            log=log,
+            resume=resume,
         )
         for line in found.told():
             progress.say(line)

@@ -8,11 +8,13 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from training.config import STRICT, Activation, Count, Levels, NotNegative, Optimiser, Positive, Share
-from training.records import Record, median_step
+from training.records import Record, jitter, median_step
+from training.records.resampling import ROUNDING
 from training.spectrum import evenly_spaced
 
 MODES = 12  # for each output
 SLOWEST, FASTEST = 0.15, 10.0  # eigenvalues, in multiples of the rate of the signals
+MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt
 NOISE_SHARE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
 
@@ -80,8 +82,8 @@ class RecordedConfig:
 def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> RecordedConfig:
     """Choose what the records decide: dt, the eigenvalues of A, and the largest noise.
 
-    dt is the median step. The eigenvalues follow from the rate of the signals, :func:`signal_rate`, and the largest
-    noise, as for a system, is a tenth of the standard deviation of each output.
+    dt is the median step, of three digits if steps are uneven. The eigenvalues follow from the rate of the signals, :func:`signal_rate`, and from the length
+    of the records. The largest noise is a tenth of the standard deviation of each output.
 
     Parameters
     ----------
@@ -101,11 +103,14 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
         If a setting makes no sense.
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
-    chosen: dict[str, Any] = {"dt": median_step(*records)}
-    chosen |= given
+    step = median_step(*records)
+    uneven = max(map(jitter, records)) > ROUNDING
+    chosen: dict[str, Any] = {"dt": float(f"{step:.3g}") if uneven else step} | given
     if "eigenvalues" not in given:
         rate = signal_rate(records)
-        spaced = evenly_spaced(MODES, -SLOWEST * rate, -min(FASTEST * rate, FASTEST_MODE / chosen["dt"]))
+        length = np.median([record.duration for record in records])
+        slowest = min(max(SLOWEST * rate, MEMORIES * np.log(1e3) / length), rate)
+        spaced = evenly_spaced(MODES, -slowest, -min(FASTEST * rate, FASTEST_MODE / chosen["dt"]))
         chosen["eigenvalues"] = tuple(float(f"{value:.6g}") for value in spaced)
     if "measurement_noise_max" not in given:
         y = np.concatenate([record.y for record in records])

@@ -26,6 +26,7 @@ from training.maps.optimise import Log, Stage, log_to, optimise
 from training.maps.samplers import TrajectorySampler
 from training.progress import LOG, ProgressBars, progress_bars
 from training.recorded.config import RecordedConfig
+from training.recorded.errors import RecordedErrors, recorded_errors
 from training.recorded.preparing import filter_of, fingerprint, split
 from training.recorded.windows import windows
 from training.records import Record, check_memory, pieces, resampled
@@ -44,11 +45,14 @@ class Recorded:
         For each network, its error after so many batches.
     held_out : list of Record
         What was not trained on, on the observer's grid.
+    errors : RecordedErrors
+        On that.
     """
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
     held_out: list[Record]
+    errors: RecordedErrors
 
 
 def train_recorded(
@@ -141,7 +145,11 @@ def train_recorded(
                 "hidden": signals.hidden,
             },
         )
-    return Recorded(artifact, run.losses, held_out)
+        found = recorded_errors(artifact, held_out)
+    known = {signal: error for signal, error in found.relative.items() if math.isfinite(error)}  # as JSON can hold it
+    training = {**artifact.training, "held_out_errors": known, "held_out_after": found.after}
+    artifact = dataclasses.replace(artifact, training=training)
+    return Recorded(artifact, run.losses, held_out, found)
 
 
 def _sampler(
