@@ -206,8 +206,8 @@ def compiled_step(system: System) -> Step:
     for points in _trials(system):
         rng, n = np.random.default_rng(0), points.shape[1]
         u, w = u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n))
-        found, expected = (advance(points, u, w, system.dt)[0] for advance in (substeps, in_numpy))
-        if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
+        by_symbols, by_numbers = (np.asarray(advance(points, u, w, system.dt)[0]) for advance in (substeps, in_numpy))
+        if not np.allclose(by_symbols, by_numbers, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
 

@@ -20,6 +20,8 @@ from typing import Any, NoReturn
 COMMANDS = {
     "check": ("check", "Check"),
     "train": ("train", "Train"),
+    "identify": ("identify", "Identify"),
+    "adapt": ("identify", "Adapt"),
     "evaluate": ("evaluate", "Evaluate"),
     "benchmark": ("benchmark", "Benchmark"),
     "agent": ("agent", "AgentCommand"),
@@ -35,6 +37,8 @@ COMMANDS = {
 # What an interruption may be followed by, by the first words of the command.
 AFTER_INTERRUPTION = {
     ("train",): "--resume goes on from the last checkpoint",
+    ("identify",): "--resume goes on from the last checkpoint",
+    ("adapt",): "--resume goes on from the last checkpoint",
     ("benchmark",): "the same command goes on",
     ("agent", "train"): "--resume goes on from the last checkpoint",
     ("agent", "compare"): "the same command goes on",

@@ -256,13 +256,43 @@ def read_changes(path: Path) -> dict[str, Any]:
     if not isinstance(found, dict) or not set(found) <= set(types):
         unknown = sorted(set(found) - set(types)) if isinstance(found, dict) else type(found).__name__
         raise ValueError(f"{path} must be an object of settings among {', '.join(sorted(types))}; it has {unknown}")
-    changes = {}
-    for name, value in found.items():
+    return _validated(found, str(path))
+
+
+def settings_of(training: Mapping[str, Any]) -> Config:
+    """The configuration behind what an artifact says of its training.
+
+    Parameters
+    ----------
+    training : mapping of str to object
+        By names of now or of before, with other things beside.
+
+    Returns
+    -------
+    Config
+        What it says; settings that are not in it have their defaults.
+
+    Raises
+    ------
+    ValueError
+        If it says nothing of the filter, or a value makes no sense.
+    """
+    known = setting_types()
+    found = {name: value for name, value in current_names(training).items() if name in known and value is not None}
+    if not {"pipeline", "eigenvalues"} <= set(found):
+        raise ValueError("the observer does not say how it was trained, so that it cannot be trained again")
+    return Config(**_validated(found, "the observer's training"))
+
+
+def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Settings that came through JSON, each of its type and within its limits."""
+    types, found = setting_types(), {}
+    for name, value in settings.items():
         try:
-            changes[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
+            found[name] = TypeAdapter(types[name]).validate_json(json.dumps(value), strict=True)
         except ValidationError as error:
-            raise ValueError(f"{path}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
-    return changes
+            raise ValueError(f"{where}: {name} = {value!r}: {error.errors()[0]['msg']}") from None
+    return found
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:

@@ -56,7 +56,24 @@ OneParameter = Annotated[
 ]
 # Each by an option of its own, which is given several times: words after one might as well be observers.
 RepeatedParameters = Annotated[tuple[OneParameter, ...], tyro.conf.UseAppendAction]
-# Each by an option of its own, which is given several times.
+# Several words after one option, and the option several times.
+Unknowns = Annotated[
+    tuple[
+        Annotated[
+            Mapping[str, tuple[float, ...]],
+            PrimitiveConstructorSpec(
+                nargs="*",
+                metavar="NAME=VALUE[:LOW:HIGH]",
+                instance_from_str=lambda words: dict(map(read_unknown, words)),
+                is_instance=lambda value: True,
+                str_from_instance=lambda found: [f"{name}={':'.join(map(str, of))}" for name, of in found.items()],
+            ),
+        ],
+        ...,
+    ],
+    tyro.conf.UseAppendAction,
+    tyro.conf.arg(help_behavior_hint=""),
+]
 HalfWidths = Annotated[
     tuple[
         Annotated[
@@ -122,8 +139,6 @@ OwnPolicy = Annotated[
 
 def read_parameter(text: str) -> tuple[str, float]:
     """Read a parameter, written as ``mu=3.3``.
-def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
 
     Parameters
     ----------
@@ -136,9 +151,6 @@ def read_half_width(text: str) -> tuple[str, float]:
         Of the parameter; nobody has looked for it.
     value : float
         Its value.
-        Of the parameter, or "all".
-    share : float
-        How far it may be from its value, as a part of that.
 
     Raises
     ------
@@ -150,6 +162,58 @@ def read_half_width(text: str) -> tuple[str, float]:
         return name.strip(), float(value)
     except ValueError:
         raise ValueError(f"{text!r} is no parameter with its value: write NAME=VALUE, as in mu=3.3") from None
+
+
+def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
+    """Read an unknown parameter, written as ``mu=1.5``, or with limits as ``mu=1.5:0.5:6``.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the parameter; nobody has looked for it.
+    numbers : tuple of float, length 1 or 3
+        A first guess and, where they were given, the lowest and the highest value.
+
+    Raises
+    ------
+    ValueError
+        If it is something else.
+    """
+    name, _, values = text.partition("=")
+    try:
+        numbers = tuple(float(value) for value in values.split(":"))
+    except ValueError:
+        numbers = ()
+    if not name.strip() or len(numbers) not in (1, 3):
+        raise ValueError(
+            f"{text!r} is no unknown parameter: write NAME=VALUE, or NAME=VALUE:LOW:HIGH, as in mu=1.5:0.5:6"
+        )
+    return name.strip(), numbers
+
+
+def read_half_width(text: str) -> tuple[str, float]:
+    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the parameter, or "all".
+    share : float
+        How far it may be from its value, as a part of that.
+
+    Raises
+    ------
+    ValueError
         If it is neither.
     """
     name, _, share = text.rpartition("=")

@@ -25,7 +25,7 @@ from training.progress import ProgressBars
 from training.records import Record, check_memory, pieces
 from training.spectrum import Spectrum, evenly_spaced
 
-WIDTH, DEPTH, BATCH, STEPS, LEARNING_RATE = 128, 3, 512, 2000, 3e-3
+WIDTH, DEPTH, BATCH, STEPS, LEARNING_RATE = 128, 3, 512, 1500, 3e-3
 RECORDED = 20  # batches between two values of the parameters that a report shows
 HELD_OUT = 10  # every so many records one is left out of the fit, for tests of what it predicts
 FORGOTTEN = 0.01  # part of the filter's start that may be left in a first guess of the state

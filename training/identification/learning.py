@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
-from training.config import Config, current_names, override, read_settings
+from training.config import Config, override, settings_of
 from training.identification.identify import STEPS, Identified, Limits, estimate_parameters
 from training.identification.report import write_report
 from training.jobs import claimed_run, describe
@@ -166,7 +165,7 @@ def adapt(
     ValueError
         As for :func:`identify`, and if the observer's settings are not those of a training.
     """
-    config = override(_settings_of(observer), settings or {})
+    config = override(settings_of(observer.training), settings or {})
     dt = observer.filter.dt
     found = _parameters(
         system,
@@ -249,8 +248,3 @@ def _observer(
         )
     artifact.save(folder / f"{found.system.name}.safetensors")
     return Learned(found, dataclasses.replace(result, artifact=artifact))
-
-
-def _settings_of(observer: Artifact) -> Config:
-    """The configuration that an observer was trained with."""
-    return read_settings(current_names(observer.training))

@@ -11,6 +11,7 @@ from training.trajectories.parameters import with_parameters
 
 STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
 SETTLING, RESETTLING = 12, 4  # Levenberg-Marquardt steps of starts before parameters move, and after each step
+NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off from a linear one
 WORSE = 1.2  # times the mean square of before, from which on a window's start is looked for again
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
@@ -220,6 +221,43 @@ def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarr
     motions = problem.follow(theta, windows.x0, problem.rows)
     problem.settle(theta, motions, problem.rows, SETTLING)
     return motions.x0
+
+
+def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
+    """Which windows are so short that what is still unknown of the parameters changes their outputs linearly.
+
+    Beyond that, chaos makes least squares blind: they have many minima, and their curvature says nothing of errors.
+
+    Parameters
+    ----------
+    shooting : Shooting
+        The problem.
+    fit : Fit
+        What is known of the parameters, from shorter windows.
+    windows : Windows
+        Longer ones.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        False where a change by a standard error is off by more than a part of the noise.
+    """
+    theta, problem = np.array(list(fit.parameters.values())), _Problem(shooting, windows)
+    at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
+    J = problem.derivatives(theta, at, problem.rows)
+    nx, Jw = at.x0.shape[1], J * problem.weight[:, None]
+    H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
+    follows = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
+    linear = np.isfinite(at.each)
+    for i, error in enumerate(np.minimum(fit.standard_errors / fit.unit, 1.0)):
+        moved = theta.copy()
+        moved[i] += error * shooting.unit[i]
+        x0 = at.x0 + error * shooting.half * follows[..., i]
+        y = problem.follow(moved, x0, problem.rows).y
+        off = y - at.y - error * (J[..., nx + i] + np.einsum("knya,na->kny", J[..., :nx], follows[..., i]))
+        off = np.where(problem.there, off, 0.0) / np.maximum(fit.noise, 1e-300)
+        linear &= np.sqrt((off**2).sum((0, 2)) / problem.count) < NONLINEAR
+    return linear
 
 
 def explained(each: np.ndarray) -> np.ndarray:

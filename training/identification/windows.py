@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from training.identification.shooting import Fit, Shooting, Windows, settled, shoot
+from training.identification.shooting import Fit, Shooting, Windows, predictable, settled, shoot
 from training.records import Record
 
 FIRST_LENGTH = 100  # samples of the first windows, fewer where records are short
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
-GAIN = 0.8  # standard errors at twice the length, over those before, from which on longer windows are not worth it
+GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
+MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
 MOST_SAMPLES = 6400  # of a window
 
@@ -70,9 +71,13 @@ def fit_windows(
             for (index, k), x in found.items()
             if (k - first) % length == 0 and k + length < len(records[index].y)
         }
-        theta = np.array(list(best.parameters.values()))
-        fit = shoot(shooting, theta, windows(records, starts, length))
-        if fit.used.mean() < LEAST_USED or fit.cost > 2 * best.cost:
+        longer = windows(records, starts, length)
+        keep = predictable(shooting, best, longer)
+        if keep.mean() < LEAST_USED:
+            break
+        starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
+        fit = shoot(shooting, np.array(list(best.parameters.values())), windows(records, starts, length))
+        if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost:
             break
         report(described(fit, length))
         before, best = best, fit

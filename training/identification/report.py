@@ -1,0 +1,88 @@
+"""What was identified, in one picture."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from observers.storage import replacing
+from training.identification.identify import Identified
+
+LAGS = 40  # samples
+SHOWN = 3  # records that took no part
+
+
+def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
+    """Correlation of residuals with those of so many samples before.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (steps + 1, n)
+        Of some windows; NaN where nothing was measured.
+    lags : int
+        The largest distance.
+
+    Returns
+    -------
+    ndarray, shape (lags,)
+        From a distance of one sample on.
+    """
+    r = residuals - np.nanmean(residuals)
+    products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
+    return np.array(products) / max(np.nanmean(r**2), 1e-300)
+
+
+def write_report(path: Path, found: Identified) -> None:
+    """Draw the course of the parameters, predictions of records left out, and how white the residuals are.
+
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    found : Identified
+        What was identified.
+    """
+    from matplotlib.figure import Figure
+
+    shown = found.predictions[:SHOWN]
+    figure = Figure(figsize=(12, 3.2 + 2.2 * len(shown)), layout="constrained")
+    grid = figure.add_gridspec(1 + len(shown), 2)
+    _draw_course(figure.add_subplot(grid[0, 0]), found)
+    _draw_residuals(figure.add_subplot(grid[0, 1]), found)
+    for row, prediction in enumerate(shown, 1):
+        ax = figure.add_subplot(grid[row, :])
+        record, samples = prediction.record, slice(prediction.first, prediction.first + len(prediction.y))
+        t = record.t[samples]
+        for j, name in enumerate(record.signals.measured):
+            ax.plot(t, record.y[samples, j], ".", ms=2, color="0.6", label=f"{name}, measured")
+            ax.plot(t, prediction.y[:, j], lw=1.2, label="predicted")
+        ax.axvline(t[prediction.fitted], color="k", lw=0.8, ls=":")
+        ax.set(xlabel="t in s", title=f"{record.name}, left out; its start from the samples before the line")
+        ax.legend(loc="upper right", fontsize="small")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def _draw_course(ax: Any, found: Identified) -> None:
+    """Parameters while the network was trained, over the values that shooting found."""
+    for name in found.standard_errors:
+        final = found.system.parameters[name]
+        if found.history and final:
+            batches, values = zip(*((batch, values[name] / final) for batch, values in found.history), strict=True)
+            ax.plot(batches, values, label=name)
+    ax.axhline(1.0, color="k", lw=0.8, ls=":")
+    ax.set(xlabel="batch of the network", ylabel="parameter over its final value", title=found.system.name)
+    if found.history:
+        ax.legend()
+
+
+def _draw_residuals(ax: Any, found: Identified) -> None:
+    """Autocorrelation of the residuals of each output; white ones stay between the lines."""
+    fit = found.fit
+    for j, noise in enumerate(fit.noise):
+        values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)
+        ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals of {noise:.3g}")
+    limit = 1.96 / np.sqrt(max(np.isfinite(fit.residuals[:, fit.used, 0]).sum(), 1))
+    ax.axhspan(-limit, limit, color="0.85", zorder=0)
+    ax.set(xlabel="lag in samples", ylabel="autocorrelation", title="residuals of the windows")
+    ax.legend()
