@@ -17,8 +17,7 @@ from observers.artifact import resolve
 from training.commands.data import DataOptions
 from training.commands.options import OwnSystem, Parameters, SystemName, Unknowns
 from training.commands.settings import Settings
-from training.commands.train import duration
-from training.progress import LOG, progress_bars
+from training.progress import LOG, duration, progress_bars
 
 if TYPE_CHECKING:
     from training.identification import Learned

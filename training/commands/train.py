@@ -17,7 +17,7 @@ from training.commands.options import HalfWidths, Parameters
 from training.commands.settings import RecordedSettings, Settings
 from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
-from training.progress import LOG, ProgressBars, progress_bars
+from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
@@ -284,11 +284,3 @@ def expected(config: Config, found: "Estimate") -> Table:
     table.add_section()
     table.add_row("all", "", duration(sum(found.seconds.values())))
     return table
-
-
-def duration(seconds: float) -> str:
-    """Seconds as people say them: 40 s, 12 min, 3.5 h, 2.1 days."""
-    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400), ("h", 3600, 48 * 3600)):
-        if seconds < limit:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds / 86400:.3g} days"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from training.commands.data import DataOptions
-from training.progress import LOG, progress_bars
+from training.progress import LOG, duration, progress_bars
 from training.recorded.config import RecordedConfig, recorded_config
 from training.recorded.preparing import described
 
@@ -58,7 +58,6 @@ def train_from_data(
     ValueError
         If the name is none for a file, a setting is unknown here, or as :func:`training.recorded.fit.train_recorded`.
     """
-    from training.commands.train import duration
     from training.recorded.fit import train_recorded
     from training.recorded.report import write_recorded_report
 
