@@ -58,7 +58,7 @@ class Identify:
     """Go on from the checkpoints in the run's folder, if there are any."""
     threads: int = 1
     """CPU threads."""
-    observer: Settings = field(default_factory=dict)
+    training: Settings = field(default_factory=dict)
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
@@ -96,7 +96,7 @@ class Identify:
                 records,
                 folder,
                 dt=self.dt,
-                settings=self.observer,
+                settings=self.training,
                 steps=self.steps,
                 seed=self.seed,
                 resume=self.resume,
@@ -129,7 +129,7 @@ class Adapt:
     """Go on from the checkpoints in the run's folder, if there are any."""
     threads: int = 1
     """CPU threads."""
-    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
+    training: Settings = field(default_factory=dict)
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
@@ -175,7 +175,7 @@ class Adapt:
                 records,
                 folder,
                 unknown=limits(system, guesses),
-                settings=self.settings,
+                settings=self.training,
                 resume=self.resume,
                 console=progress,
             )
