@@ -6,6 +6,7 @@ The data are not part of this project: nonlinearbenchmark.org has them, as SNLS8
     python examples/silverbox.py SNLS80mV.csv
 """
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -122,7 +123,7 @@ def main(
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)
     edges = np.linspace(*TRAINING, RECORDS + 1).astype(int)
-    records = [part(data, begin, end) for begin, end in zip(edges, edges[1:])]
+    records = [part(data, begin, end) for begin, end in itertools.pairwise(edges)]
     with progress_bars(console, out / LOG) as progress:
         found = estimate_parameters(Silverbox(), LIMITS, records, out, progress=progress, steps=steps, seed=seed)
         for line in found.told():
