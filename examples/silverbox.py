@@ -6,7 +6,6 @@ The data are not part of this project: nonlinearbenchmark.org has them, as SNLS8
     python examples/silverbox.py SNLS80mV.csv
 """
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -31,7 +30,7 @@ SAMPLES = 131_072
 FREE = 50  # first samples of each test, from which its start may be found, and which do not count
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters and one of the multisine records
 ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # up to there it stays within the outputs of the training part
-RECORDS = 8  # that the training part is cut into; one is left out, for a look at what is predicted
+RECORDS, LENGTH = 8, 2_048  # taken from the training part; one is left out, for a look at what is predicted
 LIMITS = {
     "damping": (6.0, 600.0),
     "stiffness": (3e4, 3e6),
@@ -103,7 +102,7 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
     """Outputs (n,) of a motion that sees inputs alone; its start is the one that fits the first samples best."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
-    x0 = settled(Shooting(system, DT, LIMITS, np.abs(theta)), theta, windows([record], first, FREE - 1))
+    x0 = settled(Shooting(system, DT, LIMITS, np.ones(len(theta))), theta, windows([record], first, FREE - 1))
     return simulate(system, x0, len(record.y) - 1, DT, u=record.u[:-1, None])[:, 0, 0]
 
 
@@ -122,8 +121,8 @@ def main(
     """
     data, console = read(path), Console()
     out.mkdir(parents=True, exist_ok=True)
-    edges = np.linspace(*TRAINING, RECORDS + 1).astype(int)
-    records = [part(data, begin, end) for begin, end in itertools.pairwise(edges)]
+    begins = np.linspace(TRAINING[0], TRAINING[1] - LENGTH, RECORDS).astype(int)
+    records = [part(data, begin, begin + LENGTH) for begin in begins]
     with progress_bars(console, out / LOG) as progress:
         found = estimate_parameters(Silverbox(), LIMITS, records, out, progress=progress, steps=steps, seed=seed)
         for line in found.told():
