@@ -1,0 +1,111 @@
+"""From a CSV file to an observer inside a control loop: the plant's states are never seen, nor is its parameter known.
+
+The middle part from the command line, with the names and units of your own columns::
+
+    kkl-gym identify van_der_pol --data runs/from_csv/record.csv --unknown mu=2 --out runs/from_csv
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import tyro
+from rich.console import Console
+
+import kkl_gym
+import observers
+from observers.storage import write
+from training.identification import identify
+from training.records import read_records
+from training.systems import controller
+
+MU = 3.3  # of the plant; the model's first guess is GUESS
+GUESS, LIMITS = 2.0, (0.2, 20.0)
+NOISE = 0.1
+STARTS = ((-3.0, 3.0), (-6.0, 6.0))  # from which the controller's input is strong enough
+
+Policy = Callable[[np.ndarray, dict[str, np.ndarray]], np.ndarray]
+"""What an environment shows, the state, and its info in; an action out."""
+
+
+def record(env: kkl_gym.KKLEnv, path: Path, *, seconds: float, seed: int) -> None:
+    """Write what a data logger would: times, inputs and noisy outputs, while a random input excites the plant."""
+    rng, rows = np.random.default_rng(seed), []
+    _, info = env.reset(seed=seed)
+    for k in range(round(seconds / env.dt)):
+        if k % 50 == 0:
+            action = rng.uniform(-1.0, 1.0, 1)
+        y = info["y"][0]
+        _, _, _, _, info = env.step(action)
+        rows.append((k * env.dt, info["u"][0], y))  # u is held from this sample to the next
+    write(path, pd.DataFrame(rows, columns=["t", "u", "y"]).to_csv(index=False))
+
+
+def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) -> float:
+    """Mean of c = mean(((x - target) / scale)^2) over time and episodes, which differ in start and noise."""
+    costs = []
+    for seed in range(episodes):
+        x, info = env.reset(seed=seed)
+        for _ in range(round(seconds / env.dt)):
+            x, reward, _, _, info = env.step(policy(x, info))
+            costs.append((1.0 / reward - 1.0) / 4.0)  # as the reward is 1 / (1 + 4 c)
+    return float(np.mean(costs))
+
+
+def main(
+    seconds: float = 60.0,
+    steps: int = 500,
+    inverse_steps: int = 3000,
+    trajectories: int = 500,
+    out: Path = Path("runs/from_csv"),
+    seed: int = 0,
+) -> tuple[float, float, float]:
+    """Record, identify, control; returns mu as found, and the costs with x_hat and with the true state.
+
+    Args:
+        seconds: length of the record.
+        steps: batches of the network that finds first guesses.
+        inverse_steps: batches of the observer's training; `kkl-gym identify` has more, and its observer errs less.
+        trajectories: simulated trajectories of the plant found, to train on.
+        out: the run's folder.
+        seed: of everything random.
+    """
+    plant = kkl_gym.KKLEnv("van_der_pol", parameters={"mu": MU}, measurement_noise=NOISE, start_box=STARTS)
+    out.mkdir(parents=True, exist_ok=True)
+    record(plant, out / "record.csv", seconds=seconds, seed=seed)
+
+    model = kkl_gym.get_system("van_der_pol", {"mu": GUESS})
+    learned = identify(
+        model,
+        {"mu": LIMITS},
+        read_records([out / "record.csv"], system=model),
+        out,
+        settings={"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 20.0},
+        steps=steps,
+        seed=seed,
+        resume=True,
+        console=Console(),
+    )
+
+    act = controller(learned.identified.system)  # made for the model found: nobody knows the plant
+    observer = observers.load(str(out / "van_der_pol.safetensors"), NOISE)
+
+    def on_estimate(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:
+        """Act on what the observer makes of samples and inputs; it is what runs beside a real plant."""
+        x_hat = observer.reset(info["y"]) if info["sample"] == 0 else observer.step(info["y"], info["u"])
+        return act(x_hat[None])[0]
+
+    def on_state(x: np.ndarray, info: dict[str, np.ndarray]) -> np.ndarray:
+        """Act on the true state, which a real plant does not show."""
+        return act(info["x"][None])[0]
+
+    found = learned.identified.system.parameters["mu"]
+    with_estimate, with_state = (cost(plant, policy, seconds=20.0, episodes=5) for policy in (on_estimate, on_state))
+    print(f"mu = {found:.4f} +- {learned.identified.standard_errors['mu']:.2g}, from {GUESS:g}; it is {MU:g}")
+    print(f"mean cost of five episodes of 20 s: {with_estimate:.4f} with x_hat, {with_state:.4f} with the true state")
+    return found, with_estimate, with_state
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

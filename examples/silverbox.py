@@ -1,0 +1,162 @@
+"""The Silverbox, the standard benchmark of nonlinear identification: an electronic Duffing oscillator, measured.
+
+The data are not part of this project: nonlinearbenchmark.org has them, as SNLS80mV.csv with columns V1 (input) and V2
+(output), 131,072 samples at 610.35 Hz. docs/silverbox.md says what is assumed and what comes out::
+
+    python examples/silverbox.py SNLS80mV.csv
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import kkl_gym
+from kkl_gym.simulate import simulate
+from observers.storage import replacing
+from training.identification import estimate_parameters
+from training.identification.shooting import Shooting, settled
+from training.identification.windows import windows
+from training.progress import LOG, progress_bars
+from training.records import Record
+
+DT = 2**14 / 1e7  # s
+SAMPLES = 131_072
+FREE = 50  # first samples of each test, from which its start may be found, and which do not count
+TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters and one of the multisine records
+ARROW, ARROW_INSIDE = (100, 40_575), (100, 32_100)  # up to there it stays within the outputs of the training part
+RECORDS, LENGTH = 8, 2_048  # taken from the training part; one is left out, for a look at what is predicted
+LIMITS = {
+    "damping": (6.0, 600.0),
+    "stiffness": (3e4, 3e6),
+    "square": (-1e5, 1e5),
+    "cube": (4e4, 4e6),
+    "offset": (-1e4, 1e4),
+    "gain": (1e4, 1e6),
+    "before": (-1.0, 1.0),
+    "after": (-1.0, 1.0),
+}
+PUBLISHED = {"NARX (SysIdentPy)": (7.73, 4.15, 2.23), "SUBNET, nx = 4": (None, 6.79, 2.24)}
+
+
+@dataclass(frozen=True)
+class Silverbox(kkl_gym.System):
+    """A forced Duffing oscillator, y'' = -damping y' - (stiffness + square y + cube y^2) y + offset + gain u(t).
+
+    The generator's input is smooth between samples. Held over an interval, as here, a weighted sum of three samples
+    acts as it does: inputs are V1 before, at and after the interval's first sample. For signals that are slow against
+    sampling the weights before = -1/6 and after = 1/3 are right to second order.
+    """
+
+    damping: float = 60.0  # 1/s
+    stiffness: float = 2.6e5  # 1/s^2
+    square: float = 0.0  # 1/(V s^2)
+    cube: float = 4e5  # 1/(V^2 s^2)
+    offset: float = 0.0  # V/s^2
+    gain: float = 1.2e5  # 1/s^2
+    before: float = 0.0  # weights of the neighbours of the sample itself, which has the rest
+    after: float = 0.0
+
+    name: ClassVar[str] = "silverbox"
+    state_names: ClassVar = ("position in V", "velocity in V/s")
+    X: ClassVar = ((-0.3, 0.3), (-130.0, 130.0))  # what the outputs and their differences show
+    bounds: ClassVar = ((-3.0, 3.0), (-1300.0, 1300.0))
+    u_max: ClassVar = (0.15, 0.15, 0.15)  # V
+    dt: ClassVar[float] = DT
+
+    def f(self, x):
+        """Drift."""
+        y, v = x
+        return v, self.offset - self.damping * v - (self.stiffness + (self.square + self.cube * y) * y) * y
+
+    def g(self, x):
+        """Input matrix."""
+        at = 1.0 - self.before - self.after
+        return (0.0, 0.0, 0.0), (self.gain * self.before, self.gain * at, self.gain * self.after)
+
+    def h(self, x):
+        """Output."""
+        return (x[0],)
+
+
+def read(path: Path) -> np.ndarray:
+    """Input and output in V, (131072, 2)."""
+    data = pd.read_csv(path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
+    if data.shape != (SAMPLES, 2):
+        raise ValueError(f"{path} has {len(data)} samples, but the Silverbox has {SAMPLES}")
+    return data
+
+
+def part(data: np.ndarray, begin: int, end: int) -> Record:
+    """Some samples as a record, whose inputs are those before, at and after each sample."""
+    u = np.stack([data[begin + shift : end + shift, 0] for shift in (-1, 0, 1)], axis=-1)
+    return Record(f"[{begin}:{end}]", DT * np.arange(end - begin), data[begin:end, 1:], u)
+
+
+def simulated(system: Silverbox, record: Record) -> np.ndarray:
+    """Outputs (n,) of a motion that sees inputs alone; its start is the one that fits the first samples best."""
+    theta = np.array([system.parameters[name] for name in LIMITS])
+    first = {(0, 0): np.array([record.y[0, 0], 0.0])}
+    x0 = settled(Shooting(system, DT, LIMITS, np.ones(len(theta))), theta, windows([record], first, FREE - 1))
+    return simulate(system, x0, len(record.y) - 1, DT, u=record.u[:-1, None])[:, 0, 0]
+
+
+def main(
+    path: Annotated[Path, tyro.conf.Positional], steps: int = 300, out: Path = Path("runs/silverbox"), seed: int = 0
+) -> list[float]:
+    """Identify, simulate the tests, print a table and draw a figure.
+
+    Returns the errors in mV rms on the multisine's test quarter, the arrow, and the arrow without extrapolation.
+
+    Args:
+        path: SNLS80mV.csv.
+        steps: batches of the network that finds first guesses.
+        out: the run's folder.
+        seed: of the network, the only thing that is random.
+    """
+    data, console = read(path), Console()
+    out.mkdir(parents=True, exist_ok=True)
+    begins = np.linspace(TRAINING[0], TRAINING[1] - LENGTH, RECORDS).astype(int)
+    records = [part(data, begin, begin + LENGTH) for begin in begins]
+    with progress_bars(console, out / LOG) as progress:
+        found = estimate_parameters(Silverbox(), LIMITS, records, out, progress=progress, steps=steps, seed=seed)
+        for line in found.told():
+            progress.say(line)
+
+    tests = {"multisine": part(data, *MULTISINE), "arrow": part(data, *ARROW)}
+    y = {name: simulated(found.system, record) for name, record in tests.items()}
+    residuals = {name: 1e3 * (record.y[:, 0] - y[name]) for name, record in tests.items()}
+    inside = residuals["arrow"][: ARROW_INSIDE[1] - ARROW_INSIDE[0]]
+    errors = [float(np.sqrt(np.mean(r[FREE:] ** 2))) for r in (*residuals.values(), inside)]
+
+    table = Table("", "multisine", "arrow", "arrow without extrapolation", title="simulated outputs, mV rms")
+    for name, values in {"Duffing equation, identified here": errors, **PUBLISHED}.items():
+        table.add_row(name, *("" if value is None else f"{value:.2f}" for value in values))
+    console.print(table)
+    draw(out / "silverbox.png", tests, residuals)
+    console.print(f"wrote {out / 'silverbox.png'}")
+    return errors
+
+
+def draw(path: Path, tests: dict[str, Record], residuals: dict[str, Any]) -> None:
+    """Draw measured outputs, and what simulated ones leave of them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    axes = figure.subplots(2, len(tests), sharex="col", sharey="row")
+    for (above, below), (name, record) in zip(axes.T, tests.items(), strict=True):
+        above.plot(record.t, record.y, lw=0.3)
+        below.plot(record.t[FREE:], residuals[name][FREE:], lw=0.3, color="C3")
+        above.set(title=name, ylabel="V2 in V")
+        below.set(xlabel="t in s", ylabel="V2 - simulated V2 in mV")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
