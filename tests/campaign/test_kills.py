@@ -252,7 +252,7 @@ class Campaign:
             if done:
                 self.counts["resumed"] += 1
             if not killed:
-                if not done:  # a kill at a random moment needs to know how long a run takes, on a machine as busy as now
+                if not done:  # kills are to be anywhere in a run, on a machine as busy as it is now
                     self.seconds = time.monotonic() - began
                 break
             done += 1
