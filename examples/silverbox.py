@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import kkl_gym
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import advance
 from observers.storage import replacing
 from training.identification import estimate_parameters
 from training.identification.shooting import Shooting, settled
@@ -83,6 +83,10 @@ class Silverbox(kkl_gym.System):
         """Output."""
         return (x[0],)
 
+    def rate(self, x):
+        """Frequency of small motions about x, in rad/s."""
+        return abs(self.stiffness + (2.0 * self.square + 3.0 * self.cube * x[0]) * x[0]) ** 0.5
+
 
 def read(path: Path) -> np.ndarray:
     """Input and output in V, (131072, 2)."""
@@ -102,8 +106,14 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
     """Outputs (n,) of a motion that sees inputs alone; its start is the one that fits the first samples best."""
     theta = np.array([system.parameters[name] for name in LIMITS])
     first = {(0, 0): np.array([record.y[0, 0], 0.0])}
-    x0 = settled(Shooting(system, DT, LIMITS, np.ones(len(theta))), theta, windows([record], first, FREE - 1))
-    return simulate(system, x0, len(record.y) - 1, DT, u=record.u[:-1, None])[:, 0, 0]
+    x = settled(Shooting(system, DT, LIMITS, np.ones(len(theta))), theta, windows([record], first, FREE - 1))[
+        0
+    ].tolist()
+    y = [x[0]]
+    for u in record.u[:-1].tolist():
+        x = advance(system, x, u, (0.0, 0.0), DT)
+        y.append(x[0])
+    return np.array(y)
 
 
 def main(

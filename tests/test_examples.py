@@ -113,6 +113,15 @@ def test_circle_pendulum(tmp_path):
     assert (errors < 0.3).all()
 
 
+def test_from_csv(tmp_path, capsys):
+    sizes = {"seconds": 30.0, "steps": 100, "inverse_steps": 600, "trajectories": 100}
+    mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
+    assert abs(mu - 3.3) < 0.1
+    assert with_estimate < 1.5 * with_state
+    assert (tmp_path / "record.csv").read_text().startswith("t,u,y\n")
+    assert "with x_hat" in capsys.readouterr().out
+
+
 def test_sb3_agent():
     reward = example("sb3_agent")(num_envs=2, steps=256)
     assert example("sb3_agent")(num_envs=2, steps=256) == reward  # everything random is seeded
