@@ -385,7 +385,8 @@ def _judged(
     told = np.abs(hidden).max(1, initial=0.0) < TOLD
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
     covariance = seen @ np.linalg.pinv(seen.T @ information @ seen, hermitian=True) @ seen.T  # of logarithms
-    errors = {name: float(size[i] * np.sqrt(covariance[i, i])) if told[i] else None for i, name in enumerate(names)}
+    relative = np.maximum(np.sqrt(np.diag(covariance)), SIMULATED)
+    errors = {name: float(size[i] * relative[i]) if told[i] else None for i, name in enumerate(names)}
     products = []
     for powers in combinations(names, hidden):
         exponents = np.array([float(powers.get(name, 0)) for name in names])
