@@ -49,6 +49,7 @@ results: $(VENV)/ready  ## the figures and the accuracy in the README and in doc
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
 
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark

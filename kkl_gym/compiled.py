@@ -205,9 +205,9 @@ def compiled_step(system: System) -> Step:
     rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
     for points in _trials(system):
         rng, n = np.random.default_rng(0), points.shape[1]
-        u, w = u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n))
-        ends = [advance(points, u, w, system.dt)[0] for advance in (substeps, in_numpy)]
-        if not np.allclose(*ends, rtol=1e-9, atol=rounding, equal_nan=True):
+        at = points, u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n)), system.dt
+        found, expected = substeps(*at)[0], in_numpy(*at)[0]
+        if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
 

@@ -26,6 +26,8 @@ Levels = Annotated[
     Discriminator(lambda value: "each" if isinstance(value, list | tuple) else "all"),
 ]
 
+STRICT = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
 # What settings were called before; files and artifacts that say it so are still read.
 FORMER_NAMES = {
     "method": "pipeline",
@@ -42,9 +44,7 @@ FORMER_NAMES = {
 }
 
 
-@dataclass(
-    frozen=True, config=ConfigDict(strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-)
+@dataclass(frozen=True, config=STRICT)
 class Config:
     """A training run; together with the system it determines the artifact.
 

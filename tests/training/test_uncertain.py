@@ -76,7 +76,7 @@ def test_it_identifies_the_plant_while_it_runs():
     assert artifact.estimated_parameters == ("stiffness",)
     assert artifact.parameter_ranges == {"stiffness": (3.6, 4.4)}
     drawn = 10.0 / np.sqrt(3)  # in percent, of who only knows the range
-    how = {"plants": 30, "duration": 15.0, "seed": 5}
+    how = {"trajectories": 30, "duration": 15.0, "seed": 5}
     clean, noisy = (parameter_errors(artifact, system, measurement_noise=level, **how)[0] for level in (0.0, 0.05))
     assert clean < 0.2 * drawn
     assert clean < noisy < 0.7 * drawn
@@ -197,4 +197,4 @@ def test_a_name_that_is_no_parameter_is_refused_before_any_work(tmp_path):
 
 def test_who_estimates_no_parameters_is_not_asked_how_well():
     with pytest.raises(ValueError, match="estimates no parameters"):
-        parameter_errors(trained(), Spring(), plants=2, duration=1.0, measurement_noise=0.0, seed=0)
+        parameter_errors(trained(), Spring(), trajectories=2, duration=1.0, measurement_noise=0.0, seed=0)

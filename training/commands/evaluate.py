@@ -1,6 +1,6 @@
 """``kkl-gym evaluate``."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from training.evaluation.errors import (
 )
 from training.evaluation.levels import Level, as_cell, beyond, level_for, show_level
 from training.evaluation.metrics import by_state
+from training.evaluation.parameters import parameter_errors, show_ranges
 from training.evaluation.plants import off_by, show_parameters
 from training.progress import ProgressBars, progress_bars
 from training.trajectories.controllers import Controller
@@ -61,6 +62,9 @@ class Evaluate:
     there for observers that take inputs, "process noise" where there is any; the CSV file always has both.
     Under a policy, those are driven in which it errs about the state and explores; in the others its inputs tell the
     state to an observer that has learned the policy.
+
+    Of an observer that estimates parameters, a third table has their errors: root mean squares over plants that are
+    drawn from the ranges of its training, over time, and from starts in X.
 
     The trajectories are those of the system that the observer was made for, or of a plant with other parameters, by
     --plant or --plant-error. Observer and Kalman filter know nothing of that, and keep their own. Starts, policy,
@@ -147,6 +151,8 @@ class Evaluate:
         on = f", plant {show_parameters(plant)}, model {show_parameters(system)}" if plant else ""
         runs = f"{self.trajectories} runs of {duration:g} s"
         smape = self._table(f"{name}: SMAPE in %, median (IQR) of {runs}{on}", artifact)
+        if artifact.parameter_ranges:
+            smape.caption = f"trained for {show_ranges(artifact)}"
         nrmse = self._table(f"{name}: NRMSE in % after transient, median{on}", artifact)
         for table, measures in ((smape, ("all steps", "after transient", "escaped")), (nrmse, system.state_names)):
             for measure in measures:
@@ -184,9 +190,46 @@ class Evaluate:
                 progress.advance(bar)
         if frames:
             progress.console.print(smape, nrmse)
+            if artifact.estimated_parameters:
+                with progress.phase("estimating parameters"):
+                    table = self._parameters(name, artifact, system, plant, levels, policy)
+                progress.console.print(table)
         for reason in left_out:
             progress.say(f"{name}, left out: {reason}")
         return frames
+
+    def _parameters(
+        self,
+        name: str,
+        artifact: Artifact,
+        system: System,
+        plant: System | None,
+        levels: Sequence[Level],
+        policy: Controller | None,
+    ) -> Table:
+        """A table of errors of estimated parameters, from starts in X."""
+        on = f"plant {show_parameters(plant)}" if plant else "plants drawn from their ranges"
+        table = Table(title=f"{name}: parameters, rms error in % of their values after transient, {on}")
+        for column in (*(["driven"] if artifact.nu else []), "noise\non y", *artifact.estimated_parameters):
+            table.add_column(column, justify="right")
+        for driven in (False, True)[: 2 if artifact.nu else 1]:
+            for level in levels:
+                found = parameter_errors(
+                    artifact,
+                    system,
+                    trajectories=self.trajectories,
+                    duration=system.duration if self.duration is None else self.duration,
+                    measurement_noise=level,
+                    seed=self.seed,
+                    process_noise=self.process_noise,
+                    driven=driven,
+                    policy=policy,
+                    plant=plant,
+                )
+                table.add_row(
+                    *(["yes" if driven else "no"] if artifact.nu else []), show_level(level), *map(percent, found)
+                )
+        return table
 
     def _rows(self, found: Errors, case: dict[str, Any], level: Level) -> "pd.DataFrame":
         """Of the CSV file."""

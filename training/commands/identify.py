@@ -17,8 +17,7 @@ from observers.artifact import resolve
 from training.commands.data import DataOptions
 from training.commands.options import OwnSystem, Parameters, SystemName, Unknowns
 from training.commands.settings import Settings
-from training.commands.train import duration
-from training.progress import LOG, progress_bars
+from training.progress import LOG, duration, progress_bars
 
 if TYPE_CHECKING:
     from training.identification import Learned
@@ -59,7 +58,7 @@ class Identify:
     """Go on from the checkpoints in the run's folder, if there are any."""
     threads: int = 1
     """CPU threads."""
-    observer: Settings = field(default_factory=dict)
+    training: Settings = field(default_factory=dict)
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
@@ -97,7 +96,7 @@ class Identify:
                 records,
                 folder,
                 dt=self.dt,
-                settings=self.observer,
+                settings=self.training,
                 steps=self.steps,
                 seed=self.seed,
                 resume=self.resume,
@@ -130,7 +129,7 @@ class Adapt:
     """Go on from the checkpoints in the run's folder, if there are any."""
     threads: int = 1
     """CPU threads."""
-    settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
+    training: Settings = field(default_factory=dict)
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
@@ -176,7 +175,7 @@ class Adapt:
                 records,
                 folder,
                 unknown=limits(system, guesses),
-                settings=self.settings,
+                settings=self.training,
                 resume=self.resume,
                 console=progress,
             )

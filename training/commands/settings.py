@@ -1,7 +1,7 @@
 """The settings of a configuration as options of ``kkl-gym train``, each with what the presets take for it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Any, TypedDict, get_args
 
 import tyro
@@ -10,6 +10,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS
 from training.config import Config, Pipeline, setting_types
 from training.presets import Preset, preset
+from training.recorded.config import RecordedConfig
 
 SHOWN = 3  # numbers of a setting that has many
 ELSEWHERE = ("pipeline", "uncertain")  # options of their own
@@ -79,25 +80,30 @@ def _text(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _options() -> Any:
-    """A dictionary of settings, those that are given, with Config's own descriptions."""
-    described = Config.__pydantic_fields__  # type: ignore[attr-defined]
-    presets = defaults()
+def _options(name: str, of: Any, defaults: Mapping[str, str]) -> Any:
+    """A dictionary of settings, those that are given, with the descriptions of a class of settings."""
+    described = of.__pydantic_fields__
+    kinds = {entry.name: entry.type for entry in fields(of)}
     options = {}
-    for name, kind in setting_types().items():
-        if name in ELSEWHERE:
-            continue
+    for setting, default in defaults.items():
         argument = tyro.conf.arg(
-            help=" ".join((described[name].description or "").split()),
-            help_behavior_hint=f"(default: {presets[name]})",
+            help=" ".join((described[setting].description or "").split()), help_behavior_hint=f"(default: {default})"
         )
-        options[name] = Annotated[kind, argument]
-    return TypedDict("Settings", options, total=False)  # type: ignore[operator]
+        options[setting] = Annotated[kinds[setting], argument]
+    return TypedDict(name, options, total=False)  # type: ignore[operator]
+
+
+def _of_records() -> dict[str, str]:
+    """Defaults of the settings that only a training on recorded states has."""
+    found = {entry.name: entry.default for entry in fields(RecordedConfig)}
+    return {name: _text(default) for name, default in found.items() if name not in setting_types()}
 
 
 if TYPE_CHECKING:
     Settings = dict[str, Any]
+    RecordedSettings = dict[str, Any]
 else:
-    Settings = _options()
+    Settings = _options("Settings", Config, {k: v for k, v in defaults().items() if k not in ELSEWHERE})
+    RecordedSettings = _options("RecordedSettings", RecordedConfig, _of_records())
 
-__all__ = ["Settings", "defaults"]
+__all__ = ["RecordedSettings", "Settings", "defaults"]

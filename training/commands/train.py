@@ -12,19 +12,24 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
-from training.commands.options import HalfWidths, Parameters, SystemName
-from training.commands.settings import Settings
+from training.commands.data import DataOptions
+from training.commands.options import HalfWidths, Parameters
+from training.commands.settings import RecordedSettings, Settings
 from training.config import Config, Pipeline, read_changes
 from training.presets import CLOSED_LOOP, Preset, preset
-from training.progress import LOG, ProgressBars, progress_bars
+from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
 from training.trajectories.parameters import relative_ranges
 
 if TYPE_CHECKING:
+    import torch
+
     from training.dry_run import Estimate
     from training.pipeline import Result
+
+RECORDED = "recorded"  # name of an observer from recorded states, where the user gives none
 
 
 @dataclass(frozen=True)
@@ -35,7 +40,15 @@ class Train:
     printed and, where TensorBoard is installed, its scalars.
     """
 
-    system: SystemName
+    system: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            metavar="SYSTEM",
+            help="A shipped system, or a class of yours as script.py:Class or module:Class. With --data, a name of "
+            "your choice for what was recorded.",
+            help_behavior_hint="",
+        ),
+    ] = ""
     pipeline: Annotated[Pipeline, tyro.conf.arg(aliases=["--method"])] = "input-aware"
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
@@ -62,6 +75,10 @@ class Train:
     """Where networks are trained; auto takes a GPU if there is one."""
     dry_run: bool = False
     """Train nothing; say what it would take on this machine, by a few batches of the same sizes."""
+    data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
+    """Recorded states, where nobody knows the equations: T_inv is fitted to them, and nothing is simulated."""
+    recorded: tyro.conf.OmitArgPrefixes[RecordedSettings] = field(default_factory=dict)
+    """Of a training with --data alone."""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=dict)
     """What of the preset's configuration is to differ."""
 
@@ -96,6 +113,8 @@ class Train:
             raise ValueError("device cuda: torch sees no GPU; leave --device out to train on the CPU")
         torch.set_num_threads(self.threads)
         device = None if self.device == "auto" else torch.device(self.device)
+        if self._has_data():
+            return self._train_from_data(device, console)
         system = get_system(self.system, self.parameters)
         changes = self._changes()
         with progress_bars(console) as progress, progress.phase("choosing a spectrum"):
@@ -122,6 +141,36 @@ class Train:
             size, took = path.stat().st_size / 1e6, duration(time.monotonic() - began)
             progress.say(f"wrote {path} ({size:.2f} MB), report.png and {LOG} beside it, in {took}")
         return path
+
+    def _has_data(self) -> bool:
+        """Whether to train on recorded data; ValueError if options say both that and the contrary."""
+        plain = Train()
+        if not self.data.data:
+            given = [option for option in ("time", "measured", "inputs", "hidden") if getattr(self.data, option)]
+            given += self.recorded
+            if given:
+                raise ValueError(f"--{given[0].replace('_', '-')} needs recorded data (--data)")
+            if not self.system:
+                raise ValueError("name a system, or recorded data (--data)")
+            return False
+        for option in ("pipeline", "preset", "closed_loop", "uncertain", "parameters", "dry_run"):
+            if getattr(self, option) != getattr(plain, option):
+                raise ValueError(f"--{option.replace('_', '-')} is of no use with --data, where nothing is simulated")
+        return True
+
+    def _train_from_data(self, device: "torch.device | None", console: Console) -> Path:
+        from training.commands.train_recorded import train_from_data
+
+        settings = {**(read_changes(self.config) if self.config else {}), **self.settings, **self.recorded}
+        return train_from_data(
+            self.system or RECORDED,
+            self.data,
+            settings,
+            out=self.out,
+            resume=self.resume,
+            device=device,
+            console=console,
+        )
 
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
@@ -235,11 +284,3 @@ def expected(config: Config, found: "Estimate") -> Table:
     table.add_section()
     table.add_row("all", "", duration(sum(found.seconds.values())))
     return table
-
-
-def duration(seconds: float) -> str:
-    """Seconds as people say them: 40 s, 12 min, 3.5 h, 2.1 days."""
-    for unit, length, limit in (("s", 1, 90), ("min", 60, 5400), ("h", 3600, 48 * 3600)):
-        if seconds < limit:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds / 86400:.3g} days"

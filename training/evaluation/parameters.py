@@ -1,4 +1,4 @@
-"""How well an observer estimates the parameters of plants that it was trained for."""
+"""Ranges of parameters that an observer was trained for, and how well it estimates them."""
 
 import numpy as np
 
@@ -13,19 +13,25 @@ from training.trajectories.noise import noisy_output
 from training.trajectories.parameters import blind, with_parameters
 
 
+def show_ranges(artifact: Artifact) -> str:
+    """For people: ``mu from 2.7 to 3.3``, with commas between several; nothing where there are none."""
+    return ", ".join(f"{name} from {low:g} to {high:g}" for name, (low, high) in artifact.parameter_ranges.items())
+
+
 def parameter_errors(
     artifact: Artifact,
     system: System,
     *,
-    plants: int,
+    trajectories: int,
     duration: float,
     measurement_noise: Level,
     seed: int,
     process_noise: float = 0.0,
     driven: bool = False,
     policy: Controller | None = None,
+    plant: System | None = None,
 ) -> np.ndarray:
-    """Errors of estimated parameters after the transient, on plants drawn from the ranges of the training.
+    """Errors of estimated parameters after the transient, on a plant or on many from the ranges of the training.
 
     Parameters
     ----------
@@ -33,8 +39,8 @@ def parameter_errors(
         An observer that estimates parameters.
     system : System
         What it was made for.
-    plants : int
-        How many, each with a trajectory of its own.
+    trajectories : int
+        How many, each of a plant of its own.
     duration : float
         Length of each in seconds.
     measurement_noise : float or tuple of float, length ny
@@ -47,6 +53,8 @@ def parameter_errors(
         As for :func:`training.evaluation.errors.unseen_trajectories`.
     policy : callable, optional
         As there.
+    plant : System, optional
+        What moves in all trajectories, such as the system with other parameters.
 
     Returns
     -------
@@ -59,26 +67,25 @@ def parameter_errors(
         If the artifact estimates no parameters, a level of noise is none or beyond its range, or every trajectory left
         the system's bounds.
     """
-    plant = with_parameters(system, artifact.parameter_ranges)
+    nx, estimated = system.nx, artifact.estimated_parameters
+    moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in estimated})
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=process_noise)
-    trajectories = unseen_trajectories(
-        plant,
+    runs = unseen_trajectories(
+        moving,
         artifact.filter.dt,
-        n=plants,
+        n=trajectories,
         duration=duration,
         seed=seed,
         driven=driven,
         process_noise=process_noise,
-        policy=policy and blind(policy, system.nx),
+        policy=policy and blind(policy, nx),
     )
-    if not trajectories.inside.any():
-        raise ValueError(f"each of {plants} runs left bounds = {system.bounds}")
-    rng = generator(Stream.EVALUATION, seed, 1)
-    y = noisy_output(plant, trajectories.x, measurement_noise=level, rng=rng)
-    found = observer.estimate_parameters(y, trajectories.u if artifact.nu else None)
-    behind = [system.nx + [*artifact.parameter_ranges].index(name) for name in artifact.estimated_parameters]
-    true = trajectories.x[0][:, behind]
+    if not runs.inside.any():
+        raise ValueError(f"each of {trajectories} runs left bounds = {system.bounds}")
+    y = noisy_output(moving, runs.x, measurement_noise=level, rng=generator(Stream.EVALUATION, seed, 1))
+    found = observer.estimate_parameters(y, runs.u if artifact.nu else None)
+    true = [plant.parameters[name] for name in estimated] if plant else runs.x[0, :, nx:]
     late = found[round(TRANSIENT * len(found)) :]
     error: np.ndarray = 100.0 * np.sqrt(np.mean((late / true - 1.0) ** 2, axis=(0, 1)))
     return error

@@ -31,8 +31,27 @@ def hidden_directions(information: np.ndarray) -> np.ndarray:
         Orthonormal columns; none if the outputs tell all parameters.
     """
     values, vectors = np.linalg.eigh(information)
-    hidden = (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)
-    return vectors[:, hidden]
+    return vectors[:, (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)]
+
+
+def told_directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the changes of parameters that the outputs show, however faintly.
+
+    Parameters
+    ----------
+    information : ndarray, shape (p, p)
+        Fisher information of the parameters.
+
+    Returns
+    -------
+    directions : ndarray, shape (p, k)
+        Orthonormal columns.
+    errors : ndarray, shape (k,)
+        Standard error along each.
+    """
+    values, vectors = np.linalg.eigh(information)
+    told = values > NOTHING * max(values[-1], 0.0)
+    return vectors[:, told], values[told] ** -0.5
 
 
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:

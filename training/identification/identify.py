@@ -36,6 +36,7 @@ KEPT_RATIOS = 100.0  # by how much rather all parameters change by one factor th
 HANGS = (
     0.05  # relative change of a state, over that of parameters which y does not tell, from which on they go together
 )
+SIMULATED = 1e-7  # relative error that simulation leaves in any case
 TOLD = 0.05  # part that a parameter may have in what the outputs do not tell, and count as told
 
 Limits = Mapping[str, tuple[float, float]]
@@ -384,12 +385,14 @@ def _judged(
     told = np.abs(hidden).max(1, initial=0.0) < TOLD
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
     covariance = seen @ np.linalg.pinv(seen.T @ information @ seen, hermitian=True) @ seen.T  # of logarithms
-    errors = {name: float(size[i] * np.sqrt(covariance[i, i])) if told[i] else None for i, name in enumerate(names)}
+    relative = np.maximum(np.sqrt(np.diag(covariance)), SIMULATED)
+    errors = {name: float(size[i] * relative[i]) if told[i] else None for i, name in enumerate(names)}
     products = []
     for powers in combinations(names, hidden):
         exponents = np.array([float(powers.get(name, 0)) for name in names])
         value = float(np.prod(np.where(exponents, np.sign(values) * np.abs(values) ** exponents, 1.0)))
-        products.append(Product(powers, value, abs(value) * float(np.sqrt(exponents @ covariance @ exponents))))
+        relative_error = max(float(np.sqrt(exponents @ covariance @ exponents)), SIMULATED)
+        products.append(Product(powers, value, abs(value) * relative_error))
     found = system.replace(fit.parameters)
     return Identified(
         system=found,

@@ -7,6 +7,7 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.identification.identifiability import told_directions
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
@@ -249,12 +250,11 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
     follows = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
     linear = np.isfinite(at.each)
-    for i, error in enumerate(np.minimum(fit.standard_errors / fit.unit, 1.0)):
-        moved = theta.copy()
-        moved[i] += error * shooting.unit[i]
-        x0 = at.x0 + error * shooting.half * follows[..., i]
-        y = problem.follow(moved, x0, problem.rows).y
-        off = y - at.y - error * (J[..., nx + i] + np.einsum("knya,na->kny", J[..., :nx], follows[..., i]))
+    directions, errors = told_directions(fit.information)
+    for change in (directions * np.minimum(errors, 1.0)).T:
+        dx = follows @ change
+        y = problem.follow(theta + change * shooting.unit, at.x0 + shooting.half * dx, problem.rows).y
+        off = y - at.y - J[..., nx:] @ change - np.einsum("knya,na->kny", J[..., :nx], dx)
         off = np.where(problem.there, off, 0.0) / np.maximum(fit.noise, 1e-300)
         linear &= np.sqrt((off**2).sum((0, 2)) / problem.count) < NONLINEAR
     return linear

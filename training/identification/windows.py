@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from training.identification.identifiability import told_directions
 from training.identification.shooting import Fit, Shooting, Windows, predictable, settled, shoot
 from training.records import Record
 
@@ -81,7 +82,8 @@ def fit_windows(
             break
         report(described(fit, length))
         before, best = best, fit
-        if (fit.standard_errors > GAIN * before.standard_errors).all():
+        directions, errors = told_directions(before.information)
+        if (np.linalg.pinv(directions.T @ fit.information @ directions).diagonal() > (GAIN * errors) ** 2).all():
             break
     return best
 

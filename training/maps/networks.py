@@ -1,10 +1,11 @@
 """Torch networks and their way into artifacts."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from scipy.linalg import block_diag
 from torch import nn
 
 from observers import MLP, ForwardMap
@@ -52,6 +53,29 @@ class Network(nn.Sequential):
             [layer.bias.detach().cpu().numpy() for layer in layers],
             self.activation,
         )
+
+
+def averaged(networks: Sequence[Network]) -> MLP:
+    """The mean of some networks of one shape, as one network: their hidden layers stand side by side.
+
+    Parameters
+    ----------
+    networks : sequence of Network
+        With the same inputs, outputs, depth and activation.
+
+    Returns
+    -------
+    MLP
+        As wide as all of them together.
+    """
+    members = [network.export() for network in networks]
+    first, *hidden, last = zip(*(member.weights for member in members), strict=True)
+    *biases, offsets = zip(*(member.biases for member in members), strict=True)
+    return MLP(
+        [np.concatenate(first), *(block_diag(*blocks) for blocks in hidden), np.concatenate(last, 1) / len(members)],
+        [*(np.concatenate(each) for each in biases), np.mean(offsets, 0)],
+        members[0].activation,
+    )
 
 
 def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:

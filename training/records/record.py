@@ -1,6 +1,6 @@
 """A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
 import numpy as np
@@ -85,6 +85,13 @@ class Record:
 
     def _fail(self, column: str, row: int, why: str) -> NoReturn:
         raise ValueError(f"{self.name}: column {column}, row {row + 1}: {why}")
+
+    def part(self, rows: slice) -> "Record":
+        """Some rows of the record, two at least; without states where none of these rows has all of them."""
+        u, x = (None if values is None else values[rows] for values in (self.u, self.x))
+        if x is not None and np.isnan(x).any(-1).all():
+            x = None
+        return replace(self, t=self.t[rows], y=self.y[rows], u=u, x=x)
 
     @property
     def duration(self) -> float:

@@ -116,9 +116,5 @@ def pieces(records: Iterable[Record]) -> list[Record]:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(int)))
         for begin, end in zip(edges[::2], edges[1::2]):
             if end - begin > 1:
-                rows = slice(int(begin), int(end))
-                u, x = (None if values is None else values[rows] for values in (record.u, record.x))
-                if x is not None and np.isnan(x).any(-1).all():
-                    x = None
-                found.append(replace(record, t=record.t[rows], y=record.y[rows], u=u, x=x))
+                found.append(record.part(slice(int(begin), int(end))))
     return found

@@ -37,7 +37,7 @@ def test_a_table_of_what_was_found(capsys, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
     file = tmp_path / "found.json"
     main(["check", OSCILLATOR, "--duration", "2", "--policy", "controller", "--json", str(file)])
-    shown = capsys.readouterr().out.splitlines()
+    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("checking ")]  # if it is slow
     assert shown[-1] == "no problems, no notes"
     found = json.loads(file.read_text())
     assert len(found) == len(shown) - 1

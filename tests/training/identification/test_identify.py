@@ -1,0 +1,181 @@
+"""Parameters and observers from records of outputs."""
+
+import json
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from kkl_gym.systems import Lorenz, ReverseDuffing, VanDerPol
+from observers import Artifact, KKLObserver
+from training.identification import adapt, estimate_parameters, identify
+from training.identification.consistency import noise_level
+from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
+from training.identification.identify import nearest
+from training.progress import progress_bars
+from training.records import Record
+from training.trajectories.signals import random_inputs
+
+SMALL = {"trajectories": 40, "samples": 40, "inverse_steps": 60, "width": 16, "depth": 1, "batch": 256}
+
+
+@dataclass(frozen=True)
+class Spring(System):
+    """A damped spring with a force."""
+
+    stiffness: float = 4.0
+    damping: float = 0.3
+    gain: float = 2.0
+
+    name: ClassVar[str] = "spring"
+    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
+    bounds: ClassVar = ((-9.0, 9.0), (-30.0, 30.0))
+    u_max: ClassVar = (1.0,)
+    dt: ClassVar = 0.02
+
+    def f(self, x):
+        return x[1], -self.stiffness * x[0] - self.damping * x[1]
+
+    def g(self, x):
+        return (0.0,), (self.gain,)
+
+    def h(self, x):
+        return (x[0],)
+
+
+class HiddenSigns(Lorenz):
+    """Lorenz seen through x3."""
+
+    name: ClassVar[str] = "lorenz_x3"
+
+    def h(self, x):
+        return (x[2],)
+
+
+def records(system, n, *, seconds, noise=0.0, seed=0, driven=False):
+    """Outputs of motions from X."""
+    rng, steps = np.random.default_rng(seed), round(seconds / system.dt)
+    u = random_inputs(system, n, steps, dt=system.dt, rng=rng, kinds=("steps",)) if driven else None
+    x = simulate(system, system.draw_starts(rng, n), steps, system.dt, u=u)
+    y = system.output(x) + noise * rng.standard_normal((*x.shape[:2], system.ny))
+    t = np.arange(steps + 1) * system.dt
+    held = None if u is None else np.concatenate([u, u[-1:]])
+    return [Record(f"run {i}", t, y[:, i], None if held is None else held[:, i]) for i in range(n)]
+
+
+def found(system, unknown, measured, folder, **options):
+    limits = {name: (value / 10, value * 10) for name, value in unknown.items()}
+    with progress_bars(None) as progress:
+        return estimate_parameters(system.replace(unknown), limits, measured, folder, progress=progress, **options)
+
+
+def test_without_noise_parameters_are_exact(tmp_path):
+    got = found(VanDerPol(), {"mu": 1.8}, records(VanDerPol(), 8, seconds=12), tmp_path, steps=60)
+    assert got.system.mu == pytest.approx(3.0, rel=1e-6)
+    assert (got.symmetries, got.hanging_states) == ([], ())
+    assert np.abs(got.predictions[0].residuals).max() < 1e-6
+    assert list(got.to_json()) == ["mu"]
+
+
+def test_inputs_and_standard_errors(tmp_path):
+    unknown = {"stiffness": 6.0, "damping": 0.2, "gain": 1.4}
+    measured = records(Spring(), 8, seconds=12, noise=0.02, driven=True)
+    got = found(Spring(), unknown, measured, tmp_path, steps=60)
+    for name, error in got.standard_errors.items():
+        truth = Spring().parameters[name]
+        assert abs(got.system.parameters[name] - truth) < 4 * error < 0.1 * truth, name
+    assert got.noise == pytest.approx(0.02, rel=0.1)
+
+
+def test_standard_errors_cover_the_truth(tmp_path):
+    """From the truth on, as what is tested is the error that is told: normalised, it is standard normal."""
+    off = []
+    for seed in range(10):
+        got = found(
+            Spring(),
+            {"stiffness": 4.1},
+            records(Spring(), 2, seconds=5, noise=0.05, seed=seed),
+            tmp_path / str(seed),
+            steps=1,
+        )
+        off.append((got.system.stiffness - 4.0) / got.standard_errors["stiffness"])
+    assert np.abs(off).max() < 3.5
+    assert 0.4 < np.std(off) < 1.8
+
+
+def test_what_duffings_output_does_not_tell(tmp_path):
+    got = found(ReverseDuffing(), {"a": 1.4, "b": 1.3}, records(ReverseDuffing(), 8, seconds=12), tmp_path, steps=150)
+    assert got.to_json() == {name: {"value": None, "standard_error": None} for name in "ab"}
+    (product,) = got.products
+    assert product.text == "a b^3"
+    assert product.value == pytest.approx(1.0, rel=1e-5)
+    assert got.hanging_states == ("x2",)
+    assert "a b^3 = 1" in " ".join(got.told())
+    assert got.system.a * got.system.b**3 == pytest.approx(1.0, rel=1e-5)
+
+
+def test_signs_that_outputs_do_not_tell():
+    assert sign_symmetries(HiddenSigns(), ["sigma", "rho", "beta"]) == [("x1", "x2")]
+    assert sign_symmetries(Lorenz(), ["sigma", "rho", "beta"]) == []
+    assert sign_symmetries(ReverseDuffing(), ["a", "b"]) == [("x2", "a", "b")]
+
+
+def test_products_of_powers():
+    hidden = np.array([[3.0, -1.0, 0.0]]).T / 10**0.5
+    texts = {written(powers) for powers in combinations(["a", "b", "c"], hidden)}
+    assert texts == {"a b^3", "c"}
+    assert hidden_directions(np.diag([1e4, 1e-9])).shape == (2, 1)
+    assert combinations(["a"], np.eye(1)) == []
+
+
+def test_the_nearest_parameters_keep_their_ratios():
+    hidden = np.array([[3.0, -1.0]]).T / 10**0.5
+    # A plant that is 10 % faster, found anywhere along a b^3 = 1.1^4.
+    anywhere = np.array([1.1 * 2.0**3, 1.1 / 2.0])
+    assert nearest(anywhere, np.ones(2), hidden) == pytest.approx([1.1, 1.1], rel=1e-2)
+
+
+def test_the_noise_of_records():
+    assert noise_level(records(VanDerPol(), 4, seconds=10, noise=0.2)) == pytest.approx(0.2, rel=0.1)
+
+
+def test_identified_and_adapted_observers(tmp_path):
+    plant = VanDerPol(3.3)
+    measured = records(plant, 6, seconds=12, noise=0.05)
+    learned = identify(
+        VanDerPol(2.2), {"mu": (1.0, 6.0)}, measured, tmp_path / "new", steps=60, settings=SMALL, resume=True
+    )
+    written_down = json.loads((tmp_path / "new" / "parameters.json").read_text())
+    assert abs(written_down["mu"]["value"] - 3.3) < 4 * written_down["mu"]["standard_error"] < 0.1
+    artifact = Artifact.read(tmp_path / "new" / "van_der_pol.safetensors")
+    assert artifact.parameters == learned.identified.system.parameters
+    assert artifact.nu == 0
+    assert artifact.measurement_noise == pytest.approx(0.05, rel=0.2)
+    assert (tmp_path / "new" / "identification.png").stat().st_size > 10_000
+    again = adapt(
+        artifact,
+        VanDerPol(3.0),
+        measured,
+        tmp_path / "adapted",
+        unknown={"mu": (1.0, 6.0)},
+        settings={"inverse_steps": 50},
+    )
+    assert again.identified.system.mu == pytest.approx(learned.identified.system.mu, rel=1e-3)
+    x_hat = KKLObserver(again.result.artifact).estimate(measured[0].y[:, None])
+    assert np.isfinite(x_hat).all()
+
+
+@pytest.mark.parametrize(
+    ("unknown", "message"),
+    [
+        ({}, "name a parameter"),
+        ({"nu": (0.0, 1.0)}, "no parameter 'nu'"),
+        ({"mu": (4.0, 5.0)}, "between its limits"),
+    ],
+)
+def test_unknowns_that_make_no_sense(unknown, message, tmp_path):
+    with progress_bars(None) as progress, pytest.raises(ValueError, match=message):
+        estimate_parameters(VanDerPol(), unknown, records(VanDerPol(), 2, seconds=3), tmp_path, progress=progress)

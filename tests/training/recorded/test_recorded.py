@@ -1,0 +1,128 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from observers import Artifact, KKLObserver
+from training.maps.networks import Network, averaged
+from training.recorded.config import recorded_config, signal_rate
+from training.recorded.errors import recorded_errors
+from training.recorded.fit import train_recorded
+from training.recorded.preparing import split
+from training.records import Record, Signals, resampled
+
+SIGNALS = Signals("time", ("position",), ("force",), ("speed",))
+SMALL = {
+    "width": 16,
+    "inverse_steps": 500,
+    "learning_rate": 0.02,
+    "samples": 10,
+    "windows": 500,
+    "batch": 256,
+    "members": 1,
+}
+
+
+def swing(seed, n=600, dt=0.05, jitter=0.0):
+    """A mass on a spring under a force that is held: p'' = -p + u, measured at uneven times."""
+    rng = np.random.default_rng(seed)
+    t = dt * (np.arange(n) + jitter * rng.uniform(-1, 1, n))
+    u = np.repeat(rng.uniform(-1, 1, n // 20), 20)
+    x = np.empty((n, 2))
+    x[0] = rng.uniform(-1, 1, 2)
+    for k in range(n - 1):
+        angle = t[k + 1] - t[k]
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        x[k + 1] = turn @ (x[k] - [u[k], 0]) + [u[k], 0]
+    return Record(f"run{seed}.csv", t, x[:, :1], u[:, None], x[:, 1:], SIGNALS)
+
+
+def test_an_observer_from_recorded_states(tmp_path):
+    records = [swing(seed, jitter=0.1) for seed in range(6)]
+    config = recorded_config(records, {**SMALL, "untold_noise": 0.01})
+    result = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu"))
+    assert len(result.held_out) == 1
+    assert result.errors.relative["speed"] < 0.1  # held out; the derivative of a driven position
+    result.artifact.save(tmp_path / "spring.safetensors")
+    artifact = Artifact.read(tmp_path / "spring.safetensors")
+    assert artifact.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
+    assert artifact.training["held_out_errors"] == pytest.approx(result.errors.relative)
+    new = resampled(swing(100), config.dt)
+    x_hat = KKLObserver(artifact).estimate(new.y, new.u)
+    late = slice(200, None)
+    assert np.sqrt(np.mean((x_hat - new.x)[late] ** 2)) < 0.1 * new.x.std()
+    with pytest.raises(ValueError, match=r"recorded states: speed from position and force, every 0.05 s.*environment"):
+        artifact.check("spring", {}, dt=0.05, ny=1, nu=1)
+
+
+def test_resuming_makes_the_same_observer(tmp_path):
+    records = [swing(seed) for seed in range(3)]
+    config = recorded_config(records, {**SMALL, "members": 2, "inverse_steps": 20, "held_out": 0.0})
+    first = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu"))
+    assert first.held_out == []
+    (tmp_path / "inverse-2.checkpoint.pt").unlink()
+    with pytest.raises(ValueError, match="holds the checkpoints of a run"):
+        train_recorded(records, config, tmp_path, name="spring")
+    again = train_recorded(records, config, tmp_path, name="spring", resume=True, device=torch.device("cpu"))
+    for a, b in zip(first.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(ValueError, match="a run of another configuration: .*records = "):
+        train_recorded([*records[:2], swing(7)], config, tmp_path, name="spring", resume=True)
+
+
+def test_without_states_or_with_short_records(tmp_path):
+    records = [replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))]
+    with pytest.raises(ValueError, match=r"no hidden states were recorded; name their columns \(--hidden\)"):
+        train_recorded(records, recorded_config(records), tmp_path, name="spring")
+    records = [swing(0, n=40)]
+    with pytest.raises(ValueError, match=r"run0.csv: column time, row 40: .* filter remembers .* faster eigenvalues"):
+        train_recorded(records, recorded_config(records), tmp_path, name="spring")
+
+
+def test_the_mean_of_networks_is_a_network():
+    torch.manual_seed(0)
+    networks = [Network(3, 2, width=5, depth=depth, activation="tanh") for depth in (2, 2, 2)]
+    inputs = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+    expected = np.mean([network.export()(inputs) for network in networks], 0)
+    np.testing.assert_allclose(averaged(networks)(inputs), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_what_is_held_out():
+    records = [resampled(swing(seed, n=100)) for seed in range(10)]
+    kept, held_out = split(records, 0.3, 0)
+    assert (len(kept), len(held_out)) == (7, 3)
+    assert {record.name for record in kept + held_out} == {record.name for record in records}
+    assert split(records, 0.3, 1)[1] != held_out
+    kept, held_out = split(records[:2], 0.3, 0)
+    assert [len(record.t) for record in kept + held_out] == [70, 70, 30, 30]
+    assert held_out[0].t[0] == records[0].t[70]
+    assert split(records, 0.0, 0) == (records, [])
+
+
+def test_the_rate_of_signals_is_their_angular_frequency():
+    t = 0.01 * np.arange(5000)
+    record = Record("a", t, np.sin(3 * t)[:, None], x=np.stack([np.cos(3 * t), 5 + np.sin(3 * t)], -1))
+    assert signal_rate([record]) == pytest.approx(3.0, rel=1e-2)
+    config = recorded_config([record])
+    assert config.dt == pytest.approx(0.01)
+    assert config.eigenvalues[0] == pytest.approx(-0.45, rel=1e-2)
+    assert config.eigenvalues[-1] == pytest.approx(-30, rel=1e-2)
+    assert config.measurement_noise_max == pytest.approx(0.1 / 2**0.5, rel=1e-2)
+    assert recorded_config([record], {"dt": 0.05, "seed": 3}).eigenvalues[-1] == -10.0
+    assert json.dumps(config.eigenvalues)
+
+
+def test_errors_are_relative_and_leave_the_transient_out(tmp_path):
+    records = [swing(seed, n=300) for seed in range(2)]
+    config = recorded_config(records, {**SMALL, "inverse_steps": 20})
+    artifact = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).artifact
+    record = resampled(records[0], config.dt)
+    x_hat = KKLObserver(artifact).estimate(record.y, record.u)
+    expected = np.sqrt(np.mean((x_hat - record.x)[100:] ** 2)) / record.x[100:].std()
+    found = recorded_errors(artifact, [record], after=5.0)
+    assert found.relative == pytest.approx({"speed": expected})
+    assert found.seconds == pytest.approx(10.0)
+    assert str(found).startswith("speed 0.")
+    assert np.isnan(recorded_errors(artifact, [record], after=100.0).relative["speed"])

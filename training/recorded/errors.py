@@ -1,0 +1,74 @@
+"""How good an observer is on recorded states that it was not trained on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from observers import Artifact, KKLObserver
+from training.maps.coordinates import settling_time
+from training.records import Record, pieces
+
+
+@dataclass(frozen=True)
+class RecordedErrors:
+    """Errors on recorded states, relative to their standard deviations.
+
+    Parameters
+    ----------
+    relative : dict of str to float
+        For each hidden signal, the root mean square error over the signal's standard deviation, all samples together.
+    after : float
+        Seconds after the start of a record, or of a gap, that were left out.
+    seconds : float
+        Length of what was compared.
+    """
+
+    relative: dict[str, float]
+    after: float
+    seconds: float
+
+    def __str__(self) -> str:
+        """For people, on one line."""
+        each = ", ".join(f"{name} {error:.3g}" for name, error in self.relative.items())
+        return f"{each} ({self.seconds:.4g} s, after {self.after:.2g} s of transient)"
+
+
+def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float | None = None) -> RecordedErrors:
+    """Run an observer along records and compare its estimates with the recorded states.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        An observer from recorded states.
+    records : sequence of Record
+        With states, on the observer's grid (:func:`training.records.resampled`); filters begin anew after gaps.
+    after : float, optional
+        Seconds for which each transient is left out; by default until the filter has forgotten its start to one part
+        in a thousand.
+
+    Returns
+    -------
+    RecordedErrors
+        NaN where nothing is left to compare.
+    """
+    after = settling_time(artifact.filter) if after is None else after
+    first = int(np.ceil(after / artifact.filter.dt - 1e-6))  # times are rounded
+    apart, x = [np.zeros((0, artifact.nx))], [np.zeros((0, artifact.nx))]
+    for record in pieces(records):
+        if record.x is not None:
+            apart.append((estimates(artifact, record) - record.x)[first:])
+            x.append(record.x[first:])
+    error, truth = np.concatenate(apart), np.concatenate(x)
+    known = ~np.isnan(error).any(-1)
+    error, truth = error[known], truth[known]
+    names = (artifact.signals or {})["hidden"]
+    if not len(error):
+        return RecordedErrors(dict.fromkeys(names, float("nan")), after, 0.0)
+    relative = np.sqrt(np.mean(error**2, 0)) / np.where(truth.std(0) > 0, truth.std(0), np.nan)
+    return RecordedErrors(dict(zip(names, relative.tolist())), after, len(error) * artifact.filter.dt)
+
+
+def estimates(artifact: Artifact, record: Record) -> np.ndarray:
+    """An observer's estimates along a record without gaps on its grid, (n, nx)."""
+    return KKLObserver(artifact).estimate(record.y, record.u if artifact.nu else None)

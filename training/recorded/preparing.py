@@ -1,0 +1,88 @@
+"""What is made of records and a configuration before anything is fitted."""
+
+import hashlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from observers import LinearFilter
+from training.recorded.config import RecordedConfig
+from training.records import Record, Signals, jitter, median_step
+from training.seeds import Stream, generator
+from training.spectrum import Spectrum
+
+FEW = 5  # records, below which none is held out as a whole
+
+
+def filter_of(config: RecordedConfig, signals: Signals) -> LinearFilter:
+    """The filter of a configuration for the signals of some records."""
+    nu = len(signals.inputs) if config.inputs else 0
+    return Spectrum(config.eigenvalues, config.pairs).filter(len(signals.measured), config.dt, nu)
+
+
+def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
+    """Hold a share of the records out: whole ones drawn by the seed, or the end of each where there are few.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All of them.
+    share : float
+        From 0 to 1; if it is positive, something is held out.
+    seed : int
+        Of the drawing.
+
+    Returns
+    -------
+    kept, held_out : list of Record
+        One at least is kept.
+    """
+    if not share:
+        return list(records), []
+    if len(records) >= FEW:
+        count = min(max(1, round(share * len(records))), len(records) - 1)
+        chosen = generator(Stream.VALIDATION, seed).permutation(len(records))[:count]
+        return [r for i, r in enumerate(records) if i not in chosen], [records[i] for i in sorted(chosen)]
+    ends = [min(max(2, round((1 - share) * len(record.t))), len(record.t) - 2) for record in records]
+    return (
+        [record.part(slice(None, end)) for record, end in zip(records, ends)],
+        [record.part(slice(end, None)) for record, end in zip(records, ends)],
+    )
+
+
+def fingerprint(record: Record) -> str:
+    """What identifies a record's samples and the names of its signals."""
+    found = hashlib.sha256(repr(record.signals).encode())
+    for values in (record.t, record.y, record.u, record.x):
+        found.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+    return found.hexdigest()[:16]
+
+
+def described(records: Sequence[Record], config: RecordedConfig, name: str) -> list[str]:
+    """What is going to be done.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        As they were read.
+    config : RecordedConfig
+        Of the run.
+    name : str
+        Of the plant.
+
+    Returns
+    -------
+    list of str
+        Lines for people.
+    """
+    signals = records[0].signals
+    given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
+    uneven, seconds = max(map(jitter, records)), sum(record.duration for record in records)
+    lacking = sum(int(np.isnan(record.y).any(-1).sum()) for record in records)
+    rates = Spectrum(config.eigenvalues, config.pairs).poles.real
+    return [
+        f"training an observer for {name} from recorded states: {', '.join(signals.hidden)} from {given}",
+        f"{len(records)} records of {seconds:.4g} s together, {lacking} rows without an output",
+        f"steps of {median_step(*records):.4g} s (median), uneven by up to {uneven:.1%}; resampled to {config.dt:g} s",
+        f"{len(rates)} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
+    ]
