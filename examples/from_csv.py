@@ -71,7 +71,9 @@ def main(
         out: the run's folder.
         seed: of everything random.
     """
-    plant = kkl_gym.KKLEnv("van_der_pol", parameters={"mu": MU}, measurement_noise=NOISE, start_box=STARTS)
+    plant = kkl_gym.KKLEnv(
+        "van_der_pol", parameters={"mu": MU}, process_noise=0.0, measurement_noise=NOISE, start_box=STARTS
+    )
     out.mkdir(parents=True, exist_ok=True)
     record(plant, out / "record.csv", seconds=seconds, seed=seed)
 

@@ -114,10 +114,10 @@ def test_circle_pendulum(tmp_path):
 
 
 def test_from_csv(tmp_path, capsys):
-    sizes = {"seconds": 30.0, "steps": 100, "inverse_steps": 600, "trajectories": 100}
+    sizes = {"seconds": 20.0, "steps": 100, "inverse_steps": 500, "trajectories": 100}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
     assert abs(mu - 3.3) < 0.1
-    assert with_estimate < 1.5 * with_state
+    assert with_estimate < 4 * with_state
     assert (tmp_path / "record.csv").read_text().startswith("t,u,y\n")
     assert "with x_hat" in capsys.readouterr().out
 

@@ -6,6 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 
+from kkl_gym.equations import input_matrix
 from kkl_gym.system import System
 from training.trajectories.parameters import with_parameters
 
@@ -100,15 +101,17 @@ def written(powers: dict[str, Fraction | float]) -> str:
     return " ".join(name if power == 1 else f"{name}^{_power(power)}" for name, power in powers.items())
 
 
-def sign_symmetries(system: System, parameters: Sequence[str]) -> list[tuple[str, ...]]:
+def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool = False) -> list[tuple[str, ...]]:
     """States and parameters that may change sign together without any change of the outputs.
 
     Parameters
     ----------
     system : System
-        Any system; without inputs, or with inputs that act as before on states that change sign.
+        Any system.
     parameters : sequence of str
         The parameters that may change sign.
+    driven : bool, default False
+        Whether inputs acted, which do not change their sign with states.
 
     Returns
     -------
@@ -121,7 +124,7 @@ def sign_symmetries(system: System, parameters: Sequence[str]) -> list[tuple[str
     if both.nx > MOST_SIGNS or both.discrete:
         return []
     x = both.draw_starts(np.random.default_rng(0), POINTS)
-    f, h = both.drift(x), both.output(x)
+    f, h, g = both.drift(x), both.output(x), _inputs(both, x)
     found = []
     for signs in itertools.product((1.0, -1.0), repeat=both.nx):
         s = np.array(signs)
@@ -129,9 +132,16 @@ def sign_symmetries(system: System, parameters: Sequence[str]) -> list[tuple[str
             continue
         with np.errstate(all="ignore"):
             same = np.allclose(both.output(s * x), h, rtol=1e-9) and np.allclose(both.drift(s * x), s * f, rtol=1e-9)
+            same = same and (not driven or np.allclose(_inputs(both, s * x), s[:, None] * g, rtol=1e-9))
         if same:
             found.append(tuple(name for name, sign in zip(both.state_names, signs, strict=True) if sign < 0))
     return [one for one in found if not any(set(other) < set(one) for other in found)]
+
+
+def _inputs(system: System, x: np.ndarray) -> np.ndarray:
+    """Input matrices (n, nx, nu) at states (n, nx)."""
+    rows = [np.broadcast_to(value, len(x)) for row in input_matrix(system, x.T) for value in row]
+    return np.reshape(rows, (system.nx, system.nu, len(x))).transpose(2, 0, 1)
 
 
 def _around(value: float) -> tuple[float, float]:

@@ -399,7 +399,11 @@ def _judged(
         standard_errors=errors,
         products=products,
         hanging_states=_hanging(fit, found, hidden * (size / fit.unit)[:, None]),
-        symmetries=sign_symmetries(found, [name for name in names if unknown[name][0] <= -found.parameters[name]]),
+        symmetries=sign_symmetries(
+            found,
+            [name for name in names if unknown[name][0] <= -found.parameters[name]],
+            driven=bool(fit.windows.u.any()),
+        ),
         noise=fit.noise,
         expected_noise=expected_noise,
         fit=fit,

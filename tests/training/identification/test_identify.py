@@ -121,6 +121,9 @@ def test_signs_that_outputs_do_not_tell():
     assert sign_symmetries(HiddenSigns(), ["sigma", "rho", "beta"]) == [("x1", "x2")]
     assert sign_symmetries(Lorenz(), ["sigma", "rho", "beta"]) == []
     assert sign_symmetries(ReverseDuffing(), ["a", "b"]) == [("x2", "a", "b")]
+    assert sign_symmetries(ReverseDuffing(), ["a", "b"], driven=True) == []  # the input stays as it is
+    assert sign_symmetries(Spring(), ["gain"]) == [("gain",)]
+    assert sign_symmetries(Spring(), ["gain"], driven=True) == []
 
 
 def test_products_of_powers():
