@@ -117,7 +117,7 @@ def simulated(system: Silverbox, record: Record) -> np.ndarray:
 
 
 def main(
-    path: Annotated[Path, tyro.conf.Positional], steps: int = 300, out: Path = Path("runs/silverbox"), seed: int = 0
+    path: Annotated[Path, tyro.conf.Positional], steps: int = 100, out: Path = Path("runs/silverbox"), seed: int = 0
 ) -> list[float]:
     """Identify, simulate the tests, print a table and draw a figure.
 
