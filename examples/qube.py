@@ -1,0 +1,246 @@
+"""Real hardware: the pendulum of a Quanser Qube Servo 2, estimated from the angle of its arm alone.
+
+Nothing is simulated and no equation is told to the observer: it is fitted to eight recorded runs, and four others say
+how good it is. Beside it stand an extended Kalman filter with the device's published model and the finite differences
+that a control engineer would begin with::
+
+    python examples/qube.py PATH
+
+PATH is a folder with run01.csv to run12.csv, whose columns are alpha, theta (rad), alpha_dot, theta_dot (rad/s) and
+time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler, Di Meglio, "Towards gain tuning for
+numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence. docs/data.md
+has the results.
+
+What is said of the device beforehand, beside the records: left and right are alike. Each run is therefore learned from
+twice, once mirrored, with the signs of both angles changed.
+
+The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
+v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative behind a low-pass of 50 rad/s. Estimates of angles are taken
+through the same formula where they are compared with them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+import kkl_gym
+from kkl_gym.elementary import cos, sin
+from observers import Artifact
+from observers.storage import replacing, write
+from training.kalman import ExtendedKalmanFilter
+from training.markdown import table
+from training.recorded.config import recorded_config
+from training.recorded.errors import estimates
+from training.recorded.fit import train_recorded
+from training.records import Record, Signals, read_records, resampled
+
+SIGNALS = Signals("time", ("theta",), (), ("cos(alpha)", "sin(alpha)", "alpha_dot", "theta_dot"))
+MIRRORED = np.array([1.0, -1.0, -1.0, -1.0])  # what these signals are multiplied with in the mirror
+TRAINING, HELD_OUT = (1, 2, 4, 5, 7, 8, 10, 11), (3, 6, 9, 12)
+FOLDS = ((1, 8), (2, 7), (4, 11), (5, 10))  # of the training runs, each left out once by --cross-validate
+DT = 0.004  # s, as the device samples
+TRANSIENT = 1.0  # s that are left out of all errors
+
+# Chosen by --cross-validate, among the training runs alone.
+SETTINGS = {
+    "eigenvalues": tuple(float(f"{-1 / each:.4g}") for each in np.geomspace(0.2, 0.008, 12)),  # time constants in s
+    "measurement_noise_max": 0.002,  # rad; an encoder's step is 0.0031
+    "inverse_steps": 3000,
+    "members": 3,
+}
+
+
+@dataclass(frozen=True)
+class Qube(kkl_gym.System):
+    """The device without motor input: x = (theta, alpha, theta', alpha'), alpha from above, y = theta.
+
+    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m (that of the arm as published,
+    mass length^2 / 12). It has much more damping than these runs show; the two coefficients are those of
+    BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
+    """
+
+    gravity: float = 9.81  # m/s^2
+    arm_length: float = 0.085  # m
+    arm_inertia: float = 5.72e-5  # kg m^2, 0.095 kg (0.085 m)^2 / 12
+    arm_damping: float = 0.00027  # N m s
+    pendulum_mass: float = 0.024  # kg
+    pendulum_length: float = 0.129  # m
+    pendulum_damping: float = 0.00005  # N m s
+
+    name: ClassVar[str] = "qube"
+    state_names: ClassVar = ("theta in rad", "alpha in rad", "theta' in rad/s", "alpha' in rad/s")
+    X: ClassVar = ((-1.5, 1.5), (0.0, 2 * np.pi), (-10.0, 10.0), (-25.0, 25.0))
+    bounds: ClassVar = ((-50.0, 50.0), (-500.0, 500.0), (-100.0, 100.0), (-200.0, 200.0))
+
+    def f(self, x):
+        """Drift: Lagrange's equations of the two angles, solved for their accelerations."""
+        _, alpha, theta_dot, alpha_dot = x
+        half, sine, cosine = self.pendulum_length / 2, sin(alpha), cos(alpha)
+        inertia = 4 / 3 * self.pendulum_mass * half**2  # about its joint
+        coupling = -self.pendulum_mass * self.arm_length * half
+        m11 = self.arm_inertia + self.pendulum_mass * self.arm_length**2 + inertia * sine * sine
+        m12, m22 = coupling * cosine, inertia
+        r1 = coupling * sine * alpha_dot**2 - 2 * inertia * sine * cosine * theta_dot * alpha_dot
+        r2 = inertia * sine * cosine * theta_dot**2 + self.pendulum_mass * self.gravity * half * sine
+        r1, r2 = r1 - self.arm_damping * theta_dot, r2 - self.pendulum_damping * alpha_dot
+        determinant = m11 * m22 - m12 * m12
+        return theta_dot, alpha_dot, (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant
+
+    def h(self, x):
+        """Output."""
+        return (x[0],)
+
+
+def main(
+    path: Annotated[Path, tyro.conf.Positional],
+    out: Path = Path("runs/qube"),
+    cross_validate: bool = False,
+    inverse_steps: int = SETTINGS["inverse_steps"],
+) -> dict[str, np.ndarray]:
+    """Train, compare, and write a table and a figure.
+
+    Parameters
+    ----------
+    path
+        Folder with run01.csv to run12.csv.
+    out
+        Folder of the run, which goes on from its checkpoints; receives qube.safetensors, table.md and estimates.png.
+    cross_validate
+        Judge the settings on the training runs instead: leave each out once, and look at none of the others.
+    inverse_steps
+        Batches for each network.
+
+    Returns
+    -------
+    dict of str to ndarray, shape (4,)
+        By estimator, root mean square errors of cos alpha, sin alpha, alpha_dot and theta_dot over their standard
+        deviations, all runs together, after the transient; NaN for what it does not estimate.
+    """
+    settings = {**SETTINGS, "dt": DT, "held_out": 0.0, "inverse_steps": inverse_steps}
+    if cross_validate:
+        runs, records = TRAINING, read(path, TRAINING)
+        estimators = {"KKL": left_out_in_turn(records, settings, out)}
+    else:
+        runs, records = HELD_OUT, read(path, HELD_OUT)
+        artifact = trained(read(path, TRAINING), settings, out)
+        artifact.save(out / "qube.safetensors")
+        estimators = {
+            "KKL from recorded states": [estimates(artifact, record) for record in records],
+            "extended Kalman filter": kalman(records),
+            "finite differences": [differences(record) for record in records],
+        }
+    found = {name: errors(x_hat, records) for name, x_hat in estimators.items()}
+    rows = [[name, *("-" if np.isnan(e) else f"{e:.3f}" for e in each)] for name, each in found.items()]
+    lines = table(["", *SIGNALS.hidden], rows)
+    print("\n".join(lines))
+    if not cross_validate:
+        write(out / "table.md", "\n".join(lines) + "\n")
+        draw(out / "estimates.png", estimators, records, [f"run {run}" for run in runs])
+    return found
+
+
+def read(path: Path, runs: Sequence[int]) -> list[Record]:
+    """Records of some runs, on the device's grid."""
+    records = read_records([path / f"run{run:02d}.csv" for run in runs], signals=SIGNALS)
+    return [resampled(record, DT) for record in records]
+
+
+def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
+    """An observer from records and their mirror images."""
+    mirrored = [replace(r, name=f"{r.name}, mirrored", y=-r.y, x=r.x * MIRRORED) for r in records]
+    both = [*records, *mirrored]
+    config = recorded_config(both, settings)
+    return train_recorded(both, config, out, name="qube", resume=True, console=Console()).artifact
+
+
+def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> list[np.ndarray]:
+    """Estimates along each training run, by observers that were trained on six others."""
+    found = {}
+    for fold in FOLDS:
+        kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]
+        artifact = trained(kept, settings, out / f"without-{fold[0]}-{fold[1]}")
+        found |= {run: estimates(artifact, records[TRAINING.index(run)]) for run in fold}
+    return [found[run] for run in TRAINING]
+
+
+def kalman(records: Sequence[Record]) -> list[np.ndarray]:
+    """Estimates of an extended Kalman filter, whose noise was chosen on the training runs.
+
+    It begins with a pendulum that hangs, give or take 1.8 rad, and velocities of 4 and 12 rad/s.
+    """
+    longest = max(len(record.t) for record in records)
+    y = np.stack([np.pad(record.y[:, 0], (0, longest - len(record.t)), mode="edge") for record in records], 1)[
+        ..., None
+    ]
+    model = ExtendedKalmanFilter(
+        Qube(),
+        DT,
+        Q=np.diag([0.0, 0.0, 10.0, 10.0]) ** 2,
+        R=np.array([[0.003**2]]),
+        start=(np.array([0.0, np.pi, 0.0, 0.0]), np.diag([1.0, 1.8, 4.0, 12.0]) ** 2),
+    )
+    x = np.stack([model.reset(y[0]), *(model.step(each) for each in y[1:])])
+    found = [x[: len(record.t), i] for i, record in enumerate(records)]
+    return [
+        np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
+        for theta, alpha in (each[:, :2].T for each in found)
+    ]
+
+
+def differences(record: Record) -> np.ndarray:
+    """The arm's velocity as the device computes it. Of the pendulum, differences of theta say nothing."""
+    nothing = np.full(len(record.t), np.nan)
+    return np.stack([nothing, nothing, nothing, recorded_velocity(record.y[:, 0])], -1)
+
+
+def recorded_velocity(angle: np.ndarray) -> np.ndarray:
+    """The derivative of an angle, (n,), behind the low-pass of the recorded velocities."""
+    velocity = np.zeros(len(angle))
+    for k in range(1, len(angle)):
+        velocity[k] = 0.8 * velocity[k - 1] + 50.0 * (angle[k] - angle[k - 1])
+    return velocity
+
+
+def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray:
+    """Root mean square errors over standard deviations, (4,), all runs together, after the transient."""
+    late = round(TRANSIENT / DT)
+    truth = np.concatenate([record.x[late:] for record in records])
+    apart = np.concatenate([each[late:] for each in x_hat]) - truth
+    return np.sqrt(np.mean(apart**2, 0)) / truth.std(0)
+
+
+def draw(
+    path: Path, estimators: Mapping[str, Sequence[np.ndarray]], records: Sequence[Record], titles: Sequence[str]
+) -> None:
+    """Draw the first seconds of the runs, each in a column, recorded and as estimated."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.2 * len(records), 9), layout="constrained")
+    axes = figure.subplots(len(SIGNALS.hidden), len(records), squeeze=False, sharex=True)
+    shown = slice(0, round(5.0 / DT))
+    for column, (record, title) in enumerate(zip(records, titles, strict=True)):
+        t = record.t[shown] - record.t[0]
+        axes[0, column].set_title(title)
+        axes[-1, column].set_xlabel("t in s")
+        for i, name in enumerate(SIGNALS.hidden):
+            ax = axes[i, column]
+            ax.plot(t, record.x[shown, i], "k", lw=1.5, label="recorded")
+            for (label, x_hat), style in zip(estimators.items(), ("m--", "c-", "y:"), strict=False):
+                if not np.isnan(x_hat[column][:, i]).any():
+                    ax.plot(t, x_hat[column][shown, i], style, lw=1.0, label=label)
+            margin = 0.2 * np.ptp(record.x[:, i])
+            ax.set_ylim(record.x[:, i].min() - margin, record.x[:, i].max() + margin)
+            if column == 0:
+                ax.set_ylabel(name)
+    axes[-1, 0].legend(loc="upper right", fontsize="small")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,69 @@
+"""examples/qube.py: on runs of its own model, and on the device's where they lie."""
+
+import os
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kkl_gym.simulate import simulate
+
+QUBE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "qube.py"))
+
+
+def test_the_model_keeps_its_energy_and_hangs():
+    model = QUBE["Qube"](arm_damping=0.0, pendulum_damping=0.0)
+
+    def energy(x):
+        _, alpha, arm, pendulum = x.T
+        half = model.pendulum_length / 2
+        tip = model.arm_length * arm - half * np.cos(alpha) * pendulum  # its middle, along the circle
+        around = half * np.sin(alpha) * arm
+        up = half * np.sin(alpha) * pendulum
+        own = model.pendulum_mass * model.pendulum_length**2 / 12 * (pendulum**2 + (np.sin(alpha) * arm) ** 2)
+        moving = model.pendulum_mass * (tip**2 + around**2 + up**2) + own + model.arm_inertia * arm**2
+        return moving / 2 + model.pendulum_mass * model.gravity * half * np.cos(alpha)
+
+    x = simulate(model, np.array([[0.1, 1.0, 2.0, 3.0], [0.0, 3.0, -1.0, 9.0]]), 500, 0.002)
+    for run in np.moveaxis(x, 1, 0):
+        np.testing.assert_allclose(energy(run), energy(run)[0], rtol=1e-5)
+    hanging = simulate(QUBE["Qube"](), np.array([[0.1, 2.0, 0.0, 0.0]]), 4000, 0.004)[-1, 0]
+    assert hanging[1] == pytest.approx(np.pi, abs=1e-2)
+
+
+def write_runs(folder):
+    """Runs of the model, in files as the device's."""
+    rng = np.random.default_rng(0)
+    runs = range(1, 13)
+    x0 = np.stack([np.zeros(12), rng.uniform(1, 5, 12), rng.uniform(-2, 2, 12), rng.uniform(-5, 5, 12)], -1)
+    x = simulate(QUBE["Qube"](), x0, 1000, 0.004)
+    for i, run in enumerate(runs):
+        alpha = np.angle(np.exp(1j * x[:, i, 1]))
+        velocities = [QUBE["recorded_velocity"](x[:, i, column]) for column in (1, 0)]
+        t = 3.0 + 0.004 * (np.arange(1001) + rng.uniform(-0.05, 0.05, 1001))
+        columns = np.column_stack([alpha, x[:, i, 0], *velocities, t])
+        header = "alpha,theta,alpha_dot,theta_dot,time"
+        np.savetxt(folder / f"run{run:02d}.csv", columns, delimiter=",", header=header, comments="")
+
+
+def test_on_runs_of_its_own_model(tmp_path, capsys):
+    write_runs(tmp_path)
+    found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=60)
+    assert np.isfinite(found["KKL from recorded states"]).all()
+    assert (found["extended Kalman filter"] < 0.6).all()
+    assert found["finite differences"][3] < 0.01
+    assert np.isnan(found["finite differences"][:3]).all()
+    assert "| finite differences | - | - | - | 0.00" in (tmp_path / "out" / "table.md").read_text()
+    assert (tmp_path / "out" / "estimates.png").stat().st_size > 10_000
+    found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=10, cross_validate=True)
+    assert list(found) == ["KKL"]
+    assert "finite differences" in capsys.readouterr().out
+
+
+def test_on_the_device(tmp_path):
+    path = os.environ.get("KKL_GYM_QUBE")
+    if path is None:
+        pytest.skip("REAL DATA NOT TESTED: set KKL_GYM_QUBE to the folder of the Qube's runs, see examples/qube.py")
+    found = QUBE["main"](Path(path), out=tmp_path)
+    assert (found["KKL from recorded states"] <= 0.04).all()
