@@ -87,7 +87,12 @@ def main(
         {"mu": LIMITS},
         read_records(files, system=model),
         out,
-        settings={"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 20.0},
+        settings={
+            "inverse_steps": inverse_steps,
+            "trajectories": trajectories,
+            "duration": 20.0,
+            "free_inverse": False,  # a second map, for motion without input, which the loop has not
+        },
         steps=steps,
         seed=seed,
         resume=True,
