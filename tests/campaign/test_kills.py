@@ -199,7 +199,9 @@ class Benchmark(Scenario):
         return checkpoints.load(path)["step"] if path.exists() else 0
 
     def result(self, out):
-        return (out / "results.csv").read_text(), sorted(path.name for path in out.glob("*.*"))
+        """Temporary files of killed processes aside, which stay for an hour."""
+        names = {path.name for path in out.glob("*.*") if not path.name.startswith(UNFINISHED)}
+        return (out / "results.csv").read_text(), names
 
 
 class Campaign:

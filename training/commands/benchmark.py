@@ -9,6 +9,7 @@ from rich.console import Console
 
 from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
+from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
 from training.evaluation.levels import multiple, show_level
 from training.progress import LOG, progress_bars, under_way
@@ -79,6 +80,7 @@ class Benchmark:
         out = self.out or Path("runs") / "benchmark" / name
         if self.beside is not None:
             check_results(self.beside)
+        clear_unfinished(out)
         with progress_bars(console, out / LOG) as progress:
             failures = []
             if not self.report:

@@ -13,7 +13,7 @@ from training.presets import Preset, preset
 from training.recorded.config import RecordedConfig
 
 SHOWN = 3  # numbers of a setting that has many
-ELSEWHERE = ("pipeline", "uncertain")  # options of their own
+ELSEWHERE = ("pipeline", "uncertain", "inputs")  # options of their own
 
 
 @dataclass(frozen=True)

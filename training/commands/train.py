@@ -63,6 +63,8 @@ class Train:
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all. Each
     trajectory of the training then has its own (input-aware), and the observer serves every such plant."""
+    no_inputs: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Let the filter take in no inputs; an input-aware map is then fitted to free motion only."""
     monitor: bool = True
     """Find limits for the observer's monitor as well, which takes a minute or more for each output; left out where h
     takes no symbols."""
@@ -161,11 +163,10 @@ class Train:
     def _train_from_data(self, device: "torch.device | None", console: Console) -> Path:
         from training.commands.train_recorded import train_from_data
 
-        settings = {**(read_changes(self.config) if self.config else {}), **self.settings, **self.recorded}
         return train_from_data(
             self.system or RECORDED,
             self.data,
-            settings,
+            {**self._changes(), **self.recorded},
             out=self.out,
             resume=self.resume,
             device=device,
@@ -182,6 +183,8 @@ class Train:
             if len({*named}) < len(named):
                 raise ValueError(f"--uncertain names a parameter twice: {', '.join(named)}")
             changes["uncertain"] = dict(self.uncertain)
+        if self.no_inputs:
+            changes["inputs"] = False
         if self.closed_loop:
             changes.setdefault("closed_loop_trajectories", CLOSED_LOOP)
         return changes

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from recorded_runs import SIGNALS, SMALL, swing
 
 from observers import Artifact, KKLObserver
 from training.maps.networks import Network, averaged
@@ -11,32 +12,7 @@ from training.recorded.config import recorded_config, signal_rate
 from training.recorded.errors import recorded_errors
 from training.recorded.fit import train_recorded
 from training.recorded.preparing import split
-from training.records import Record, Signals, resampled
-
-SIGNALS = Signals("time", ("position",), ("force",), ("speed",))
-SMALL = {
-    "width": 16,
-    "inverse_steps": 500,
-    "learning_rate": 0.02,
-    "samples": 10,
-    "windows": 500,
-    "batch": 256,
-    "members": 1,
-}
-
-
-def swing(seed, n=600, dt=0.05, jitter=0.0):
-    """A mass on a spring under a force that is held: p'' = -p + u, measured at uneven times."""
-    rng = np.random.default_rng(seed)
-    t = dt * (np.arange(n) + jitter * rng.uniform(-1, 1, n))
-    u = np.repeat(rng.uniform(-1, 1, n // 20), 20)
-    x = np.empty((n, 2))
-    x[0] = rng.uniform(-1, 1, 2)
-    for k in range(n - 1):
-        angle = t[k + 1] - t[k]
-        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        x[k + 1] = turn @ (x[k] - [u[k], 0]) + [u[k], 0]
-    return Record(f"run{seed}.csv", t, x[:, :1], u[:, None], x[:, 1:], SIGNALS)
+from training.records import Record, resampled
 
 
 def test_an_observer_from_recorded_states(tmp_path):
@@ -68,7 +44,7 @@ def test_resuming_makes_the_same_observer(tmp_path):
     again = train_recorded(records, config, tmp_path, name="spring", resume=True, device=torch.device("cpu"))
     for a, b in zip(first.artifact.inverse.mlp.weights, again.artifact.inverse.mlp.weights):
         np.testing.assert_array_equal(a, b)
-    with pytest.raises(ValueError, match="a run of another configuration: .*records = "):
+    with pytest.raises(ValueError, match=r"a run of another configuration: .*records = "):
         train_recorded([*records[:2], swing(7)], config, tmp_path, name="spring", resume=True)
 
 
