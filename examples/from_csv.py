@@ -1,8 +1,8 @@
-"""From a CSV file to an observer inside a control loop: the plant's states are never seen, nor is its parameter known.
+"""From CSV files to an observer inside a control loop: the plant's states are never seen, nor is its parameter known.
 
 The middle part from the command line, with the names and units of your own columns::
 
-    kkl-gym identify van_der_pol --data runs/from_csv/record.csv --unknown mu=2 --out runs/from_csv
+    kkl-gym identify van_der_pol --data runs/from_csv/record-*.csv --unknown mu=2 --out runs/from_csv
 """
 
 from collections.abc import Callable
@@ -45,7 +45,7 @@ def record(env: kkl_gym.KKLEnv, path: Path, *, seconds: float, seed: int) -> Non
 def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) -> float:
     """Mean of c = mean(((x - target) / scale)^2) over time and episodes, which differ in start and noise."""
     costs = []
-    for seed in range(episodes):
+    for seed in range(100, 100 + episodes):  # other starts than those of the records
         x, info = env.reset(seed=seed)
         for _ in range(round(seconds / env.dt)):
             x, reward, _, _, info = env.step(policy(x, info))
@@ -54,8 +54,9 @@ def cost(env: kkl_gym.KKLEnv, policy: Policy, *, seconds: float, episodes: int) 
 
 
 def main(
-    seconds: float = 60.0,
-    steps: int = 500,
+    runs: int = 6,
+    seconds: float = 10.0,
+    steps: int = 300,
     inverse_steps: int = 3000,
     trajectories: int = 500,
     out: Path = Path("runs/from_csv"),
@@ -64,7 +65,8 @@ def main(
     """Record, identify, control; returns mu as found, and the costs with x_hat and with the true state.
 
     Args:
-        seconds: length of the record.
+        runs: files that are written; of five or more, one is left out of the fit, for a look at what is predicted.
+        seconds: length of each.
         steps: batches of the network that finds first guesses.
         inverse_steps: batches of the observer's training; `kkl-gym identify` has more, and its observer errs less.
         trajectories: simulated trajectories of the plant found, to train on.
@@ -75,15 +77,22 @@ def main(
         "van_der_pol", parameters={"mu": MU}, process_noise=0.0, measurement_noise=NOISE, start_box=STARTS
     )
     out.mkdir(parents=True, exist_ok=True)
-    record(plant, out / "record.csv", seconds=seconds, seed=seed)
+    files = [out / f"record-{k}.csv" for k in range(runs)]
+    for k, path in enumerate(files):
+        record(plant, path, seconds=seconds, seed=seed + k)
 
     model = kkl_gym.get_system("van_der_pol", {"mu": GUESS})
     learned = identify(
         model,
         {"mu": LIMITS},
-        read_records([out / "record.csv"], system=model),
+        read_records(files, system=model),
         out,
-        settings={"inverse_steps": inverse_steps, "trajectories": trajectories, "duration": 20.0},
+        settings={
+            "inverse_steps": inverse_steps,
+            "trajectories": trajectories,
+            "duration": 20.0,
+            "free_inverse": False,  # a second map, for motion without input, which the loop has not
+        },
         steps=steps,
         seed=seed,
         resume=True,

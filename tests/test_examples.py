@@ -114,11 +114,11 @@ def test_circle_pendulum(tmp_path):
 
 
 def test_from_csv(tmp_path, capsys):
-    sizes = {"seconds": 20.0, "steps": 100, "inverse_steps": 500, "trajectories": 100}
+    sizes = {"seconds": 4.0, "steps": 60, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
-    assert abs(mu - 3.3) < 0.1
-    assert with_estimate < 4 * with_state
-    assert (tmp_path / "record.csv").read_text().startswith("t,u,y\n")
+    assert abs(mu - 3.3) < 0.4
+    assert with_state < with_estimate < 0.3  # 0.38 without control
+    assert (tmp_path / "record-0.csv").read_text().startswith("t,u,y\n")
     assert "with x_hat" in capsys.readouterr().out
 
 
