@@ -11,12 +11,12 @@ from training.identification.identifiability import told_directions
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
-SETTLING, RESETTLING = 12, 4  # Levenberg-Marquardt steps of starts before parameters move, and after each step
+SETTLING, RESETTLING = 12, 3  # Levenberg-Marquardt steps of starts before parameters move, and after each step
 NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off from a linear one
-WORSE = 1.2  # times the mean square of before, from which on a window's start is looked for again
+WORSE = 1.0  # times the mean square of before, from which on a window's start is looked for again
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
-SMALL_STEP = 0.02  # of the standard errors, below which the parameters are done with
+SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
 MOST_ROWS = 60_000  # motions simulated at once
