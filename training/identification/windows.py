@@ -9,7 +9,7 @@ from training.identification.identifiability import told_directions
 from training.identification.shooting import Fit, Shooting, Windows, predictable, settled, shoot
 from training.records import Record
 
-FIRST_LENGTH = 100  # samples of the first windows, fewer where records are short
+FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
@@ -33,8 +33,8 @@ def fit_windows(
 ) -> Fit:
     """Fit parameters and starts on windows of growing length.
 
-    Short windows find their way from rough guesses; long ones say more. Chaos and process noise, which no start
-    explains for long, set an end to their length.
+    Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
+    explain most of them. Chaos and process noise, which no start explains for long, set an end to their growth.
 
     Parameters
     ----------
@@ -57,12 +57,14 @@ def fit_windows(
         At the length that says most.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    length = min(FIRST_LENGTH, longest)
-    starts: Starts = {}
-    for index, record in enumerate(records):
-        at = np.arange(first, len(record.y) - length, length)
-        starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-    best = shoot(shooting, theta, windows(records, starts, length))
+    for length in sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True):
+        starts: Starts = {}
+        for index, record in enumerate(records):
+            at = np.arange(first, len(record.y) - length, length)
+            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
+        best = shoot(shooting, theta, windows(records, starts, length))
+        if best.used.mean() >= LEAST_USED:
+            break
     report(described(best, length))
     while 2 * length <= longest:
         length *= 2
