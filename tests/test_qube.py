@@ -25,11 +25,11 @@ def test_the_model_keeps_its_energy_and_hangs():
         moving = model.pendulum_mass * (tip**2 + around**2 + up**2) + own + model.arm_inertia * arm**2
         return moving / 2 + model.pendulum_mass * model.gravity * half * np.cos(alpha)
 
-    x = simulate(model, np.array([[0.1, 1.0, 2.0, 3.0], [0.0, 3.0, -1.0, 9.0]]), 500, 0.002)
+    x = simulate(model, np.array([[0.1, 1.0, 2.0, 3.0], [0.0, 3.0, -1.0, 9.0]]), 200, 0.004)
     for run in np.moveaxis(x, 1, 0):
         np.testing.assert_allclose(energy(run), energy(run)[0], rtol=1e-5)
-    hanging = simulate(QUBE["Qube"](), np.array([[0.1, 2.0, 0.0, 0.0]]), 4000, 0.004)[-1, 0]
-    assert hanging[1] == pytest.approx(np.pi, abs=1e-2)
+    hanging = simulate(QUBE["Qube"](), np.array([[0.1, 2.0, 0.0, 0.0]]), 2500, 0.004)[-1, 0]
+    assert hanging[1] == pytest.approx(np.pi, abs=0.05)
 
 
 def write_runs(folder):
@@ -37,17 +37,19 @@ def write_runs(folder):
     rng = np.random.default_rng(0)
     runs = range(1, 13)
     x0 = np.stack([np.zeros(12), rng.uniform(1, 5, 12), rng.uniform(-2, 2, 12), rng.uniform(-5, 5, 12)], -1)
-    x = simulate(QUBE["Qube"](), x0, 1000, 0.004)
+    x = simulate(QUBE["Qube"](), x0, 700, 0.004)
     for i, run in enumerate(runs):
         alpha = np.angle(np.exp(1j * x[:, i, 1]))
         velocities = [QUBE["recorded_velocity"](x[:, i, column]) for column in (1, 0)]
-        t = 3.0 + 0.004 * (np.arange(1001) + rng.uniform(-0.05, 0.05, 1001))
+        t = 3.0 + 0.004 * (np.arange(701) + rng.uniform(-0.05, 0.05, 701))
         columns = np.column_stack([alpha, x[:, i, 0], *velocities, t])
         header = "alpha,theta,alpha_dot,theta_dot,time"
         np.savetxt(folder / f"run{run:02d}.csv", columns, delimiter=",", header=header, comments="")
 
 
-def test_on_runs_of_its_own_model(tmp_path, capsys):
+def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
+    for setting, small in {"windows": 500, "samples": 10, "members": 1, "width": 16}.items():
+        monkeypatch.setitem(QUBE["SETTINGS"], setting, small)
     write_runs(tmp_path)
     found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=60)
     assert np.isfinite(found["KKL from recorded states"]).all()

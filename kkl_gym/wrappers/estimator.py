@@ -9,7 +9,8 @@ import numpy as np
 
 from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
-from observers import KKLObserver, load, shipped
+from observers import Artifact, KKLObserver, shipped
+from observers.artifact import resolve
 from observers.checks import choice, flag
 
 
@@ -152,15 +153,12 @@ class KKLEstimator:
         system = plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
-        self.observer: KKLObserver = load(
-            system.name if observer is None else observer,
-            plant.measurement_noise if measurement_noise is None else measurement_noise,
-            process_noise=plant.process_noise,
-            monitor=monitor,
-        )
-        self.observer.artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)
+        artifact = Artifact.read(resolve(system.name if observer is None else observer))
+        artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if known_start:
-            self.observer.artifact.require_forward()  # an error now, not at the first reset
+            artifact.require_forward()  # an error now, not at the first reset
+        noise = plant.measurement_noise if measurement_noise is None else measurement_noise
+        self.observer = KKLObserver(artifact, noise, process_noise=plant.process_noise, monitor=monitor)
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)

@@ -11,9 +11,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
-import kkl_gym.wrappers.estimator
+import kkl_gym
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
-from observers import Artifact, ArtifactError, KKLObserver
+from observers import Artifact, ArtifactError, KKLObserver, load
 
 checking_wrapped = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 everyone = pytest.mark.parametrize("name", ENV_IDS)
@@ -269,17 +269,11 @@ def test_wrong_arguments(saved, tmp_path):
         KKLObservation(KKLEnv("lorenz"), str(tmp_path / "none.safetensors"))
 
 
-def test_the_default_observer_is_the_systems(monkeypatch, make_artifact):
-    asked = []
-
-    def load(name, noise, monitor, process_noise):
-        asked.append((name, noise, process_noise))
-        assert not monitor
-        return KKLObserver(make_artifact(name), noise)
-
-    monkeypatch.setattr(kkl_gym.wrappers.estimator, "load", load)
-    KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7, process_noise=0.02))
-    assert asked == [("van_der_pol", 0.7, 0.02)]
+def test_the_default_observer_is_the_systems():
+    env = KKLObservation(KKLEnv("van_der_pol", measurement_noise=0.7, process_noise=0.02))
+    observer, shipped = env.get_wrapper_attr("observer"), load("van_der_pol").artifact
+    assert observer.artifact.training == shipped.training
+    assert (observer.measurement_noise, observer.process_noise) == (0.7, 0.02)
 
 
 def test_blind_map_under_action(saved):

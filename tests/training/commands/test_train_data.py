@@ -2,6 +2,7 @@
 
 import re
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from recorded_runs import SMALL, as_csv, swing
@@ -29,7 +30,7 @@ def test_from_files_to_an_observer(tmp_path, capsys, monkeypatch):
     assert observer.measurement_noise == 0.0
     assert observer.estimate(np.zeros((10, 1)), np.zeros((9, 1))).shape == (10, 1)
     with pytest.raises(ValueError, match=r"'spring' was learned from recorded states.*fits no environment"):
-        kkl_gym.KKLObservation(kkl_gym.make("KKLVanDerPol-v0"), "runs/spring/spring.safetensors")
+        kkl_gym.KKLObservation(gym.make("KKLVanDerPol-v0"), "runs/spring/spring.safetensors")
     with pytest.raises(SystemExit, match="'spring' was learned from recorded states"):
         main(["evaluate", "runs/spring/spring.safetensors"])
     main(["train", "spring", "--data", *files, *COLUMNS, *QUICK, "--resume"])
