@@ -59,6 +59,7 @@ def test_settings_of_noise_reach_data_and_samples(monkeypatch, tmp_path):
         "high_noise_emphasis": 3.0,
         "error": None,
         "scaling": "relative",
+        "parameters": 0,
     }
     assert seen == {"record": 0.5, "sampler": {**told, "process_noise_max": 0.05}}
     with pytest.raises(ReachedError):

@@ -166,7 +166,7 @@ def test_batches_of_two_outputs_are_what_the_observer_shows_its_network():
     for row in torch.nonzero(quiet)[::40, 0].tolist():
         state = x[row].numpy() * sampler.scale.scale + sampler.scale.offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        shown = observer._states(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
 
 
@@ -181,7 +181,7 @@ def test_batches_are_what_the_observer_shows_its_network(sampler, monkeypatch):
     for row in (torch.nonzero(inputs[:, -2] == 0)[::500, 0]).tolist():
         state = x[row].numpy() * sampler.scale.scale + sampler.scale.offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
-        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        shown = observer._states(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
 
 
@@ -199,7 +199,7 @@ def test_batches_hold_what_the_observer_tells_of_process_noise(disturbed_sampler
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         level = data.process_noise[trajectory]
         observer = KKLObserver(artifact, 0.0, process_noise=level)
-        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        shown = observer._states(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-4)
         assert cell[row] % 3 == int(level > 0) + int(level > 0.025)
         assert cell[row] // 3 % 7 == 0
@@ -218,7 +218,7 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(process_noi
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         levels = data.measurement_noise[trajectory], float(data.process_noise[trajectory])
         observer = KKLObserver(artifact, levels[0], process_noise=levels[1])
-        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
+        shown = observer._states(data.z[slot, trajectory], float(data.ages[slot] * artifact.filter.dt))
         expected = network(inputs[row : row + 1].numpy())[0] * inverse.x_scale + inverse.x_offset
         np.testing.assert_allclose(shown, expected, atol=1e-3)
         at_run_time = cell[row] - sampler.open_loop.cells
@@ -254,6 +254,6 @@ def test_closed_loop_batches_of_two_outputs():
         state = x[row].numpy() * sampler.scale.scale + sampler.scale.offset
         slot, trajectory = np.argwhere(np.isclose(data.x, state, atol=1e-5).all(-1))[0]
         observer = KKLObserver(artifact, data.measurement_noise[trajectory])
-        shown = observer._invert(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
+        shown = observer._states(data.z[slot, trajectory], float(data.ages[slot] * linear.dt))
         np.testing.assert_allclose(shown, x_hat[row], atol=1e-3)
         assert ((cell[row] - sampler.cells) % 7 == 0) == (part[trajectory] == 0).all()

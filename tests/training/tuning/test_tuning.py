@@ -319,7 +319,11 @@ def test_settings_of_the_first_version_of_the_maps_are_still_known():
         if name in now:
             assert now[name] == (tuple(value) if isinstance(value, list) else value), name
     # What had no setting then: one map of free and driven motion, trained by Adam, without process noise.
-    later = {entry.name: entry.default for entry in fields(Config) if entry.name not in made}
+    later = {
+        entry.name: {} if entry.name == "uncertain" else entry.default
+        for entry in fields(Config)
+        if entry.name not in made
+    }
     later |= {"free_inverse": False, "optimiser": "adam", "process_noise_share": 0.0}
     assert {
         "noise_free_share",
