@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.identification import adapt, identify
     from training.pipeline import Result, train
     from training.presets import preset
 
@@ -16,9 +17,11 @@ __all__ = [
     "Certificate",
     "Config",
     "Result",
+    "adapt",
     "calibrate",
     "certify",
     "errors",
+    "identify",
     "nrmse",
     "preset",
     "smape",
@@ -30,9 +33,11 @@ _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
     "Result": "pipeline",
+    "adapt": "identification",
     "calibrate": "evaluation.calibration",
     "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
+    "identify": "identification",
     "nrmse": "evaluation.metrics",
     "preset": "presets",
     "smape": "evaluation.metrics",

@@ -48,6 +48,7 @@ from training.trajectories.signals import DRIVEN, KINDS
 SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
+NOMINAL_SHARE = 0.5  # of the trajectories where parameters are uncertain have the system's own, which are the likeliest
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory, at the pace of the shipped systems
 
 
@@ -90,7 +91,8 @@ def train(
     2. Free inverse (input-aware maps of a system with inputs, unless turned off or under a policy): trajectories
        without input are simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
     3. The training trajectories are simulated with the filter beside them; those of input-aware maps have process noise
-       and inputs, random ones or a policy's. In all stages each trajectory has its own values of uncertain parameters.
+       and inputs, random ones or a policy's. In all stages half of the trajectories have values of their own of
+       uncertain parameters.
     4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
        the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
        added to z.
@@ -182,7 +184,7 @@ class _Run:
     def __post_init__(self) -> None:
         system, config = self.system, self.config
         noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
-        self.plant = with_parameters(system, self.ranges)
+        self.plant = with_parameters(system, self.ranges, NOMINAL_SHARE)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.started = time.monotonic()
         self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]

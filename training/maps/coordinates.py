@@ -1,6 +1,6 @@
 """Coordinates of the filter's state that a network can read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class Coordinates:
         return np.asarray((z - self.offset) @ self.whiten.T)
 
 
-def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
+def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
     """Find the coordinates for a filter's states.
 
     Parameters
@@ -46,12 +46,18 @@ def coordinates(z: np.ndarray, noise: np.ndarray) -> Coordinates:
         Samples without noise.
     noise : ndarray, shape (size, size)
         Covariance of the noise in z where the standard deviation of that on y is 1.
+    silent : ndarray, shape (size, k), optional
+        Directions in which z says nothing: coordinates do not change along them.
 
     Returns
     -------
     Coordinates
         Without the directions that hold rounding errors only.
     """
+    if silent is not None and silent.size:
+        telling = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)
+        rest = coordinates(z @ telling.T, telling @ noise @ telling.T)
+        return replace(rest, whiten=rest.whiten @ telling)
     offset, scale = z.mean(0), spread(z)
     _, singular, directions = np.linalg.svd((z - offset) / scale, full_matrices=False)
     keep = singular > SMALLEST_MODE * singular[0]

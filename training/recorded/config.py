@@ -64,6 +64,9 @@ class RecordedConfig:
     do not. They end as one network, as wide as all together."""
     inputs: bool = True
     """Whether the filter takes in recorded inputs."""
+    arbitrary_zero: tuple[str, ...] = ()
+    """Measured signals whose zero is arbitrary, such as angles of encoders that were zeroed anywhere: the map sees how
+    they change, and not where they are."""
     noise_free_share: Share = 0.5
     """Share of the samples without noise beside that which the records hold."""
     high_noise_emphasis: Positive = 2.0

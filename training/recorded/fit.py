@@ -97,8 +97,8 @@ def train_recorded(
     Raises
     ------
     ValueError
-        If no states were recorded, all records are shorter than the filter remembers, or there are checkpoints, but not
-        ``resume`` or not of this configuration and these records.
+        If no states were recorded, a signal of ``config`` is not measured, all records are shorter than the filter
+        remembers, or there are checkpoints, but not ``resume`` or not of this configuration and these records.
     FloatingPointError
         If the loss stops being a number.
     """
@@ -110,6 +110,10 @@ def train_recorded(
         began = time.monotonic()
         torch.manual_seed(config.seed)
         signals = records[0].signals
+        if unknown := [name for name in config.arbitrary_zero if name not in signals.measured]:
+            raise ValueError(
+                f"arbitrary_zero names {', '.join(map(repr, unknown))}; measured are {', '.join(signals.measured)}"
+            )
         linear = filter_of(config, signals)
         check_memory(records, settling_time(linear), lambda text: progress.say(f"warning: {text}"))
         with progress.phase("preparing batches"):
@@ -157,6 +161,7 @@ def _sampler(
 ) -> TrajectorySampler:
     """Batches of recorded states and filter states, with noise added to that of the records."""
     ages = recording_ages(math.ceil(settling_time(linear) / config.dt), config.samples)
+    measured = records[0].signals.measured
     untold = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])
     return TrajectorySampler(
         windows(pieces(records), linear, ages=ages, n=config.windows),
@@ -169,6 +174,7 @@ def _sampler(
         high_noise_emphasis=config.high_noise_emphasis,
         error=np.einsum("j,jab->ab", untold**2, stationary_covariance(linear)) if config.untold_noise else None,
         scaling="range",  # errors count by their own size, not the state's
+        silent=linear.equilibrium[:, [measured.index(name) for name in config.arbitrary_zero]],
     )
 
 

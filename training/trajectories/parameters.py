@@ -76,7 +76,7 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
     return ranges
 
 
-def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -> System:
+def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]], nominal_share: float = 0.0) -> System:
     """A system whose states are x and then some of its parameters, with derivative zero.
 
     An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
@@ -88,6 +88,8 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
         Any system.
     ranges : mapping of str to (float, float)
         Low and high end of each parameter that becomes a state, in this order. Starts are uniform in them.
+    nominal_share : float, default 0
+        Share of the starts that have the system's own parameters instead.
 
     Returns
     -------
@@ -134,6 +136,8 @@ def with_parameters(system: System, ranges: Mapping[str, tuple[float, float]]) -
         def draw_starts(self, rng: Any, n: int, factor: float = 1.0) -> Any:
             x = super().draw_starts(rng, n)  # parameters keep to their ranges, and states to what the system draws
             x[:, :nx] = system.draw_starts(rng, n, factor)
+            if nominal_share:
+                x[rng.random(n) < nominal_share, nx:] = [getattr(system, name) for name in names]
             return x
 
         @property

@@ -48,6 +48,19 @@ def test_resuming_makes_the_same_observer(tmp_path):
         train_recorded([*records[:2], swing(7)], config, tmp_path, name="spring", resume=True)
 
 
+def test_estimates_do_not_hang_on_an_arbitrary_zero(tmp_path):
+    records = [swing(seed) for seed in range(3)]
+    config = recorded_config(records, {**SMALL, "inverse_steps": 20, "arbitrary_zero": ("position",)})
+    artifact = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).artifact
+    new = resampled(swing(100), config.dt)
+    here, there = (KKLObserver(artifact).estimate(new.y + offset, new.u) for offset in (0.0, 100.0))
+    np.testing.assert_allclose(here, there, atol=1e-3 * new.x.std())
+    assert here[-1] != pytest.approx(here[-50])  # it does move
+    unknown = replace(config, arbitrary_zero=("angle",))
+    with pytest.raises(ValueError, match=r"arbitrary_zero names 'angle'; measured are position"):
+        train_recorded(records, unknown, tmp_path / "unknown", name="spring")
+
+
 def test_without_states_or_with_short_records(tmp_path):
     records = [replace(swing(0), x=None, signals=replace(SIGNALS, hidden=()))]
     with pytest.raises(ValueError, match=r"no hidden states were recorded; name their columns \(--hidden\)"):

@@ -112,3 +112,15 @@ def test_ranges_that_make_no_sense(system, widths, message):
 def test_a_system_without_parameters_has_none_to_be_uncertain():
     with pytest.raises(ValueError, match="oscillator has no parameters"):
         relative_ranges(Oscillator(), {"all": 0.1})
+
+
+def test_a_share_of_the_starts_has_the_nominal_parameters():
+    system = VanDerPol()
+    starts = {share: with_parameters(system, {"mu": (2.0, 5.0)}, share) for share in (0.0, 0.5, 1.0)}
+    nominal = {
+        share: (one.draw_starts(np.random.default_rng(0), 4000)[:, -1] == system.mu).mean()
+        for share, one in starts.items()
+    }
+    assert nominal[0.0] == 0.0
+    assert abs(nominal[0.5] - 0.5) < 0.04  # five standard errors
+    assert nominal[1.0] == 1.0

@@ -62,6 +62,8 @@ class TrajectorySampler:
         How many of the last components of ``data.x`` are parameters that are estimated beside the state.
     scaling : {"relative", "range"}, default "relative"
         Of states and their errors, see :class:`training.maps.scaling.StateScale`.
+    silent : ndarray, shape (size, k), optional
+        Directions of z that the network is not to see.
 
     Attributes
     ----------
@@ -103,6 +105,7 @@ class TrajectorySampler:
         error: np.ndarray | None = None,
         parameters: int = 0,
         scaling: Scaling = "relative",
+        silent: np.ndarray | None = None,
     ) -> None:
         m, n, size = data.z.shape
         ny = linear.B.shape[1]
@@ -112,7 +115,7 @@ class TrajectorySampler:
         rows = np.random.default_rng(0).permutation(m * n)[:100_000]
         each = stationary_covariance(linear)
         together = np.einsum("j,jab->ab", (largest / largest.max()) ** 2, each)
-        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], together)
+        self.coordinates = coordinates(data.z.reshape(m * n, size)[rows], together, silent)
         gain, whiten = self.coordinates.noise_gain, self.coordinates.whiten
         self.noise_gain = gain
         if ny > 1:
