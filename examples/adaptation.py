@@ -37,11 +37,14 @@ class Compared:
     ----------
     shipped, adapted, trained : float
         Of the shipped observer, the adapted one, and the one trained on the true parameters.
+    parameters : dict of str to float
+        Errors of the parameters found, in % of the plant's.
     """
 
     shipped: float
     adapted: float
     trained: float
+    parameters: dict[str, float]
 
 
 def main(
@@ -52,6 +55,7 @@ def main(
     seed: int = 12,
     out: Path | None = None,
     inverse_steps: int | None = None,
+    trajectories: int | None = None,
 ) -> Compared:
     """Simulate records of a plant that is not an observer's model, adapt the observer, and say what that brings.
 
@@ -63,6 +67,7 @@ def main(
         seed: of the records; any will do.
         out: the runs' folder.
         inverse_steps: batches of both trainings, fewer than the shipped observer had for a quick look.
+        trajectories: simulated for them, the same.
     """
     console, model = Console(), get_system(system)
     plant = model.replace({name: WRONG * value for name, value in model.parameters.items()})
@@ -71,7 +76,8 @@ def main(
     y = plant.output(x) + noise * rng.standard_normal((steps + 1, records, plant.ny))
     t = np.arange(steps + 1) * plant.dt
     shipped, folder = Artifact.read(resolve(system)), out or Path("runs") / f"{system}-adapted"
-    settings = {} if inverse_steps is None else {"inverse_steps": inverse_steps}
+    sizes = {"inverse_steps": inverse_steps, "trajectories": trajectories}
+    settings = {name: size for name, size in sizes.items() if size is not None}
     began = time.process_time()
     learned = adapt(
         shipped,
@@ -88,14 +94,14 @@ def main(
     trained = train(plant, config, folder / "true", resume=True, console=console).artifact
 
     unseen = unseen_trajectories(plant, plant.dt, n=50, duration=50.0, seed=seed)
-    found = Compared(
-        *(
-            float(np.median(errors(one, plant, unseen, measurement_noise=noise, seed=seed).full))
-            for one in (shipped, learned.result.artifact, trained)
-        )
-    )
-    for name, value in learned.identified.system.parameters.items():
-        console.print(f"{name}: {value:.6g}, {100 * (value / plant.parameters[name] - 1):+.2g} % off")
+    smape = [
+        float(np.median(errors(one, plant, unseen, measurement_noise=noise, seed=seed).full))
+        for one in (shipped, learned.result.artifact, trained)
+    ]
+    values = learned.identified.system.parameters
+    found = Compared(*smape, {name: 100 * (value / plant.parameters[name] - 1) for name, value in values.items()})
+    for name, off in found.parameters.items():
+        console.print(f"{name}: {values[name]:.6g}, {off:+.2g} % off")
     console.print(
         f"{system}, noise {noise:g}, SMAPE in %: shipped {found.shipped:.3g}, adapted {found.adapted:.3g}, trained on "
         f"the plant {found.trained:.3g}; adapting took {took:.0f} s of CPU"

@@ -113,6 +113,14 @@ def test_circle_pendulum(tmp_path):
     assert (errors < 0.3).all()
 
 
+def test_adaptation(tmp_path, capsys):
+    sizes = {"records": 6, "seconds": 12.0, "inverse_steps": 40, "trajectories": 40}
+    found = example("adaptation")("van_der_pol", noise=0.1, **sizes, out=tmp_path)
+    assert abs(found.parameters["mu"]) < 1.0  # from 9 % off
+    assert found.shipped < min(found.adapted, found.trained)  # which are hardly trained here
+    assert "% off" in capsys.readouterr().out
+
+
 def test_from_csv(tmp_path, capsys):
     sizes = {"seconds": 4.0, "steps": 60, "inverse_steps": 400, "trajectories": 60}
     mu, with_estimate, with_state = example("from_csv")(**sizes, out=tmp_path)
