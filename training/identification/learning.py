@@ -21,7 +21,7 @@ from training.maps.optimise import log_to
 from training.pipeline import Result, train
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
-from training.records import Record, check_dt, median_step, resampled
+from training.records import Record, check_dt, resampled, sampling_interval
 
 NOISE_RANGE = 2.0  # largest measurement noise that a map is made for, over what the records show
 LEAST_NOISE = 0.002  # the same, over the output's range, where they show hardly any
@@ -183,7 +183,7 @@ def adapt(
 
 
 def _interval(records: Sequence[Record], dt: float | None) -> float:
-    return float(f"{median_step(*records):.6g}") if dt is None else dt
+    return sampling_interval(*records) if dt is None else dt
 
 
 def _parameters(

@@ -3,7 +3,7 @@
 from training.records.checks import check_dt, check_memory
 from training.records.reading import read_records
 from training.records.record import Record
-from training.records.resampling import jitter, median_step, pieces, resampled
+from training.records.resampling import jitter, median_step, pieces, resampled, sampling_interval
 from training.records.signals import Signals
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "pieces",
     "read_records",
     "resampled",
+    "sampling_interval",
 ]
