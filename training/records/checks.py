@@ -16,21 +16,23 @@ OTHER_CLOCK = 30.0  # times the sampling interval of other records
 WHOLE_TURN = 0.9 * 2 * np.pi  # jumps from here to a whole turn are those of a wrapped angle
 
 
-def check_between_records(records: Sequence[Record], warn: Warn) -> None:
-    """See that records have the same columns, and that none seems to be in other units than the others.
+def check_signals(records: Sequence[Record], system: System | None = None) -> None:
+    """See that there are records, with the same columns, and as many of them as a system has signals.
 
     Parameters
     ----------
     records : sequence of Record
         Of one plant.
-    warn : callable
-        Told of spreads that differ.
+    system : System, optional
+        The plant, where that is known.
 
     Raises
     ------
     ValueError
-        If columns differ, or sampling intervals by a factor of 30.
+        If there is none, columns differ, or a number of columns.
     """
+    if not records:
+        raise ValueError("there is no record")
     first = records[0]
     for record in records[1:]:
         for role in ROLES.values():
@@ -38,6 +40,33 @@ def check_between_records(records: Sequence[Record], warn: Warn) -> None:
             if here != there:
                 told = [", ".join(names) or "none" for names in (here, there)]
                 raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
+    if system is None:
+        return
+    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
+    for role, count in counts.items():
+        found = getattr(first.signals, role)
+        if len(found) != count and (found or role == "measured"):
+            raise ValueError(
+                f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; "
+                f"name others by --{role}"
+            )
+
+
+def check_between_records(records: Sequence[Record], warn: Warn) -> None:
+    """See that no record seems to be in other units than the others.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With the same columns.
+    warn : callable
+        Told of spreads that differ.
+
+    Raises
+    ------
+    ValueError
+        If sampling intervals differ by a factor of 30.
+    """
     steps = np.array([median_step(record) for record in records])
     for record, step in zip(records, steps):
         if not 1 / OTHER_CLOCK < step / np.median(steps) < OTHER_CLOCK:
@@ -46,7 +75,7 @@ def check_between_records(records: Sequence[Record], warn: Warn) -> None:
                 "other files; is the time in other units than seconds?"
             )
     for letter, role in ROLES.items():
-        for j, column in enumerate(getattr(first.signals, role)):
+        for j, column in enumerate(getattr(records[0].signals, role)):
             spreads = np.array([_spread(record, letter, j) for record in records])
             usual = np.median(spreads[spreads > 0]) if (spreads > 0).any() else 1.0
             if len(records) == 2 and spreads.all():
@@ -102,12 +131,12 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
 
 
 def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
-    """See that records have a system's numbers of signals, and sizes that it may reach.
+    """See that records are of sizes that a system may reach.
 
     Parameters
     ----------
     records : sequence of Record
-        With the same columns.
+        With the system's numbers of columns.
     system : System
         What was recorded.
     warn : callable
@@ -117,19 +146,10 @@ def check_against_system(records: Sequence[Record], system: System, warn: Warn) 
     Raises
     ------
     ValueError
-        If a number of signals differs, or a signal is a hundred times larger than the system's declarations allow.
+        If a signal is a hundred times larger than the system's declarations allow.
     """
-    signals, first = records[0].signals, records[0].name
-    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
-    for role, count in counts.items():
-        found = getattr(signals, role)
-        if len(found) != count and (found or role == "measured"):
-            raise ValueError(
-                f"{first}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; name "
-                f"others by --{role}"
-            )
-    if system.nu and not signals.inputs:
-        warn(f"{first}: no column of inputs, which are taken for zero")
+    if system.nu and not records[0].signals.inputs:
+        warn(f"{records[0].name}: no column of inputs, which are taken for zero")
     for record in records:
         ratio = median_step(record) / system.dt
         if not 1 / OTHER_UNITS < ratio < OTHER_UNITS:

@@ -117,7 +117,7 @@ def _csv(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
     with _explained(path, "CSV"), path.open(encoding="utf-8-sig", newline="") as file:
         header = file.readline()
         separator = max(SEPARATORS, key=header.count)
-        layout = {"delimiter": separator, "skipinitialspace": True}
+        layout: Any = {"delimiter": separator, "skipinitialspace": True}
         names = tuple(name.strip() for name in next(csv.reader([header], **layout), []))
         if not any(names) or all(_is_number(name) for name in names):
             raise ValueError("its first row must hold the names of the columns")

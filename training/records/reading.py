@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from kkl_gym.system import System
-from training.records.checks import check_against_system, check_between_records, check_motion
+from training.records.checks import check_against_system, check_between_records, check_motion, check_signals
 from training.records.files import read_columns
 from training.records.record import Record, refuse_infinite
 from training.records.signals import Signals, column_of, values_of
@@ -53,6 +53,7 @@ def read_records(
         raise ValueError("name a file of recorded data: .npz, .csv or .parquet (--data)")
     records = [_read(path, signals or Signals()) for path in paths]
     told = warn or (lambda text: warnings.warn(text, stacklevel=4))
+    check_signals(records, system)
     check_between_records(records, told)
     check_motion(records, told)
     if system is not None:

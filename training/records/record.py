@@ -1,7 +1,7 @@
 """A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
 
 from dataclasses import dataclass, field, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -76,8 +76,8 @@ class Record:
                 f"got {values.shape}"
             )
         if not getattr(self.signals, role):
-            numbered = tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))
-            object.__setattr__(self, "signals", replace(self.signals, **{role: numbered}))
+            numbered: Any = {role: tuple(f"{letter}{i + 1}" for i in range(values.shape[1]))}
+            object.__setattr__(self, "signals", replace(self.signals, **numbered))
         names: tuple[str, ...] = getattr(self.signals, role)
         if len(names) != values.shape[1]:
             raise ValueError(f"{self.name}: {letter} has {values.shape[1]} columns, but {role} = {names}")

@@ -45,7 +45,7 @@ def test_from_files_to_an_observer(data, tmp_path, capsys, monkeypatch):
         (["--unknown", "mu"], "NAME=VALUE"),
         (["--unknown", "nu=1"], "no parameter 'nu'"),
         (["--unknown", "mu=0"], "mu=0:LOW:HIGH"),
-        (["--unknown", "mu=2:3:4"], "between its limits"),
+        (["--unknown", "mu=2:3:4"], "between finite limits"),
         ([], "--unknown mu=1.5"),
     ],
 )
