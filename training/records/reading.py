@@ -41,8 +41,8 @@ def read_records(
     Raises
     ------
     ValueError
-        If there is no file, one cannot be read, or its samples make no record; the message names file, column and row.
-        Rows are counted from 1, without the header.
+        If there is no file, one is named twice or cannot be read, or its samples make no record; the message names
+        file, column and row. Rows are counted from 1, without the header.
     OSError
         If a file cannot be read.
     ModuleNotFoundError
@@ -51,6 +51,9 @@ def read_records(
     paths = [Path(path) for path in files]
     if not paths:
         raise ValueError("name a file of recorded data: .npz, .csv or .parquet (--data)")
+    twice = sorted({str(path) for path in paths if paths.count(path) > 1})
+    if twice:
+        raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
     records = [_read(path, signals or Signals()) for path in paths]
     told = warn or (lambda text: warnings.warn(text, stacklevel=4))
     check_signals(records, system)

@@ -1,5 +1,6 @@
 """A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
 
+import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
@@ -101,6 +102,14 @@ class Record:
         if x is not None and np.isnan(x).any(-1).all():
             x = None
         return replace(self, t=self.t[rows], y=self.y[rows], u=u, x=x)
+
+    @property
+    def fingerprint(self) -> str:
+        """What identifies the samples and the names of their signals."""
+        found = hashlib.sha256(repr(self.signals).encode())
+        for values in (self.t, self.y, self.u, self.x):
+            found.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
+        return found.hexdigest()[:16]
 
     @property
     def duration(self) -> float:

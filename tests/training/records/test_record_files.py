@@ -176,6 +176,8 @@ def test_no_record(tmp_path):
 
 def test_files_that_differ(tmp_path):
     first = npz(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a.npz: named twice, which would count each sample twice$"):
+        read_records([first, npz(tmp_path / "b.npz"), first])
     with pytest.raises(ValueError, match=r"b.npz: inputs are columns u, but none in .*a.npz"):
         read_records([first, npz(tmp_path / "b.npz", u=Y)])
     with pytest.raises(ValueError, match=r"b.npz: column t: steps of 50 s, but .*other units than seconds"):
