@@ -1,6 +1,6 @@
 """Windows of records: standard errors, and first guesses that explain nothing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -96,6 +96,22 @@ def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypat
     fit = fit_windows(shooting, np.array([4.1]), records, lambda record, at: x[at, int(record.name)], first=0)
     assert len(fit.windows.u) == length
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
+
+
+def test_standard_errors_are_of_any_units():
+    """Outputs tell a parameter that came out far larger than its unit, and none of a second in sum with a third."""
+    _, fit = fitted(windows(Decay(), 5, 60, noise=0.01, process_noise=0.0, seed=0), rate_constant=1.1)
+    told = np.diag([1e4, 1e-4, 1.0, 1.0])
+    told[2, 3] = told[3, 2] = 1.0
+    found = replace(
+        fit,
+        parameters={"a": 1.0, "b": 1e5, "c": 1.0, "d": 1.0},
+        unit=np.ones(4),
+        information=told,
+        curvature=told,
+        white=told,
+    )
+    assert found.standard_errors == pytest.approx([0.01, 100.0, np.inf, np.inf])
 
 
 def test_few_windows_say_nothing_of_their_scatter():
