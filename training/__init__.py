@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
-    from training.identification import adapt, identify
+    from training.identification.learning import adapt, identify
     from training.pipeline import Result, train
     from training.presets import preset
 
@@ -33,11 +33,11 @@ _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
     "Result": "pipeline",
-    "adapt": "identification",
+    "adapt": "identification.learning",
     "calibrate": "evaluation.calibration",
     "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
-    "identify": "identification",
+    "identify": "identification.learning",
     "nrmse": "evaluation.metrics",
     "preset": "presets",
     "smape": "evaluation.metrics",

@@ -17,6 +17,7 @@ WORSE = 1.0  # times the mean square of before, from which on a window's start i
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
 SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
+ROUNDING = 1e-14  # of an output's standard deviation: the least noise
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
 COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
@@ -72,6 +73,9 @@ class Fit:
         Windows that the model explains; the others count little or nothing.
     cost : float
         Mean square of the residuals of those windows, over each output's variance.
+    left : float
+        Length of the step to the least squares that is still to be made, in standard errors for white noise; chaos,
+        and what rounding makes of it, may stand in its way.
     starts_by_parameters : ndarray, shape (number used, nx, p)
         How the starts that fit best, over X's half-widths, follow the parameters, over their units.
     """
@@ -87,6 +91,7 @@ class Fit:
     scattered: np.ndarray
     used: np.ndarray
     cost: float
+    left: float
     starts_by_parameters: np.ndarray
 
     def errors(self, directions: np.ndarray, told: np.ndarray) -> np.ndarray:
@@ -311,7 +316,7 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     for change in (told * np.minimum(fit.errors(told, told), 1.0)).T:
         x0 = at.x0 + shooting.half * (by_parameters @ change)
         off = problem.follow(theta + change * shooting.unit, x0, problem.rows).y - at.y - beyond @ change
-        off = np.where(problem.there, off, 0.0) / np.maximum(fit.noise, 1e-300)
+        off = np.where(problem.there, off, 0.0) / fit.noise
         linear &= np.sqrt((off**2).sum((0, 2)) / problem.count) < NONLINEAR
     return linear
 
@@ -360,26 +365,46 @@ def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision:
                 f"{dict(zip(shooting.names, theta.round(6).tolist()))}; give other first guesses, or limits"
             )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
-        step, better = np.inf, False
+        better = False
+        if _left(*_reduced(H, g, used=used, nx=nx)[:2], at.each[used].mean()) < precision:
+            break
         while damping < MOST_DAMPING and not better:
-            D = _damped(H, damping)
-            along = np.linalg.solve(D[:, :nx, :nx], np.concatenate([D[:, :nx, nx:], g[:, :nx, None]], -1))
-            cross = D[:, nx:, :nx]
-            S = (D[:, nx:, nx:] - cross @ along[..., :-1])[used].sum(0)
-            s = (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0)
-            new = np.clip(theta + np.linalg.lstsq(S, s, rcond=1e-12)[0] * shooting.unit, shooting.low, shooting.high)
+            S, s, along = _reduced(H, g, used=used, nx=nx, damping=damping)
+            step = np.linalg.lstsq(S + damping * np.diag(S.diagonal()), s, rcond=1e-12)[0]
+            new = np.clip(theta + step * shooting.unit, shooting.low, shooting.high)
             change = (new - theta) / shooting.unit
             x0 = at.x0 + (along[..., -1] - along[..., :-1] @ change) * shooting.half
             tried = problem.follow(new, x0, problem.rows)
             problem.settle(new, tried, np.flatnonzero(tried.each > WORSE * at.each), RESETTLING)
             # Windows that chaos has thrown off count no more than what lies beyond the worst that is explained.
-            if np.minimum(tried.each[used], 2 * at.each[used].max()).sum() < at.each[used].sum():
-                step = float(np.sqrt(max(change @ S @ change, 0.0) / max(at.each[used].mean(), 1e-300)))
-                theta, at, better = new, tried, True
+            fall = at.each[used].sum() - np.minimum(tried.each[used], 2 * at.each[used].max()).sum()
+            better = fall > 0
             damping = max(damping / 10.0, 1e-12) if better else damping * 10.0
-        if not better or step < precision:
+        if not better:
             break
+        theta, at = new, tried
+        if fall * len(windows.y) < precision**2 * at.each[used].mean():
+            break  # rounding leaves no more; the fit says how far off it is
     return _fit(problem, theta, at)
+
+
+def _reduced(
+    H: np.ndarray, g: np.ndarray, *, used: np.ndarray, nx: int, damping: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normal equations S (p, p), s (p,) of the parameters alone, with starts of the windows used that follow them.
+
+    The third is how all starts follow, (n, nx, p + 1): they move by its last column less the others times the change.
+    """
+    D, cross = _damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
+    along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
+    S = (H[:, nx:, nx:] - cross @ along[..., :-1])[used].sum(0)
+    return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
+
+
+def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
+    """Length of the step that normal equations ask for, in standard errors that residuals of such a cost leave."""
+    step = np.linalg.lstsq(S, s, rcond=1e-12)[0]
+    return float(np.sqrt(max(step @ s, 0.0) / max(cost, 1e-300)))
 
 
 def _damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
@@ -395,8 +420,9 @@ def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
     there = problem.there[:, used] & (J != 0).any(-1)
     count = there.sum((0, 1))
     free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
-    noise = np.sqrt(np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free)
-    information = _beyond_starts(J, 1.0 / np.maximum(noise, 1e-300) ** 2, nx)[0]
+    squares = np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free
+    noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
+    information = _beyond_starts(J, 1.0 / noise**2, nx)[0]
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
     few = len(gradients) / max(len(gradients) - len(theta), 1)  # windows, whose gradients add up to zero
@@ -412,6 +438,7 @@ def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
         scattered=few * gradients.T @ gradients,
         used=used,
         cost=float(np.mean(at.each[used])),
+        left=_left(curvature, gradients.sum(0), np.mean(at.each[used])),
         starts_by_parameters=by_parameters,
     )
 

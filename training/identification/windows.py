@@ -10,7 +10,6 @@ from training.identification.shooting import (
     CLUSTERS,
     Fit,
     Shooting,
-    UnexplainedError,
     Windows,
     predictable,
     settled,
@@ -18,11 +17,12 @@ from training.identification.shooting import (
 )
 from training.records import Record
 
-FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
+FIRST_LENGTH = 100  # samples of the first windows: long ones say more, short ones find their way
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
+LEFT = 0.5  # standard errors that a fit may be from where its squares are least
 MOST_SAMPLES = 6400  # of a window
 
 Starts = dict[tuple[int, int], np.ndarray]
@@ -42,9 +42,9 @@ def fit_windows(
 ) -> Fit:
     """Fit parameters and starts on windows of growing length.
 
-    Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
-    explain most of them. Chaos and process noise set an end to their growth, which no start explains for long:
-    residuals are no longer white then, and standard errors that follow the scatter of windows fall no further.
+    Long windows say more, short ones find their way from rougher guesses. Chaos and process noise set an end to their
+    growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
+    scatter of windows fall no further.
 
     Parameters
     ----------
@@ -69,23 +69,15 @@ def fit_windows(
     Raises
     ------
     UnexplainedError
-        If no window of any length can be explained.
+        If no window can be explained.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
-    for length in lengths:
-        starts: Starts = {}
-        for index, record in enumerate(records):
-            at = np.arange(first, len(record.y) - length, length)
-            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-        try:
-            best = shoot(shooting, theta, windows(records, starts, length))
-        except UnexplainedError:
-            if length == lengths[-1]:
-                raise
-            continue
-        if best.used.mean() >= LEAST_USED:
-            break
+    starts: Starts = {}
+    length = min(FIRST_LENGTH, longest)
+    for index, record in enumerate(records):
+        at = np.arange(first, len(record.y) - length, length)
+        starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
+    best = shoot(shooting, theta, windows(records, starts, length))
     report(described(best, length))
     while 2 * length <= longest:
         length *= 2
@@ -104,6 +96,8 @@ def fit_windows(
         starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
         fit = shoot(shooting, np.array(list(best.parameters.values())), windows(records, starts, length))
         if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
+            break
+        if fit.left > LEFT:
             break
         report(described(fit, length))
         told = told_directions(best.information)
