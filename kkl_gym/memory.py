@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from observers import LinearFilter
-from observers.checks import is_finite, shown
+from observers.checks import is_finite, is_sequence, shown
 
-SHORTEST, LONGEST = 0.1, 10_000.0  # time constants in steps
+SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than it saves
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
 
@@ -56,7 +56,7 @@ class Memory:
     Raises
     ------
     ValueError
-        If time constants are no numbers, from 0.1 to 10,000 steps, or too close to each other.
+        If time constants are no numbers, from 0.5 to 10,000 steps, or too close to each other.
     """
 
     def __init__(
@@ -247,14 +247,14 @@ def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray
 
 def _time_constants(name: str, values: Any) -> tuple[float, ...]:
     """Time constants as floats, or ValueError."""
-    if not isinstance(values, list | tuple | np.ndarray):
+    if not is_sequence(values):
         raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
     for value in values:
         if not is_finite(value) or not SHORTEST <= value <= LONGEST:
             raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {shown(value)}")
     found = tuple(map(float, values))
     for one, next_one in pairwise(found):
-        if next_one < CLOSEST * one:
+        if next_one < (1 - 1e-9) * CLOSEST * one:
             raise ValueError(
                 f"{name} must rise, each at least {CLOSEST} times the one before, got {one:g} and {next_one:g}: closer "
                 "ones would hold the same"

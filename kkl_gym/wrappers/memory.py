@@ -66,7 +66,7 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
     angles : sequence of int or of str
         Which of these are angles in rad. Each is replaced by its cosine and sine.
     time_constants : sequence of float
-        Of the outputs' filters, in steps, from 0.1 to 10,000, each at least 1.5 times the one before. Longer ones
+        Of the outputs' filters, in steps, from 0.5 to 10,000, each at least 1.5 times the one before. Longer ones
         remember longer.
     input_time_constants : sequence of float
         Of the filters of actions, in steps, likewise; none leave actions out. Boxes with bounds are scaled to [-1, 1],
