@@ -122,6 +122,16 @@ def test_from_csv(tmp_path, capsys):
     assert "with x_hat" in capsys.readouterr().out
 
 
+def test_memory(capsys):
+    """What it prints is what it returns, and all is seeded; to learn something takes longer."""
+    sizes = {"steps": 150, "episodes": 2}
+    returns = example("memory")(**sizes)
+    printed = re.findall(r"(.*): mean return (-\d+) ± ", capsys.readouterr().out)
+    assert printed == [(name, f"{value:.0f}") for name, value in returns.items()]
+    assert example("memory")(**sizes) == returns
+    assert example("memory")(**sizes, seed=1) != returns
+
+
 def test_sb3_agent():
     reward = example("sb3_agent")(num_envs=2, steps=256)
     assert example("sb3_agent")(num_envs=2, steps=256) == reward  # everything random is seeded
