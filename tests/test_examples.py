@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import kkl_gym
 from training.cli import main
 from training.evaluation import calibration
 
@@ -130,6 +131,19 @@ def test_memory(capsys):
     assert printed == [(name, f"{value:.0f}") for name, value in returns.items()]
     assert example("memory")(**sizes) == returns
     assert example("memory")(**sizes, seed=1) != returns
+
+
+def test_the_page_on_memory_runs():
+    page = (ROOT / "docs" / "memory.md").read_text()
+    small = {"20_000": "1", "1024": "3", "HalfCheetah-v5": "Pendulum-v1"}  # MuJoCo comes with the extra envs alone
+    made = {"kkl_gym": kkl_gym}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        for large, little in small.items():
+            block = block.replace(large, little)
+        exec(block, made)
+    assert made["env"].observation_space.shape == (12,)
+    assert made["agent"].num_timesteps == 1
+    assert made["envs"].observation_space.shape == (12,)
 
 
 def test_sb3_agent():

@@ -143,6 +143,13 @@ def test_bounds_hold_and_are_reached_by_the_worst_signals(outputs, inputs):
     assert low[1 + len(outputs) :].tolist() == [-1.0] * len(inputs)
 
 
+def test_signals_without_bounds_have_memories_without_bounds():
+    infinite = np.array([np.inf])
+    low, high = memory(1, 1).bounds(-infinite, infinite, np.array([2.0]), infinite)
+    assert high.tolist() == [np.inf] * 7
+    assert low.tolist() == [-np.inf] * 5 + [0.0] * 2  # where an input's filter begins
+
+
 def test_one_row_a_batch_and_a_wide_row_agree(monkeypatch):
     y, u = signals(30, 5, 3), signals(29, 5, 2, seed=1)
     batch = run(memory(3, 2), y, u)
