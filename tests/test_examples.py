@@ -114,6 +114,7 @@ def test_circle_pendulum(tmp_path):
     assert (errors < 0.3).all()
 
 
+@pytest.mark.slow
 def test_adaptation(tmp_path, capsys):
     sizes = {"records": 6, "seconds": 12.0, "inverse_steps": 40, "trajectories": 40}
     found = example("adaptation")("van_der_pol", noise=0.1, **sizes, out=tmp_path)
