@@ -328,7 +328,9 @@ def explained(each: np.ndarray) -> np.ndarray:
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
 
 
-def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision: float = SMALL_STEP) -> Fit:
+def shoot(
+    shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision: float = SMALL_STEP, rounds: int = ROUNDS
+) -> Fit:
     """Least squares over parameters and starts at one length of windows.
 
     Parameters
@@ -341,6 +343,8 @@ def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision:
         The data, with starts to begin with.
     precision : float
         Size of a step, in standard errors of the parameters, from which on they are good enough.
+    rounds : int
+        Most steps.
 
     Returns
     -------
@@ -355,7 +359,7 @@ def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision:
     problem, nx, damping = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING
     at = problem.follow(theta, windows.x0, problem.rows)
     problem.settle(theta, at, problem.rows, SETTLING)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         used = explained(at.each)
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)

@@ -5,11 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from training.identification.consistency import noise_level
 from training.identification.identifiability import told_directions
 from training.identification.shooting import (
     CLUSTERS,
+    ROUNDS,
     Fit,
     Shooting,
+    UnexplainedError,
     Windows,
     predictable,
     settled,
@@ -17,7 +20,10 @@ from training.identification.shooting import (
 )
 from training.records import Record
 
-FIRST_LENGTH = 100  # samples of the first windows: long ones say more, short ones find their way
+FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
+FIRST_ROUNDS = 15  # steps in which the longer of these have to find theirs
+MORE_NOISE = 1.5  # standard deviation of their residuals, over that of the noise that neighbouring samples show
+SMALL = 0.01  # of an output's standard deviation: residuals that are no matter without noise either
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
@@ -42,7 +48,8 @@ def fit_windows(
 ) -> Fit:
     """Fit parameters and starts on windows of growing length.
 
-    Long windows say more, short ones find their way from rougher guesses. Chaos and process noise set an end to their
+    Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
+    explain most of them, but for noise. Chaos and process noise set an end to their
     growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
     scatter of windows fall no further.
 
@@ -69,15 +76,27 @@ def fit_windows(
     Raises
     ------
     UnexplainedError
-        If no window can be explained.
+        If no window of any length can be explained.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    starts: Starts = {}
-    length = min(FIRST_LENGTH, longest)
-    for index, record in enumerate(records):
-        at = np.arange(first, len(record.y) - length, length)
-        starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-    best = shoot(shooting, theta, windows(records, starts, length))
+    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
+    expected = np.maximum(
+        MORE_NOISE * noise_level(records), SMALL * np.nanstd(np.concatenate([r.y for r in records]), 0)
+    )
+    for length in lengths:
+        starts: Starts = {}
+        for index, record in enumerate(records):
+            at = np.arange(first, len(record.y) - length, length)
+            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
+        last = length == lengths[-1]
+        try:
+            best = shoot(shooting, theta, windows(records, starts, length), rounds=ROUNDS if last else FIRST_ROUNDS)
+        except UnexplainedError:
+            if last:
+                raise
+            continue
+        if best.used.mean() >= LEAST_USED and best.left <= LEFT and (best.noise <= expected).all():
+            break
     report(described(best, length))
     while 2 * length <= longest:
         length *= 2

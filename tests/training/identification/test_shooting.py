@@ -86,7 +86,7 @@ def test_standard_errors_cover_the_truth_under_process_noise(process_noise, colo
 
 @pytest.mark.parametrize(("process_noise", "length"), [(0.0, 160), (0.1, 40)])
 def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
-    monkeypatch.setattr(fitting, "FIRST_LENGTH", 20)
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (20,))
     rng, steps, n = np.random.default_rng(1), 160, 45
     w = process_noise * rng.standard_normal((steps, n, 2))
     x = simulate(Swing(), Swing().draw_starts(rng, n), steps, Swing.dt, w=w)
