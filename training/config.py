@@ -164,7 +164,7 @@ class Config:
                 raise ValueError(f"the eigenvalues of A must be distinct, got {modes}")
         if self.uncertain and self.pipeline != "input-aware":
             raise ValueError(f"uncertain = {self.uncertain!r} needs the pipeline 'input-aware', not {self.pipeline!r}")
-        if self.estimate_parameters and not self.uncertain:
+        if self.estimate_parameters and not any(self.uncertain.values()):
             raise ValueError("estimate_parameters needs uncertain parameters, of which there are none")
         if self.policy is not None and (self.pipeline != "input-aware" or not self.inputs):
             raise ValueError(

@@ -180,6 +180,7 @@ def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():
         ({"uncertain": {"mu": 1.0}}, "less than 1"),
         ({"uncertain": {"mu": -0.1}}, "greater than or equal to 0"),
         ({"estimate_parameters": True}, "needs uncertain parameters"),
+        ({"estimate_parameters": True, "uncertain": {"all": 0.0}}, "needs uncertain parameters"),
         ({"uncertain": {"mu": 0.1}, "pipeline": "spinn", "forward_steps": 9}, "needs the pipeline 'input-aware'"),
     ],
 )

@@ -1,8 +1,7 @@
 """``kkl-gym identify`` and ``kkl-gym adapt``."""
 
 import time
-from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -85,7 +84,7 @@ class Identify:
         from training.identification import identify
 
         torch.set_num_threads(max(1, self.threads))
-        unknown = dict(ChainMap(*map(dict, reversed(self.unknown))))
+        unknown = merged(self.unknown)
         system = get_system(self.system, {**self.parameters, **{name: of[0] for name, of in unknown.items()}})
         folder = self.out or Path("runs") / f"{system.name}-identified"
         with progress_bars(console, folder / LOG) as progress:
@@ -158,9 +157,7 @@ class Adapt:
         torch.set_num_threads(max(1, self.threads))
         artifact = Artifact.read(resolve(self.observer))
         system = system_of(artifact, self.system)
-        guesses = dict(ChainMap(*map(dict, reversed(self.unknown)))) or {
-            name: (value,) for name, value in system.parameters.items()
-        }
+        guesses = merged(self.unknown) or {name: (value,) for name, value in system.parameters.items()}
         if not guesses:
             raise ValueError(f"{system.name} has no parameters that could be adapted")
         system = system.replace({name: numbers[0] for name, numbers in guesses.items()})
@@ -185,6 +182,31 @@ class Adapt:
             learned.result.artifact.save(self.out)
             progress.say(f"wrote {self.out}")
             return self.out
+
+
+def merged(unknown: Sequence[Sequence[tuple[str, tuple[float, ...]]]]) -> dict[str, tuple[float, ...]]:
+    """Unknown parameters of one option or several.
+
+    Parameters
+    ----------
+    unknown : sequence of sequences of (str, tuple of float)
+        Names with numbers, as each option gives them.
+
+    Returns
+    -------
+    dict of str to tuple of float
+        The numbers by name.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is named twice.
+    """
+    pairs = [pair for option in unknown for pair in option]
+    names = [name for name, _ in pairs]
+    if len({*names}) < len(names):
+        raise ValueError(f"--unknown names a parameter twice: {', '.join(names)}")
+    return dict(pairs)
 
 
 def limits(system: System, unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:

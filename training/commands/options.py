@@ -60,13 +60,13 @@ RepeatedParameters = Annotated[tuple[OneParameter, ...], tyro.conf.UseAppendActi
 Unknowns = Annotated[
     tuple[
         Annotated[
-            Mapping[str, tuple[float, ...]],
+            tuple[tuple[str, tuple[float, ...]], ...],
             PrimitiveConstructorSpec(
                 nargs="*",
                 metavar="NAME=VALUE[:LOW:HIGH]",
-                instance_from_str=lambda words: dict(map(read_unknown, words)),
+                instance_from_str=lambda words: tuple(map(read_unknown, words)),
                 is_instance=lambda value: True,
-                str_from_instance=lambda found: [f"{name}={':'.join(map(str, of))}" for name, of in found.items()],
+                str_from_instance=lambda found: [f"{name}={':'.join(map(str, of))}" for name, of in found],
             ),
         ],
         ...,

@@ -25,6 +25,7 @@ HORIZON = 10  # samples between two estimates that the equations must lead from 
 DYNAMICS = 10.0  # weight of that, in half-widths of X, against the output's residual, in standard deviations
 RATE_STEP = 0.3  # rate times the length of a Runge-Kutta step
 PACE = 3.0  # of a parameter's logarithm, for each unit of what the optimiser moves
+INSIDE = 1e-4  # part of the bounds' width that states keep from their ends
 DIFFERENCES = 4  # of y, in which hardly anything is left of its motion, and all of its noise
 FITTED = 100_000  # samples from which the filter's coordinates are found
 
@@ -135,7 +136,8 @@ class ConsistencyProblem(nn.Module):
         low, high = system.box()
         self._centre, self._half = (torch.tensor(v, dtype=torch.float32) for v in ((low + high) / 2, (high - low) / 2))
         bounds = torch.tensor(system.bounds, dtype=torch.float32)
-        self._low, self._high = bounds[:, 0], bounds[:, 1]
+        room = INSIDE * (bounds[:, 1] - bounds[:, 0])  # as a root has no derivative at the end of its domain
+        self._low, self._high = bounds[:, 0] + room, bounds[:, 1] - room
         self._spread = self._y.var(0).clamp(min=1e-30)
         self._dt = linear.dt
         self._substeps = 1 if system.discrete else max(1, math.ceil(system.typical_rate * linear.dt / RATE_STEP))
@@ -197,7 +199,7 @@ class ConsistencyProblem(nn.Module):
             return _stacked(model.step(x.unbind(-1), inputs if len(inputs) == nu else (0.0,) * nu), x)
 
         def slope(x: torch.Tensor) -> torch.Tensor:
-            at = x.unbind(-1)
+            at = x.clamp(self._low, self._high).unbind(-1)  # beyond the bounds equations may know no numbers
             f: Components = model.f(at)
             if len(inputs) and nu:
                 rows = input_matrix(model, at)

@@ -35,7 +35,7 @@ def hidden_directions(information: np.ndarray) -> np.ndarray:
     return vectors[:, (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)]
 
 
-def told_directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def told_directions(information: np.ndarray) -> np.ndarray:
     """Find the changes of parameters that the outputs show, however faintly.
 
     Parameters
@@ -45,14 +45,11 @@ def told_directions(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Returns
     -------
-    directions : ndarray, shape (p, k)
+    ndarray, shape (p, k)
         Orthonormal columns.
-    errors : ndarray, shape (k,)
-        Standard error along each.
     """
     values, vectors = np.linalg.eigh(information)
-    told = values > NOTHING * max(values[-1], 0.0)
-    return vectors[:, told], values[told] ** -0.5
+    return vectors[:, values > NOTHING * max(values[-1], 0.0)]
 
 
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:

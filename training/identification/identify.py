@@ -14,15 +14,15 @@ import torch
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver, LinearFilter
-from observers.checks import shown
+from observers.checks import is_finite, shown
 from training.identification.consistency import HORIZON, ConsistencyProblem, Filtered, filtered, noise_level, run_filter
 from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
-from training.identification.shooting import Fit, Shooting, shoot
-from training.identification.windows import Guess, Prediction, fit_windows, predict
+from training.identification.shooting import CLUSTERS, Fit, Shooting, UnexplainedError, shoot
+from training.identification.windows import LEAST_USED, MORE_COST, Guess, Prediction, fit_windows, predict
 from training.jobs import describe
 from training.maps.optimise import Log, Stage, optimise
 from training.progress import ProgressBars
-from training.records import Record, check_memory, pieces
+from training.records import Record, check_memory, check_signals, pieces
 from training.spectrum import Spectrum, evenly_spaced
 
 WIDTH, DEPTH, BATCH, STEPS, LEARNING_RATE = 128, 3, 512, 1500, 3e-3
@@ -31,11 +31,9 @@ HELD_OUT = 10  # every so many records one is left out of the fit, for tests of 
 FORGOTTEN = 0.01  # part of the filter's start that may be left in a first guess of the state
 LONGEST_MEMORY = 0.25  # of a record's length
 FASTEST, FASTEST_OF_SAMPLES, SPREAD = 1.5, 0.5, 22.5  # modes: fastest over the rate, over 1/dt, and over the slowest
-FARTHEST = 10.0  # factor by which a parameter without limits may move from its starting value
 KEPT_RATIOS = 100.0  # by how much rather all parameters change by one factor than one of them alone, where y is silent
-HANGS = (
-    0.05  # relative change of a state, over that of parameters which y does not tell, from which on they go together
-)
+BACK = (1.0, 0.5, 0.25)  # parts of the way to the nearest parameters, where states would leave their bounds beyond
+HANGS = 0.05  # relative change of a state that goes with parameters which y does not tell, over theirs
 SIMULATED = 1e-7  # relative error that simulation leaves in any case
 TOLD = 0.05  # part that a parameter may have in what the outputs do not tell, and count as told
 
@@ -77,6 +75,8 @@ class Identified:
         Of the parameters that were unknown; None for those that the outputs do not tell.
     products : list of Product
         What the outputs tell.
+    at_limits : tuple of str
+        Parameters that went as far as they were allowed to.
     hanging_states : tuple of str
         States that change with what the outputs do not tell, so that their units are those of the first guesses.
     symmetries : list of tuple of str
@@ -96,6 +96,7 @@ class Identified:
     system: System
     standard_errors: dict[str, float | None]
     products: list[Product]
+    at_limits: tuple[str, ...]
     hanging_states: tuple[str, ...]
     symmetries: list[tuple[str, ...]]
     noise: np.ndarray
@@ -118,6 +119,13 @@ class Identified:
             for name, error in self.standard_errors.items()
             if error is not None
         ]
+        lines += [f"{name} is at its limit: give it a wider range" for name in self.at_limits]
+        if self.fit.coloured:
+            lines.append(
+                "the residuals are not white: the standard errors are those that windows show by their scatter"
+            )
+        elif self.fit.used.sum() < CLUSTERS:
+            lines.append(f"fewer than {CLUSTERS} windows: the standard errors are right for white noise alone")
         silent = [name for name, error in self.standard_errors.items() if error is None]
         if silent:
             known = [
@@ -201,17 +209,8 @@ def estimate_parameters(
     ValueError
         If a parameter is unknown to the system, no record is long enough, or no window of them can be explained.
     """
-    for name, (low, high) in unknown.items():
-        if name not in system.parameters:
-            raise ValueError(
-                f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
-            )
-        if not low < high or not low <= system.parameters[name] <= high:
-            raise ValueError(
-                f"{name} must start between its limits, got {system.parameters[name]:g} in {low:g} to {high:g}"
-            )
-    if not unknown:
-        raise ValueError("name a parameter that is unknown, as in --unknown mu=1.5")
+    _check_unknown(system, unknown)
+    check_signals(records, system)
     dt = float(records[0].t[1] - records[0].t[0])
     linear = _filter(system, records, dt, observer)
     first = math.ceil(min(memory(linear), LONGEST_MEMORY * np.median([record.duration for record in records])) / dt)
@@ -247,12 +246,24 @@ def estimate_parameters(
         unit = np.where(rough == 0, [0.1 * (high - low) for low, high in unknown.values()], np.abs(rough))
         shooting = Shooting(system, dt, unknown, unit)
         fit = fit_windows(shooting, rough, fitted, guess, first=first, report=progress.say)
-        values, hidden = np.array(list(fit.parameters.values())), _hidden(fit)
-        if hidden.size:
-            fit = shoot(shooting, nearest(values, given, hidden), fit.windows)
+        fit = _brought_back(shooting, fit, given)
         found, length = np.array(list(fit.parameters.values())), len(fit.windows.y) - 1
         predictions = predict(shooting, found, held_out, guess, first=first, length=length)
     return _judged(fit, system, unknown, predictions=predictions, history=history, expected_noise=noise_level(fitted))
+
+
+def _check_unknown(system: System, unknown: Limits) -> None:
+    """Raise ValueError unless some of the system's parameters are unknown, and start between finite limits."""
+    if not unknown:
+        raise ValueError("name a parameter that is unknown, as in --unknown mu=1.5")
+    for name, (low, high) in unknown.items():
+        if name not in system.parameters:
+            raise ValueError(
+                f"{system.name} has no parameter {shown(name)}; it has {', '.join(system.parameters) or 'none'}"
+            )
+        value = system.parameters[name]
+        if not (is_finite(low) and is_finite(high) and low < high and low <= value <= high):
+            raise ValueError(f"{name} must start between finite limits, got {value:g} in {shown(low)} to {shown(high)}")
 
 
 def _filter(system: System, records: Sequence[Record], dt: float, observer: Artifact | None) -> LinearFilter:
@@ -334,7 +345,8 @@ def _estimates(observer: Artifact, noise: np.ndarray) -> Guess:
 def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.ndarray:
     """Of all parameters that explain the outputs as well, those nearest to what was given.
 
-    Near is what keeps the parameters' ratios to each other: a plant that is faster by a factor has them all larger.
+    A parameter of which they say nothing at all stays as it was given. Of the others near is what keeps their ratios to
+    each other: a plant that is faster by a factor has them all larger.
 
     Parameters
     ----------
@@ -350,6 +362,14 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     ndarray, shape (p,)
         The parameters; those whose sign has changed stay as they are.
     """
+    silent = (hidden**2).sum(1) > 1.0 - TOLD**2
+    if silent.any():
+        rest = np.linalg.svd(hidden[~silent])[0][:, : hidden.shape[1] - silent.sum()]
+        nearer = given.copy()
+        nearer[~silent] = nearest(values[~silent], given[~silent], rest)
+        return nearer
+    if not hidden.size:
+        return values
     p = len(values)
     comparable = values * given > 0
     moved = np.log(np.where(comparable, values / np.where(comparable, given, 1.0), 1.0))
@@ -358,15 +378,32 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     return np.where(comparable, values * np.exp(-back), values)
 
 
-def _relative(fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes (p,) of the parameters found, and their information (p, p) in these units."""
+def _brought_back(shooting: Shooting, fit: Fit, given: np.ndarray) -> Fit:
+    """What explains the records as well, with parameters as near to what was given as the system's bounds allow."""
+    values, hidden = np.array(list(fit.parameters.values())), _hidden(fit)
+    if not hidden.size:
+        return fit
+    near = np.clip(nearest(values, given, hidden), shooting.low, shooting.high)
+    for share in BACK:
+        try:
+            found = shoot(shooting, values + share * (near - values), fit.windows)
+        except UnexplainedError:
+            continue
+        if found.used.sum() >= LEAST_USED * fit.used.sum() and found.cost <= MORE_COST * fit.cost + SIMULATED**2:
+            return found
+    return fit
+
+
+def _size(fit: Fit) -> np.ndarray:
+    """Sizes (p,) of the parameters found."""
     values = np.abs(list(fit.parameters.values()))
-    size = np.where(values == 0, fit.unit, values)
-    return size, fit.information * np.outer(size / fit.unit, size / fit.unit)
+    return np.where(values == 0, fit.unit, values)
 
 
 def _hidden(fit: Fit) -> np.ndarray:
-    return hidden_directions(_relative(fit)[1])
+    """Directions (p, k) of relative changes that the outputs do not tell."""
+    relative = _size(fit) / fit.unit
+    return hidden_directions(fit.information * np.outer(relative, relative))
 
 
 def _judged(
@@ -380,24 +417,30 @@ def _judged(
 ) -> Identified:
     """What the fit says of each parameter."""
     names, hidden = tuple(unknown), _hidden(fit)
-    size, information = _relative(fit)
-    values = np.array(list(fit.parameters.values()))
+    values, size = np.array(list(fit.parameters.values())), _size(fit)
     told = np.abs(hidden).max(1, initial=0.0) < TOLD
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
-    covariance = seen @ np.linalg.pinv(seen.T @ information @ seen, hermitian=True) @ seen.T  # of logarithms
-    relative = np.maximum(np.sqrt(np.diag(covariance)), SIMULATED)
-    errors = {name: float(size[i] * relative[i]) if told[i] else None for i, name in enumerate(names)}
+
+    def relative_error(exponents: np.ndarray) -> float:
+        """Of a product of powers."""
+        direction = (exponents * fit.unit / size)[:, None]
+        return max(float(fit.errors(direction, seen * (size / fit.unit)[:, None])[0]), SIMULATED)
+
+    errors = {
+        name: float(size[i] * relative_error(np.eye(len(names))[i])) if told[i] else None
+        for i, name in enumerate(names)
+    }
     products = []
     for powers in combinations(names, hidden):
         exponents = np.array([float(powers.get(name, 0)) for name in names])
         value = float(np.prod(np.where(exponents, np.sign(values) * np.abs(values) ** exponents, 1.0)))
-        relative_error = max(float(np.sqrt(exponents @ covariance @ exponents)), SIMULATED)
-        products.append(Product(powers, value, abs(value) * relative_error))
+        products.append(Product(powers, value, abs(value) * relative_error(exponents)))
     found = system.replace(fit.parameters)
     return Identified(
         system=found,
         standard_errors=errors,
         products=products,
+        at_limits=tuple(name for name, value in fit.parameters.items() if value in unknown[name] and errors[name]),
         hanging_states=_hanging(fit, found, hidden * (size / fit.unit)[:, None]),
         symmetries=sign_symmetries(
             found,

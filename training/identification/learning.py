@@ -12,6 +12,7 @@ from rich.console import Console
 
 from kkl_gym.system import System
 from observers import Artifact
+from observers.checks import check_dt, integer
 from observers.storage import write
 from training.config import Config, override, settings_of
 from training.identification.identify import STEPS, Identified, Limits, estimate_parameters
@@ -21,7 +22,8 @@ from training.maps.optimise import log_to
 from training.pipeline import Result, train
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
-from training.records import Record, check_dt, median_step, resampled
+from training.records import Record, check_signals, resampled, sampling_interval
+from training.records import check_dt as check_steps
 
 NOISE_RANGE = 2.0  # largest measurement noise that a map is made for, over what the records show
 LEAST_NOISE = 0.002  # the same, over the output's range, where they show hardly any
@@ -97,24 +99,35 @@ def identify(
         If the records, or the parameters' names or limits, make no sense; see
         :func:`training.identification.identify.estimate_parameters`.
     """
+    integer("steps", steps, 0)
+    check_signals(records, system)
+    interval = sampling_interval(*records) if dt is None else check_dt(dt)
+    given = {"dt": interval, "seed": seed, **(settings or {})}
+    preset(system, "input-aware", "fast", changes={"eigenvalues": (-1.0,), **given})  # bad settings are refused early
     found = _parameters(
-        system, unknown, records, folder, dt=dt, steps=steps, seed=seed, resume=resume, console=console, observer=None
+        system,
+        unknown,
+        records,
+        folder,
+        dt=interval,
+        steps=steps,
+        seed=seed,
+        resume=resume,
+        console=console,
+        observer=None,
     )
-    interval = _interval(records, dt)
     inputs = bool(system.nu) and records[0].u is not None
     size = np.asarray(found.system.output_range)
     largest = np.maximum(NOISE_RANGE * found.noise, LEAST_NOISE * size)
     quiet = bool((found.noise < LEAST_NOISE * size / NOISE_RANGE).all())
     changes: dict[str, Any] = {
-        "dt": interval,
         "duration": 5000 * interval,
         "inputs": inputs,
         "inverse_steps": INVERSE_STEPS,
         "measurement_noise_max": float(largest[0]) if len(largest) == 1 else tuple(largest.tolist()),
         "noise_free_share": 0.5 if quiet else 0.2,
         "high_noise_emphasis": 2.0 if quiet else 4.0,
-        "seed": seed,
-        **(settings or {}),
+        **given,
     }
     config = preset(found.system, "input-aware", "fast", changes=changes)
     return _observer(found, config, folder, noise=found.noise, resume=resume, console=console)
@@ -182,17 +195,13 @@ def adapt(
     return _observer(found, config, folder, noise=None, resume=resume, console=console)
 
 
-def _interval(records: Sequence[Record], dt: float | None) -> float:
-    return float(f"{median_step(*records):.6g}") if dt is None else dt
-
-
 def _parameters(
     system: System,
     unknown: Limits,
     records: Sequence[Record],
     folder: Path,
     *,
-    dt: float | None,
+    dt: float,
     steps: int,
     seed: int,
     resume: bool,
@@ -200,10 +209,16 @@ def _parameters(
     observer: Artifact | None,
 ) -> Identified:
     """Identify, and write what was found."""
-    interval = _interval(records, dt)
-    check_dt(records, interval)
-    uniform = [resampled(record, interval) for record in records]
-    identity = {**describe(system), "unknown": dict(unknown), "steps": steps, "seed": seed, "dt": interval}
+    check_steps(records, dt)
+    uniform = [resampled(record, dt) for record in records]
+    identity = {
+        **describe(system),
+        "unknown": dict(unknown),
+        "steps": steps,
+        "seed": seed,
+        "dt": dt,
+        "records": [record.fingerprint for record in records],
+    }
     with (
         claimed_run(folder, identity, resume),
         log_to(folder) as log,

@@ -7,7 +7,7 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.identification.identifiability import told_directions
+from training.identification.identifiability import NOTHING, told_directions
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
@@ -18,8 +18,14 @@ ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
 SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
+CLUSTERS = 20  # windows, of which the scatter says something
+COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
 OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
 MOST_ROWS = 60_000  # motions simulated at once
+
+
+class UnexplainedError(ValueError):
+    """No window of the records can be explained from the first guesses."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,9 @@ class Fit:
         Fisher information of the parameters in units of ``unit``, where starts are unknown.
     unit : ndarray, shape (p,)
         Of each parameter.
+    curvature, white, scattered : ndarray, shape (p, p)
+        What a covariance of the parameters is made of, in the same units: the second derivative of the squares that
+        were minimised, and the covariance of their gradient, as white noise makes it and as windows show it.
     used : ndarray of bool, shape (n,)
         Windows that the model explains; the others count little or nothing.
     cost : float
@@ -73,16 +82,54 @@ class Fit:
     noise: np.ndarray
     information: np.ndarray
     unit: np.ndarray
+    curvature: np.ndarray
+    white: np.ndarray
+    scattered: np.ndarray
     used: np.ndarray
     cost: float
     starts_by_parameters: np.ndarray
 
+    def errors(self, directions: np.ndarray, told: np.ndarray) -> np.ndarray:
+        """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
+
+        Residuals that hang together, such as those of process noise, make parameters less certain than white ones of
+        the same size do. The gradients of windows, each with a start of its own, show by how much (the sandwich
+        estimator for clustered data). Those of few windows would show too little, and are left out.
+
+        Parameters
+        ----------
+        directions : ndarray, shape (p, k)
+            In units of ``unit``.
+        told : ndarray, shape (p, m)
+            A basis of what the outputs tell, likewise.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            The standard errors; what the outputs do not tell of a direction counts nothing.
+        """
+        kinds = [self.white, self.scattered] if self.used.sum() >= CLUSTERS else [self.white]
+        return np.max([self._errors(directions, told, kind) for kind in kinds], axis=0)
+
+    def _errors(self, directions: np.ndarray, told: np.ndarray, kind: np.ndarray) -> np.ndarray:
+        """From one covariance of the gradient."""
+        spread = (
+            told @ np.linalg.pinv(told.T @ self.curvature @ told, rcond=1e-13, hermitian=True) @ told.T @ directions
+        )
+        return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
+
     @property
     def standard_errors(self) -> np.ndarray:
-        """Of the parameters, (p,); those of directions that outputs do not tell are huge or infinite."""
-        values, vectors = np.linalg.eigh(self.information)
-        with np.errstate(divide="ignore"):
-            return self.unit * np.sqrt((vectors**2 / np.maximum(values, 0.0)).sum(1))
+        """Of the parameters, (p,); infinite where the outputs do not tell one."""
+        told = told_directions(self.information)
+        silent = 1.0 - (told**2).sum(1) > NOTHING
+        return np.where(silent, np.inf, self.unit * self.errors(np.eye(len(self.unit)), told))
+
+    @property
+    def coloured(self) -> bool:
+        """Whether windows scatter more than white residuals let them, of which few windows show nothing."""
+        told = told_directions(self.information)
+        return bool((self.errors(told, told) > COLOURED * self._errors(told, told, self.white)).any())
 
 
 class Shooting:
@@ -246,15 +293,12 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     theta, problem = np.array(list(fit.parameters.values())), _Problem(shooting, windows)
     at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
     J = problem.derivatives(theta, at, problem.rows)
-    nx, Jw = at.x0.shape[1], J * problem.weight[:, None]
-    H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
-    follows = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
+    _, beyond, by_parameters = _beyond_starts(J, problem.weight, at.x0.shape[1])
     linear = np.isfinite(at.each)
-    directions, errors = told_directions(fit.information)
-    for change in (directions * np.minimum(errors, 1.0)).T:
-        dx = follows @ change
-        y = problem.follow(theta + change * shooting.unit, at.x0 + shooting.half * dx, problem.rows).y
-        off = y - at.y - J[..., nx:] @ change - np.einsum("knya,na->kny", J[..., :nx], dx)
+    told = told_directions(fit.information)
+    for change in (told * np.minimum(fit.errors(told, told), 1.0)).T:
+        x0 = at.x0 + shooting.half * (by_parameters @ change)
+        off = problem.follow(theta + change * shooting.unit, x0, problem.rows).y - at.y - beyond @ change
         off = np.where(problem.there, off, 0.0) / np.maximum(fit.noise, 1e-300)
         linear &= np.sqrt((off**2).sum((0, 2)) / problem.count) < NONLINEAR
     return linear
@@ -285,12 +329,24 @@ def shoot(shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision:
     -------
     Fit
         What was found.
+
+    Raises
+    ------
+    UnexplainedError
+        If the motions of all windows leave the system's bounds.
     """
     problem, nx, damping = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING
     at = problem.follow(theta, windows.x0, problem.rows)
     problem.settle(theta, at, problem.rows, SETTLING)
     for _ in range(ROUNDS):
         used = explained(at.each)
+        if not used.any():
+            low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
+            raise UnexplainedError(
+                f"windows of {len(windows.u)} samples: all motions leave the bounds of {shooting.system.name}, from "
+                f"first guesses of the state between {np.round(low, 3)} and {np.round(high, 3)} and of the parameters "
+                f"{dict(zip(shooting.names, theta.round(6).tolist()))}; give other first guesses, or limits"
+            )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
         step, better = np.inf, False
         while damping < MOST_DAMPING and not better:
@@ -328,11 +384,10 @@ def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
     count = there.sum((0, 1))
     free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
     noise = np.sqrt(np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free)
-    Jw = J / np.maximum(noise, 1e-300)[:, None]
-    H = np.einsum("knya,knyb->nab", Jw, Jw, optimize=True)
-    cross = H[:, nx:, :nx]
-    by_starts = np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True)
-    information = (H[:, nx:, nx:] - cross @ by_starts @ cross.transpose(0, 2, 1)).sum(0)
+    information = _beyond_starts(J, 1.0 / np.maximum(noise, 1e-300) ** 2, nx)[0]
+    curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
+    gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
+    few = len(gradients) / max(len(gradients) - len(theta), 1)  # windows, whose gradients add up to zero
     return Fit(
         parameters=dict(zip(shooting.names, theta.tolist(), strict=True)),
         windows=replace(problem.windows, x0=at.x0),
@@ -340,7 +395,38 @@ def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
         noise=noise,
         information=information,
         unit=shooting.unit,
+        curvature=curvature,
+        white=np.einsum("knya,knyb,y->ab", beyond, beyond, (problem.weight * noise) ** 2, optimize=True),
+        scattered=few * gradients.T @ gradients,
         used=used,
         cost=float(np.mean(at.each[used])),
-        starts_by_parameters=-by_starts @ cross.transpose(0, 2, 1),
+        starts_by_parameters=by_parameters,
     )
+
+
+def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What parameters change in the outputs beyond what starts make up for.
+
+    Parameters
+    ----------
+    J : ndarray, shape (steps + 1, n, ny, nx + p)
+        Derivatives of the outputs by starts and parameters.
+    weight : ndarray, shape (ny,)
+        Of the squares of each output.
+    nx : int
+        Number of states.
+
+    Returns
+    -------
+    curvature : ndarray, shape (p, p)
+        Of half the sum of squares by the parameters, with the best starts for each.
+    beyond : ndarray, shape (steps + 1, n, ny, p)
+        Derivatives of the outputs by the parameters, likewise.
+    by_parameters : ndarray, shape (n, nx, p)
+        Those of the best starts.
+    """
+    H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
+    by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
+    curvature = (H[:, nx:, nx:] + H[:, nx:, :nx] @ by_parameters).sum(0)
+    beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)
+    return curvature, beyond, by_parameters

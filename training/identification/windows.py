@@ -6,7 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from training.identification.identifiability import told_directions
-from training.identification.shooting import Fit, Shooting, Windows, predictable, settled, shoot
+from training.identification.shooting import (
+    CLUSTERS,
+    Fit,
+    Shooting,
+    UnexplainedError,
+    Windows,
+    predictable,
+    settled,
+    shoot,
+)
 from training.records import Record
 
 FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
@@ -34,7 +43,8 @@ def fit_windows(
     """Fit parameters and starts on windows of growing length.
 
     Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
-    explain most of them. Chaos and process noise, which no start explains for long, set an end to their growth.
+    explain most of them. Chaos and process noise set an end to their growth: no start explains them for long, and
+    standard errors grow that follow the scatter of windows.
 
     Parameters
     ----------
@@ -55,14 +65,25 @@ def fit_windows(
     -------
     Fit
         At the length that says most.
+
+    Raises
+    ------
+    UnexplainedError
+        If no window of any length can be explained.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    for length in sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True):
+    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
+    for length in lengths:
         starts: Starts = {}
         for index, record in enumerate(records):
             at = np.arange(first, len(record.y) - length, length)
             starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-        best = shoot(shooting, theta, windows(records, starts, length))
+        try:
+            best = shoot(shooting, theta, windows(records, starts, length))
+        except UnexplainedError:
+            if length == lengths[-1]:
+                raise
+            continue
         if best.used.mean() >= LEAST_USED:
             break
     report(described(best, length))
@@ -74,6 +95,8 @@ def fit_windows(
             for (index, k), x in found.items()
             if (k - first) % length == 0 and k + length < len(records[index].y)
         }
+        if len(starts) < CLUSTERS and best.coloured:
+            break  # longer windows would hide what these show
         longer = windows(records, starts, length)
         keep = predictable(shooting, best, longer)
         if keep.mean() < LEAST_USED:
@@ -83,9 +106,11 @@ def fit_windows(
         if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost:
             break
         report(described(fit, length))
-        before, best = best, fit
-        directions, errors = told_directions(before.information)
-        if (np.linalg.pinv(directions.T @ fit.information @ directions).diagonal() > (GAIN * errors) ** 2).all():
+        told = told_directions(best.information)
+        gain = fit.errors(told, told) / best.errors(told, told)
+        if (gain < 1).any():
+            best = fit
+        if (gain > GAIN).all():
             break
     return best
 

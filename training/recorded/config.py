@@ -9,8 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from observers.checks import check_dt
 from training.config import STRICT, Activation, Count, Levels, NotNegative, Optimiser, Positive, Share
-from training.records import Record, jitter, median_step
-from training.records.resampling import ROUNDING
+from training.records import Record, sampling_interval
 from training.spectrum import evenly_spaced
 
 MODES = 12  # for each output
@@ -86,7 +85,7 @@ class RecordedConfig:
 def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None = None) -> RecordedConfig:
     """Choose what the records decide: dt, the eigenvalues of A, and the largest noise.
 
-    dt is the median step, of two digits if steps are uneven. The eigenvalues follow from the rate of the signals,
+    dt is the median step, rounded where steps are uneven. The eigenvalues follow from the rate of the signals,
     :func:`signal_rate`, and from the length of the records. The largest noise is a tenth of the standard deviation of
     each output.
 
@@ -108,9 +107,7 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
         If a setting makes no sense.
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
-    step = median_step(*records)
-    uneven = max(map(jitter, records)) > ROUNDING
-    chosen: dict[str, Any] = {"dt": float(f"{step:.2g}") if uneven else step} | given
+    chosen: dict[str, Any] = {"dt": sampling_interval(*records)} | given
     check_dt(chosen["dt"])
     if "eigenvalues" not in given:
         rate = signal_rate(records)

@@ -27,7 +27,7 @@ from training.maps.samplers import TrajectorySampler
 from training.progress import LOG, ProgressBars, progress_bars
 from training.recorded.config import RecordedConfig
 from training.recorded.errors import RecordedErrors, recorded_errors
-from training.recorded.preparing import filter_of, fingerprint, split
+from training.recorded.preparing import filter_of, split
 from training.recorded.windows import windows
 from training.records import Record, check_memory, pieces, resampled
 from training.trajectories.record import recording_ages
@@ -105,7 +105,7 @@ def train_recorded(
     if not records or any(record.x is None for record in records):
         raise ValueError("no hidden states were recorded; name their columns (--hidden), or give equations to simulate")
     device = device or torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    identity = {"name": name, "records": [fingerprint(record) for record in records], **dataclasses.asdict(config)}
+    identity = {"name": name, "records": [record.fingerprint for record in records], **dataclasses.asdict(config)}
     with claimed_run(folder, identity, resume), log_to(folder) as log, progress_bars(console, folder / LOG) as progress:
         began = time.monotonic()
         torch.manual_seed(config.seed)

@@ -1,6 +1,5 @@
 """What is made of records and a configuration before anything is fitted."""
 
-import hashlib
 from collections.abc import Sequence
 
 import numpy as np
@@ -48,14 +47,6 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         [record.part(slice(None, end)) for record, end in zip(records, ends)],
         [record.part(slice(end, None)) for record, end in zip(records, ends)],
     )
-
-
-def fingerprint(record: Record) -> str:
-    """What identifies a record's samples and the names of its signals."""
-    found = hashlib.sha256(repr(record.signals).encode())
-    for values in (record.t, record.y, record.u, record.x):
-        found.update(b"" if values is None else np.ascontiguousarray(values).tobytes())
-    return found.hexdigest()[:16]
 
 
 def described(records: Sequence[Record], config: RecordedConfig, name: str) -> list[str]:

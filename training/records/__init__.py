@@ -1,9 +1,9 @@
 """Recorded data: files of samples, the columns that are asked of them, what is checked, and uniform grids."""
 
-from training.records.checks import check_dt, check_memory
+from training.records.checks import check_dt, check_memory, check_signals
 from training.records.reading import read_records
 from training.records.record import Record
-from training.records.resampling import jitter, median_step, pieces, resampled
+from training.records.resampling import jitter, median_step, pieces, resampled, sampling_interval
 from training.records.signals import Signals
 
 __all__ = [
@@ -11,9 +11,11 @@ __all__ = [
     "Signals",
     "check_dt",
     "check_memory",
+    "check_signals",
     "jitter",
     "median_step",
     "pieces",
     "read_records",
     "resampled",
+    "sampling_interval",
 ]

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from kkl_gym.system import System
-from training.records.record import Record
+from training.records.record import ROLES, Record
 from training.records.resampling import LONGEST_GAP, median_step
 
 Warn = Callable[[str], object]
@@ -14,31 +14,59 @@ OTHER_UNITS = 100.0  # times what is expected: no motion does that, but a unit a
 OTHER_SPREAD = 300.0  # times that of other records of the same signal
 OTHER_CLOCK = 30.0  # times the sampling interval of other records
 WHOLE_TURN = 0.9 * 2 * np.pi  # jumps from here to a whole turn are those of a wrapped angle
-ROWS = {"y": "measured", "u": "inputs", "x": "hidden"}
 
 
-def check_between_records(records: Sequence[Record], warn: Warn) -> None:
-    """See that records have the same columns, and that none seems to be in other units than the others.
+def check_signals(records: Sequence[Record], system: System | None = None) -> None:
+    """See that there are records, with the same columns, and as many of them as a system has signals.
 
     Parameters
     ----------
     records : sequence of Record
         Of one plant.
+    system : System, optional
+        The plant, where that is known.
+
+    Raises
+    ------
+    ValueError
+        If there is none, columns differ, or a number of columns.
+    """
+    if not records:
+        raise ValueError("there is no record")
+    first = records[0]
+    for record in records[1:]:
+        for role in ROLES.values():
+            here, there = getattr(record.signals, role), getattr(first.signals, role)
+            if here != there:
+                told = [", ".join(names) or "none" for names in (here, there)]
+                raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
+    if system is None:
+        return
+    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
+    for role, count in counts.items():
+        found = getattr(first.signals, role)
+        if len(found) != count and (found or role == "measured"):
+            raise ValueError(
+                f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; "
+                f"name others by --{role}"
+            )
+
+
+def check_between_records(records: Sequence[Record], warn: Warn) -> None:
+    """See that no record seems to be in other units than the others.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With the same columns.
     warn : callable
         Told of spreads that differ.
 
     Raises
     ------
     ValueError
-        If columns differ, or sampling intervals by a factor of 30.
+        If sampling intervals differ by a factor of 30.
     """
-    first = records[0]
-    for record in records[1:]:
-        for role in ROWS.values():
-            here, there = getattr(record.signals, role), getattr(first.signals, role)
-            if here != there:
-                told = [", ".join(names) or "none" for names in (here, there)]
-                raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
     steps = np.array([median_step(record) for record in records])
     for record, step in zip(records, steps):
         if not 1 / OTHER_CLOCK < step / np.median(steps) < OTHER_CLOCK:
@@ -46,9 +74,9 @@ def check_between_records(records: Sequence[Record], warn: Warn) -> None:
                 f"{record.name}: column {record.signals.time}: steps of {step:g} s, but {np.median(steps):g} s in the "
                 "other files; is the time in other units than seconds?"
             )
-    for letter, role in ROWS.items():
-        for j, column in enumerate(getattr(first.signals, role)):
-            spreads = np.array([np.nanstd(getattr(record, letter)[:, j]) for record in records])
+    for letter, role in ROLES.items():
+        for j, column in enumerate(getattr(records[0].signals, role)):
+            spreads = np.array([_spread(record, letter, j) for record in records])
             usual = np.median(spreads[spreads > 0]) if (spreads > 0).any() else 1.0
             if len(records) == 2 and spreads.all():
                 usual = spreads.min()
@@ -58,6 +86,12 @@ def check_between_records(records: Sequence[Record], warn: Warn) -> None:
                         f"{record.name}: column {column} spreads over {spread / usual:.3g} times what it does in other "
                         "files; is it in other units?"
                     )
+
+
+def _spread(record: Record, letter: str, j: int) -> float:
+    """Standard deviation of a column; exactly 0 where it never moves, which rounding may keep from that."""
+    values = getattr(record, letter)[:, j]
+    return 0.0 if np.nanmax(values) == np.nanmin(values) else float(np.nanstd(values))
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
@@ -77,16 +111,15 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
     """
     for letter, role in (("y", "measured"), ("x", "hidden")):
         for j, column in enumerate(getattr(records[0].signals, role)):
-            still = [bool(np.nanstd(getattr(record, letter)[:, j]) == 0) for record in records]
-            if all(still):
-                value = getattr(records[0], letter)[0, j]
+            if not any(_spread(record, letter, j) for record in records):
+                value = np.nanmax(getattr(records[0], letter)[:, j])
                 raise ValueError(
                     f"{records[0].name}: column {column}: {value:g} in all rows, and no other file says more; there is "
                     "nothing to learn from what never moves"
                 )
-            for record, stands in zip(records, still):
+            for record in records:
                 values = getattr(record, letter)[:, j]
-                if stands:
+                if not _spread(record, letter, j):
                     warn(f"{record.name}: column {column} never moves")
                 jumps = abs(np.diff(values))
                 turns = np.flatnonzero((jumps > WHOLE_TURN) & (jumps < 2 * np.pi + 0.1))
@@ -98,37 +131,36 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
 
 
 def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
-    """See that records have a system's numbers of signals, and sizes that it may reach.
+    """See that records are of sizes that a system may reach.
 
     Parameters
     ----------
     records : sequence of Record
-        With the same columns.
+        With the system's numbers of columns.
     system : System
         What was recorded.
     warn : callable
-        Told of outputs and states that are a hundred times smaller than expected, and of inputs that were not recorded.
+        Told of outputs and states that are a hundred times smaller than expected, of steps of time that are a hundred
+        times longer or shorter, and of inputs that were not recorded.
 
     Raises
     ------
     ValueError
-        If a number of signals differs, or a signal is a hundred times larger than the system's declarations allow.
+        If a signal is a hundred times larger than the system's declarations allow.
     """
-    signals, first = records[0].signals, records[0].name
-    counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
-    for role, count in counts.items():
-        found = getattr(signals, role)
-        if len(found) != count and (found or role == "measured"):
-            raise ValueError(
-                f"{first}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; name "
-                f"others by --{role}"
+    if system.nu and not records[0].signals.inputs:
+        warn(f"{records[0].name}: no column of inputs, which are taken for zero")
+    for record in records:
+        ratio = median_step(record) / system.dt
+        if not 1 / OTHER_UNITS < ratio < OTHER_UNITS:
+            warn(
+                f"{record.name}: column {record.signals.time}: steps of {median_step(record):.3g} s are {ratio:.3g} "
+                f"times the dt of {system.name} ({system.dt:g} s); is the time in seconds?"
             )
-    if system.nu and not signals.inputs:
-        warn(f"{first}: no column of inputs, which are taken for zero")
     low, high = system.box()
     sizes = {"y": np.array(system.output_range), "u": np.array(system.u_max), "x": high - low}
     for record in records:
-        for letter, role in ROWS.items():
+        for letter, role in ROLES.items():
             values = getattr(record, letter)
             if values is None:
                 continue

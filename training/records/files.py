@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
-MISSING = {"", "na", "nan", "null"}  # cells of a text file that hold no number, in small letters
+from observers.checks import shown
+
+MISSING = {"", "na", "n/a", "nan", "none", "null"}  # cells of a text file that hold no number, in small letters
 SEPARATORS = ",;\t"
 Columns = dict[str, np.ndarray]
 Choose = Callable[[Sequence[str]], Sequence[str]]  # from the names of all columns to those that are wanted
@@ -62,20 +64,31 @@ def _npz(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
         found = np.load(path, allow_pickle=False)
         if not isinstance(found, np.lib.npyio.NpzFile):
             raise ValueError("it holds a single array; save it by numpy.savez(path, t=t, y=y)")
+        arrays, refused = dict[str, np.ndarray](), dict[str, ValueError]()
         with found:
-            arrays = {name: found[name] for name in found.files}
+            for name in found.files:
+                try:
+                    arrays[name] = found[name]
+                except ValueError as error:  # such as of pickled objects, which hurt nobody who does not ask for them
+                    refused[name] = error
     named: list[tuple[str, np.ndarray]] = []
     for name, values in arrays.items():
         if values.ndim == 2 and values.shape[1] > 1:
             named += [(f"{name}{i + 1}", column) for i, column in enumerate(values.T)]
         elif values.ndim in (1, 2) and values.size:  # nobody misses the inputs of a system that has none
             named.append((name, values.reshape(-1)))
-    names, columns = tuple(name for name, _ in named), dict(named)
-    chosen = {name: _floats(path, name, columns[name]) for name in choose(names)}
+    names, columns = (*(name for name, _ in named), *refused), dict(named)
+    wanted = choose(names)
+    for name in wanted:
+        if name in refused:
+            raise ValueError(f"{path}: column {name}: {refused[name]}")
+    chosen = {name: _floats(path, name, columns[name]) for name in wanted}
     lengths = {name: len(values) for name, values in chosen.items()}
-    if len(set(lengths.values())) > 1:
-        told = ", ".join(f"{name} has {length}" for name, length in lengths.items())
-        raise ValueError(f"{path}: columns must be of one length; {told} rows")
+    for name, length in lengths.items():
+        if length != lengths[wanted[0]]:
+            raise ValueError(
+                f"{path}: columns must be of one length; {wanted[0]} has {lengths[wanted[0]]}, {name} has {length} rows"
+            )
     return names, chosen
 
 
@@ -104,13 +117,14 @@ def _csv(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
     with _explained(path, "CSV"), path.open(encoding="utf-8-sig", newline="") as file:
         header = file.readline()
         separator = max(SEPARATORS, key=header.count)
-        names = tuple(name.strip() for name in next(csv.reader([header], delimiter=separator), []))
+        layout: Any = {"delimiter": separator, "skipinitialspace": True}
+        names = tuple(name.strip() for name in next(csv.reader([header], **layout), []))
         if not any(names) or all(_is_number(name) for name in names):
             raise ValueError("its first row must hold the names of the columns")
         chosen = list(choose(names))
         places = [names.index(name) for name in chosen]
         columns = [array("d") for _ in chosen]
-        for row, cells in _rows(csv.reader(file, delimiter=separator)):
+        for row, cells in _rows(csv.reader(file, **layout)):
             if len(cells) != len(names):
                 raise ValueError(f"row {row} has {len(cells)} cells, the header {len(names)}")
             for name, place, column in zip(chosen, places, columns):
@@ -136,7 +150,8 @@ def _number(cell: str, column: str, row: int) -> float:
     except ValueError:
         if cell.strip().lower() in MISSING:
             return float("nan")
-        raise ValueError(f"column {column}, row {row}: {cell!r} is no number") from None
+        hint = "; write decimals with a point" if "," in cell else ""
+        raise ValueError(f"column {column}, row {row}: {shown(cell)} is no number{hint}") from None
 
 
 def _is_number(cell: str) -> bool:

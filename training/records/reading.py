@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from kkl_gym.system import System
-from training.records.checks import check_against_system, check_between_records, check_motion
+from training.records.checks import check_against_system, check_between_records, check_motion, check_signals
 from training.records.files import read_columns
 from training.records.record import Record, refuse_infinite
 from training.records.signals import Signals, column_of, values_of
@@ -41,8 +41,8 @@ def read_records(
     Raises
     ------
     ValueError
-        If there is no file, one cannot be read, or its samples make no record; the message names file, column and row.
-        Rows are counted from 1, without the header.
+        If there is no file, one is named twice or cannot be read, or its samples make no record; the message names
+        file, column and row. Rows are counted from 1, without the header.
     OSError
         If a file cannot be read.
     ModuleNotFoundError
@@ -51,8 +51,12 @@ def read_records(
     paths = [Path(path) for path in files]
     if not paths:
         raise ValueError("name a file of recorded data: .npz, .csv or .parquet (--data)")
+    twice = sorted({str(path) for path in paths if paths.count(path) > 1})
+    if twice:
+        raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
     records = [_read(path, signals or Signals()) for path in paths]
     told = warn or (lambda text: warnings.warn(text, stacklevel=4))
+    check_signals(records, system)
     check_between_records(records, told)
     check_motion(records, told)
     if system is not None:

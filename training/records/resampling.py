@@ -17,6 +17,24 @@ def median_step(*records: Record) -> float:
     return float(np.median(np.concatenate([np.diff(record.t) for record in records])))
 
 
+def sampling_interval(*records: Record) -> float:
+    """The median step in seconds, of no more digits than the times agree on, two at least.
+
+    Parameters
+    ----------
+    *records : Record
+        Of one sensor.
+
+    Returns
+    -------
+    float
+        0.01 also where times were written in single precision, whose steps are a little off.
+    """
+    uneven = max(map(jitter, records))
+    digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
+    return float(f"{median_step(*records):.{digits}g}")
+
+
 def jitter(record: Record) -> float:
     """How uneven the steps are: their largest deviation from the median step over it, gaps of samples aside.
 

@@ -1,6 +1,7 @@
 """Which columns of a file are what: time, measured outputs, inputs and hidden states."""
 
 import re
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -72,7 +73,8 @@ class Signals:
         Raises
         ------
         ValueError
-            If a column is missing; the message names it, and those that there are.
+            If a column is missing, or the time is a signal as well. The message names it, and the columns that there
+            are.
         """
         found = replace(
             self,
@@ -90,8 +92,10 @@ class Signals:
         for option, names in options.items():
             for name in names:
                 if column_of(name, columns) not in columns:
-                    there = ", ".join(columns) or "none"
+                    there = textwrap.shorten(", ".join(columns), 200, placeholder=" ...") or "none"
                     raise ValueError(f"{path} has no column {column_of(name, columns)}; there are {there} ({option})")
+        if found.time in {column_of(name, columns) for name in found.all}:
+            raise ValueError(f"{path}: column {found.time} is the time, and cannot be a signal too")
         return found
 
 

@@ -35,6 +35,9 @@ def test_from_files_to_an_observer(data, tmp_path, capsys, monkeypatch):
     assert Artifact.read(folder / "van_der_pol.safetensors").parameters == {"mu": found["value"]}
     assert f"mu = {found['value']:.6g} +- " in capsys.readouterr().out
     assert {"identification.png", "report.png", "log.txt"} <= {path.name for path in folder.iterdir()}
+    again = ["--unknown", "mu=2.5:1:5", "--steps", "20", *SIZES.split(), "--resume"]
+    with pytest.raises(SystemExit, match="van_der_pol-identified holds a run of another configuration: records = "):
+        main(["identify", "van_der_pol", "--data", *data[:-1], *again])
     main(["adapt", "van_der_pol", "--data", *data, "--out", "new.safetensors", *SIZES.split()])
     assert Artifact.read(tmp_path / "new.safetensors").parameters["mu"] == pytest.approx(found["value"], rel=1e-3)
 
@@ -45,8 +48,13 @@ def test_from_files_to_an_observer(data, tmp_path, capsys, monkeypatch):
         (["--unknown", "mu"], "NAME=VALUE"),
         (["--unknown", "nu=1"], "no parameter 'nu'"),
         (["--unknown", "mu=0"], "mu=0:LOW:HIGH"),
-        (["--unknown", "mu=2:3:4"], "between its limits"),
+        (["--unknown", "mu=2:3:4"], "between finite limits"),
         ([], "--unknown mu=1.5"),
+        (["--unknown", "mu=2", "--unknown", "mu=3"], "--unknown names a parameter twice: mu, mu"),
+        (["--unknown", "mu=2:1:inf"], "between finite limits"),
+        (["--unknown", "mu=2", "--steps", "-5"], "steps must be an integer, not negative, got -5"),
+        (["--unknown", "mu=2", "--seed", "-1"], "seed = -1"),
+        (["--unknown", "mu=2", "--training.width", "-3"], "width = -3"),
     ],
 )
 def test_what_makes_no_sense(arguments, message, data, tmp_path, capsys, monkeypatch):

@@ -176,9 +176,39 @@ def test_identified_and_adapted_observers(tmp_path):
     [
         ({}, "name a parameter"),
         ({"nu": (0.0, 1.0)}, "no parameter 'nu'"),
-        ({"mu": (4.0, 5.0)}, "between its limits"),
+        ({"mu": (4.0, 5.0)}, "between finite limits, got 3 in 4.0 to 5.0"),
+        ({"mu": (5.0, 1.0)}, "between finite limits"),
+        ({"mu": (0.0, float("inf"))}, "between finite limits, got 3 in 0.0 to inf"),
+        ({"mu": (float("nan"), 5.0)}, "between finite limits"),
     ],
 )
 def test_unknowns_that_make_no_sense(unknown, message, tmp_path):
     with progress_bars(None) as progress, pytest.raises(ValueError, match=message):
         estimate_parameters(VanDerPol(), unknown, records(VanDerPol(), 2, seconds=3), tmp_path, progress=progress)
+
+
+def test_records_that_do_not_fit_the_system(tmp_path):
+    (free,), (driven,) = records(Spring(), 1, seconds=3), records(Spring(), 1, seconds=3, driven=True)
+    doubled = Record("doubled", free.t, np.hstack([free.y, free.y]))
+    for given, message in (
+        ([], "there is no record"),
+        ([doubled], "spring has 1 measured, but the columns are y1, y2"),
+        ([free, driven], "inputs are columns u1, but none in"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            found(Spring(), {"stiffness": 4.0}, given, tmp_path)
+
+
+def test_a_parameter_at_its_limit_is_told(tmp_path):
+    with progress_bars(None) as progress:
+        got = estimate_parameters(
+            Spring(3.5),
+            {"stiffness": (3.0, 3.7)},
+            records(Spring(), 2, seconds=5, noise=0.05),
+            tmp_path,
+            progress=progress,
+            steps=1,
+        )
+    assert got.at_limits == ("stiffness",)
+    assert "stiffness is at its limit: give it a wider range" in got.told()
+    assert "fewer than 20 windows" in " ".join(got.told())

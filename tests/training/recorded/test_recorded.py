@@ -113,5 +113,5 @@ def test_errors_are_relative_and_leave_the_transient_out(tmp_path):
     found = recorded_errors(artifact, [record], after=5.0)
     assert found.relative == pytest.approx({"speed": expected})
     assert found.seconds == pytest.approx(10.0)
-    assert str(found).startswith("speed 0.")
+    assert str(found) == f"speed {expected:.3g} (10 s, after 5 s of transient)"
     assert np.isnan(recorded_errors(artifact, [record], after=100.0).relative["speed"])

@@ -58,7 +58,7 @@ def test_parquet(tmp_path):
 
 
 def test_missing_samples_are_nan(tmp_path):
-    rows = ["0,1,2,", "0.1,,2,", "0.2,NaN,na,", "0.3,2,1,"]
+    rows = ["0,1,2,", "0.1,None,2,", "0.2,NaN,n/a,", "0.3,2,1,"]
     signals = Signals(measured=("theta",), hidden=("alpha",))
     (record,) = read_records([csv(tmp_path / "a.csv", rows=rows)], signals=signals, warn=quiet)
     np.testing.assert_array_equal(record.y[:, 0], [1, np.nan, np.nan, 2])
@@ -78,6 +78,12 @@ BAD_CSV = {
     "all missing": (["0,,2,a", "1,nan,2,a"], "column theta, row 1: no row holds a number"),
     "one row": (["0,1,2,a"], "t must be two samples at least"),
     "never moves": (["0,3,2,a", "1,3,2,a"], "column theta: 3 in all rows"),
+    "rounding moves": ([f"{k},0.1,2,a" for k in range(99)], "column theta: 0.1 in all rows"),
+    "decimal comma": (
+        ["0,1,2,a", '1,"2,5",2,a'],
+        "column theta, row 2: '2,5' is no number; write decimals with a point",
+    ),
+    "huge": (["0,1,2,a", "1,1e300,2,a"], "column theta, row 2: 1e\\+300 is no sample"),
     "hidden never moves": (["0,3,2,a", "1,4,2,a"], r"column cos\(alpha\): -0.416147 in all rows"),
 }
 
@@ -114,7 +120,9 @@ def test_no_expression_but_cos_and_sin(tmp_path):
 BAD_NPZ = {
     "short": ({"y": Y[:-1]}, "columns must be of one length; t has 200, y has 199 rows"),
     "missing": ({"y": np.zeros((3, 4, 5))}, "no column y"),
-    "objects": ({"y": np.array([None] * 200)}, "bad.npz: .*allow_pickle=False"),
+    "objects": ({"y": np.array([None] * 200)}, "bad.npz: column y: .*allow_pickle=False"),
+    "transposed": ({"y": np.stack([Y, Y])}, "columns must be of one length; t has 200, y1 has 2 rows$"),
+    "rows for columns": ({"t": T[None]}, r"no column t; there are t1, t2, [t0-9, ]* \.\.\. \(--time\)$"),
     "text": ({"y": np.array(["a"] * 200)}, "bad.npz: column y must hold numbers, got <U1"),
     "complex": ({"y": Y + 1j}, "bad.npz: column y must hold numbers, got complex128"),
     "missing input": ({"u": np.where(T < 5, T, np.nan)}, "bad.npz: column u, row 101: a number is missing"),
@@ -126,6 +134,22 @@ def test_bad_npz(tmp_path, case):
     arrays, message = BAD_NPZ[case]
     with pytest.raises(ValueError, match=message):
         read_records([npz(tmp_path / "bad.npz", **arrays)])
+
+
+def test_what_is_not_asked_for_does_no_harm(tmp_path):
+    (record,) = read_records([npz(tmp_path / "a.npz", notes=np.array({"made": "today"}, dtype=object))], warn=quiet)
+    np.testing.assert_array_equal(record.t, T)
+
+
+def test_spaces_before_quotes(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text('"t", "y"\n"0", "1"\n"1", "3"\n')
+    np.testing.assert_array_equal(read_records([path], warn=quiet)[0].y, [[1.0], [3.0]])
+
+
+def test_the_time_is_no_signal(tmp_path):
+    with pytest.raises(ValueError, match=r"a.npz: column t is the time, and cannot be a signal too"):
+        read_records([npz(tmp_path / "a.npz")], signals=Signals(measured=("y", "cos(t)")))
 
 
 def test_no_record(tmp_path):
@@ -152,6 +176,8 @@ def test_no_record(tmp_path):
 
 def test_files_that_differ(tmp_path):
     first = npz(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"a.npz: named twice, which would count each sample twice$"):
+        read_records([first, npz(tmp_path / "b.npz"), first])
     with pytest.raises(ValueError, match=r"b.npz: inputs are columns u, but none in .*a.npz"):
         read_records([first, npz(tmp_path / "b.npz", u=Y)])
     with pytest.raises(ValueError, match=r"b.npz: column t: steps of 50 s, but .*other units than seconds"):
@@ -177,6 +203,9 @@ def test_units_and_numbers_of_a_systems_signals(tmp_path):
         read_records([npz(tmp_path / "b.npz", y=1000 * y)], system=system)
     with pytest.warns(UserWarning, match=r"b.npz: column y moves by .* 0.001"):
         read_records([npz(tmp_path / "b.npz", y=y / 1000)], system=system)
+    for unit in (1000.0, 1e-4):
+        with pytest.warns(UserWarning, match=r"b.npz: column t: steps of .* s are .* times the dt .* time in seconds"):
+            read_records([npz(tmp_path / "b.npz", t=unit * T, y=y)], system=system)
     with pytest.raises(ValueError, match=r"has 1 measured, but the columns are y1, y2; name others by --measured"):
         read_records([npz(tmp_path / "b.npz", y=np.hstack([y, y]))], system=system)
 
@@ -187,6 +216,17 @@ def test_records_in_memory():
     assert record.duration == pytest.approx(9.95)
     with pytest.raises(ValueError, match=r"y must have shape \(200, n\)"):
         Record("a", T, Y)
+    column = Y[:, None]
+    for y in (
+        np.ma.masked_array(column, column > 0.5),
+        column + 1j,
+        column.astype(str),
+        column > 0,
+        None,
+        [[1], [1, 2]],
+    ):
+        with pytest.raises(ValueError, match=r"a: y (must hold real numbers|holds masked entries)"):
+            Record("a", T, y)
     with pytest.raises(ValueError, match=r"y has 1 columns, but measured"):
         Record("a", T, Y[:, None], signals=Signals(measured=("p", "q")))
     with pytest.raises(ValueError, match=r"measured names y twice"):

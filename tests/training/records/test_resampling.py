@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from training.records import Record, check_dt, check_memory, jitter, median_step, pieces, resampled
+from training.records import Record, check_dt, check_memory, jitter, median_step, pieces, resampled, sampling_interval
 
 DT = 0.02
 T = 3.0 + DT * np.arange(500)
@@ -83,3 +83,12 @@ def test_memory():
     assert told == ["a: column t, row 20: the record ends after 0.38 s, but the filter remembers 5 s"]
     with pytest.raises(ValueError, match="and no other is longer"):
         check_memory([record(T), record(T[:20])], 50.0, told.append)
+
+
+def test_the_sampling_interval_has_no_digits_by_chance():
+    assert sampling_interval(record(T)) == DT
+    assert sampling_interval(record(T.astype("float32"))) == DT
+    assert sampling_interval(record(1.7e9 + T)) == DT
+    assert sampling_interval(record(jittery())) == pytest.approx(DT, rel=0.051)
+    assert len(f"{sampling_interval(record(jittery())):g}") <= len("0.020")
+    assert sampling_interval(record(np.arange(500) / 610.35)) == pytest.approx(1 / 610.35, rel=1e-10)

@@ -1,0 +1,90 @@
+"""Windows of records: standard errors, and first guesses that explain nothing."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.identification.identify import _brought_back, nearest
+from training.identification.shooting import Shooting, UnexplainedError, Windows, shoot
+
+
+@dataclass(frozen=True)
+class Decay(System):
+    """x' = -rate x + noise, y = gain x."""
+
+    rate_constant: float = 1.0
+    gain: float = 1.0
+
+    name: ClassVar[str] = "decay"
+    X: ClassVar = ((0.5, 1.5),)
+    bounds: ClassVar = ((-2.0, 2.0),)
+    dt: ClassVar = 0.02
+
+    def f(self, x):
+        return (-self.rate_constant * x[0],)
+
+    def h(self, x):
+        return (self.gain * x[0],)
+
+
+def windows(system, n, steps, *, noise, process_noise, seed):
+    """Windows of motions from X, with true starts."""
+    rng = np.random.default_rng(seed)
+    x0 = system.draw_starts(rng, n)
+    x = simulate(system, x0, steps, system.dt, w=process_noise * rng.standard_normal((steps, n, system.nx)))
+    y = system.output(x)
+    return Windows(y + noise * rng.standard_normal(y.shape), np.zeros((steps, n, 0)), x0)
+
+
+def fitted(measured, **guesses):
+    limits = {name: (value / 10, value * 10) for name, value in guesses.items()}
+    system = Decay().replace(guesses)
+    values = np.array(list(guesses.values()))
+    shooting = Shooting(system, system.dt, limits, values)
+    return shooting, shoot(shooting, values, measured)
+
+
+@pytest.mark.parametrize(("process_noise", "coloured"), [(0.0, False), (0.3, True)])
+def test_standard_errors_cover_the_truth_under_process_noise(process_noise, coloured):
+    """Normalised errors are standard normal: where noise is white, and where windows alone show what it does."""
+    off, white = [], []
+    for seed in range(12):
+        measured = windows(Decay(), 40, 60, noise=0.01, process_noise=process_noise, seed=seed)
+        _, fit = fitted(measured, rate_constant=1.1)
+        assert fit.coloured == coloured
+        off.append((fit.parameters["rate_constant"] - 1.0) / fit.standard_errors[0])
+        white.append(fit.white[0, 0] ** 0.5 / fit.curvature[0, 0] * 1.1 / fit.standard_errors[0])
+    assert 0.5 < np.std(off) < 1.6
+    assert abs(np.mean(off)) < 1.0
+    assert (np.mean(white) < 0.5) == coloured
+
+
+def test_few_windows_say_nothing_of_their_scatter():
+    measured = windows(Decay(), 10, 60, noise=0.01, process_noise=0.3, seed=0)
+    _, fit = fitted(measured, rate_constant=1.1)
+    assert not fit.coloured
+    assert fit.standard_errors[0] == pytest.approx(1.1 * fit.white[0, 0] ** 0.5 / fit.curvature[0, 0])
+
+
+def test_guesses_that_explain_nothing():
+    measured = windows(Decay(), 5, 60, noise=0.01, process_noise=0.0, seed=0)
+    shooting = Shooting(Decay(-40.0), 0.02, {"rate_constant": (-50.0, -30.0)}, np.array([40.0]))
+    with pytest.raises(UnexplainedError, match=r"windows of 60 samples: all motions leave the bounds of decay.*-40"):
+        shoot(shooting, np.array([-40.0]), measured)
+
+
+def test_parameters_go_back_no_further_than_bounds_let_states():
+    """y tells gain times x. As x of up to 1.5 may grow to 2 alone, the gain of 0.25 that was given is too small."""
+    measured = windows(Decay(), 20, 60, noise=0.001, process_noise=0.0, seed=0)
+    shooting, fit = fitted(measured, gain=1.0)
+    found = _brought_back(shooting, fit, np.array([0.25]))
+    assert 0.7 < found.parameters["gain"] < 0.9
+    assert found.cost == pytest.approx(fit.cost, rel=0.1)
+
+
+def test_what_outputs_say_nothing_of_stays_as_it_was_given():
+    assert nearest(np.array([3.0, 7.0]), np.array([2.5, 2.0]), np.array([[0.0], [1.0]])).tolist() == [3.0, 2.0]
