@@ -8,6 +8,7 @@ from kkl_gym.own import OWN_ID
 from kkl_gym.system import System
 from kkl_gym.systems import SYSTEMS, Lorenz, ReverseDuffing, Rossler, VanDerPol, get_system
 from kkl_gym.vector import KKLVectorEnv
+from kkl_gym.wrappers.memory import KKLMemory, KKLVectorMemory
 from kkl_gym.wrappers.single import ActionRepeat, KKLObservation
 from kkl_gym.wrappers.vector import KKLVectorObservation, VectorActionRepeat
 
@@ -40,8 +41,10 @@ __all__ = [
     "ActionRepeat",
     "EquationError",
     "KKLEnv",
+    "KKLMemory",
     "KKLObservation",
     "KKLVectorEnv",
+    "KKLVectorMemory",
     "KKLVectorObservation",
     "Lorenz",
     "ReverseDuffing",

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.ma import MaskedArray, is_masked
 
 _FLOAT = np.dtype(float)  # one object: to compare by identity is quick, and a step's cost would be felt
+LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
 _NO_NUMBERS = (bool, np.timedelta64)  # though Python takes one for an integer, and NumPy the other
 _TEXTS = (str, bytes, bytearray, memoryview)  # sequences too
 _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observers take, and within float32
@@ -40,6 +41,18 @@ def is_finite(value: object) -> bool:
         return isinstance(value, Real) and not isinstance(value, _NO_NUMBERS) and math.isfinite(value)
     except OverflowError:  # an integer beyond every float
         return False
+
+
+def is_sequence(values: object) -> bool:
+    """Whether a value is a list, a tuple, a range or an array with an axis: no text, nor what is gone through once."""
+    return isinstance(values, list | tuple | range) or (isinstance(values, np.ndarray) and values.ndim > 0)
+
+
+def all_finite(values: np.ndarray) -> bool:
+    """Whether outputs or inputs are numbers, none of them beyond 1e15."""
+    if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
+        return all(-LARGEST <= value <= LARGEST for value in values.tolist())  # false for NaN too
+    return bool((np.abs(values) <= LARGEST).all())
 
 
 def noise_level(name: str, level: Any) -> float:

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
-from observers.checks import bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.monitor import Monitor
 
-_LARGEST = 1e15  # of an output or input; beyond it float32 would overflow
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
@@ -475,7 +474,7 @@ class KKLObserver:
         T, x0, shape = self.artifact.require_forward(), real_array("x0", x0), (*y0.shape[:-1], self.artifact.nx)
         if x0.shape != shape:
             raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
-        if not _finite(x0):
+        if not all_finite(x0):
             raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
         z0 = np.zeros((*shape[:-1], self.artifact.filter.size))
         z0[..., : T.mlp.outputs] = T(x0)
@@ -486,12 +485,12 @@ class KKLObserver:
         ny = self.artifact.ny
         if y.shape != (*batch, ny):
             raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
-        if _finite(y):
+        if all_finite(y):
             return None
         if ny == 1:
             raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
         gaps = np.isnan(y)
-        if not _finite(np.where(gaps, 0.0, y)):
+        if not all_finite(np.where(gaps, 0.0, y)):
             raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")
         if first:
             raise ValueError("y holds NaN: outputs may be missing later, but the first sample must be whole")
@@ -513,7 +512,7 @@ class KKLObserver:
             return np.zeros((*batch, 0))
         if u.shape != (*batch, nu):
             raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
-        if not _finite(u):
+        if not all_finite(u):
             raise ValueError("u holds NaN, infinity or values beyond 1e15")
         return u
 
@@ -567,12 +566,6 @@ class _Decoder:
             for i, condition in enumerate(conditions):
                 inputs[..., width + i] = condition
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
-
-
-def _finite(values: np.ndarray) -> bool:
-    if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
-        return all(-_LARGEST <= value <= _LARGEST for value in values.tolist())  # false for NaN too
-    return bool((np.abs(values) <= _LARGEST).all())
 
 
 def load(

@@ -50,7 +50,7 @@ class VectorEstimate(VectorWrapper):
 
     def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
         super().__init__(env)
-        self.autoreset_mode = _autoreset_mode(env)
+        self.autoreset_mode = autoreset_mode_in(env)
         self._estimator = estimator
         self.single_observation_space: gym.spaces.Box = estimator.space
         self.observation_space: gym.spaces.Box = batch_space(estimator.space, env.num_envs)  # type: ignore[assignment]
@@ -312,7 +312,7 @@ class VectorActionRepeat(VectorWrapper):
         inside: VectorEnv = env
         while isinstance(inside, VectorEstimate | VectorActionRepeat):
             inside = inside.env
-        if not isinstance(inside, KKLVectorEnv) or _autoreset_mode(env) is not AutoresetMode.DISABLED:
+        if not isinstance(inside, KKLVectorEnv) or autoreset_mode_in(env) is not AutoresetMode.DISABLED:
             raise ValueError(
                 'VectorActionRepeat needs a KKLVectorEnv made with autoreset_mode="Disabled" and resets rows itself; '
                 "put other wrappers outside, and for Sync and Async vectors ActionRepeat into each environment; got "
@@ -419,10 +419,14 @@ def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
 
-def _autoreset_mode(env: VectorEnv) -> AutoresetMode:
+def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
+    """The autoreset mode that a vector environment says it has, or ValueError if it says none."""
     mode = env.metadata.get("autoreset_mode")
     if not isinstance(mode, AutoresetMode):
-        raise ValueError(f"{env} does not say its autoreset mode: metadata['autoreset_mode'] is {mode!r}")
+        raise ValueError(
+            f"{env} does not say its autoreset mode: metadata['autoreset_mode'] is {mode!r}; "
+            "set it to one of gymnasium.vector.AutoresetMode"
+        )
     return mode
 
 

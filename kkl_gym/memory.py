@@ -1,0 +1,265 @@
+"""A linear memory of signals at equal steps: what outputs and inputs were, in a few numbers for each."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from observers import LinearFilter
+from observers.checks import is_finite, is_sequence, shown
+
+SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
+SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than it saves
+CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
+
+
+class Memory:
+    """Exact first-order filters of signals, in coordinates that are uncorrelated and as large as the signals.
+
+    For each output y and time constant tau the low-pass z' = (y - z) / tau is integrated exactly, y being linear
+    between samples. What counts is w = y - z, which is 0 where y rests, whatever its value:
+    w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs it is the low-pass
+    v' = (u - v) / tau itself, u being held.
+
+    Of a slow signal all w say nearly the same, tau times its rate. So the memory holds combinations of them: the
+    slowest first, and of each faster one what slower ones do not tell. They are uncorrelated and as large as y if y
+    wanders as an Ornstein-Uhlenbeck process does, with a correlation time of which only the order is known, from
+    twice the shortest time constant to eight times the longest. Nothing is fitted to data, and white noise on y is
+    amplified at most threefold.
+
+    Parameters
+    ----------
+    ny, nu : int
+        Numbers of outputs and inputs.
+    time_constants : sequence of float, length m
+        Of outputs, in steps, each at least 1.5 times the one before.
+    input_time_constants : sequence of float, length k
+        Of inputs, in steps, likewise; there may be none.
+
+    Attributes
+    ----------
+    time_constants, input_time_constants : tuple of float
+        As given.
+    decay, rise : ndarray, shape (m,)
+        What w keeps of itself in a step, and what it takes of y's change.
+    mixing : ndarray, shape (m, m)
+        What makes coordinates, slowest first, of w, fastest first.
+    transition : ndarray, shape (m, m)
+        What coordinates keep of themselves.
+    drive : ndarray, shape (m,)
+        What they take of y's change.
+    input_decay, input_drive : ndarray, shape (k,)
+        What v keeps of itself, and what it takes of the input.
+
+    Raises
+    ------
+    ValueError
+        If time constants are no numbers, from 0.5 to 10,000 steps, or too close to each other.
+    """
+
+    def __init__(
+        self, ny: int, nu: int, *, time_constants: Sequence[float], input_time_constants: Sequence[float]
+    ) -> None:
+        self.time_constants = _time_constants("time_constants", time_constants)
+        self.input_time_constants = _time_constants("input_time_constants", input_time_constants)
+        m = len(self.time_constants)
+        if not m:
+            raise ValueError("time_constants must name at least one, in steps, such as (1, 2, 4, 8)")
+        tau = np.array([*self.time_constants, *self.input_time_constants])
+        linear = LinearFilter(-np.diag(1 / tau), 1 / tau[:, None], dt=1.0, nu=1)
+        decay = linear.transition.diagonal()[: len(tau)].copy()
+        self.decay, self.rise = decay[:m], 1 - linear.late_y[:m, 0]
+        self.mixing = _mixing(self.time_constants, self.decay, self.rise)
+        self.transition = self.mixing * self.decay @ np.linalg.inv(self.mixing)
+        self.drive = self.mixing @ self.rise
+        self.input_decay, self.input_drive = decay[m:], linear.held_u[len(tau) + m :, 0].copy()
+        self._ny, self._nu = ny, nu
+        # A single row advances by one product, where it is small: every call of NumPy would be felt.
+        self._update = self._matrix() if self.size <= SMALL else None
+        self._row: np.ndarray | None = None  # its [y, coordinates, v]
+        self._y: np.ndarray | None = None  # of a batch, (n, ny); it has coordinates, (m, n, ny), and v, (k, n, nu)
+
+    def _matrix(self) -> np.ndarray:
+        """What [state, next y, u] of a single row are multiplied by to give its next state."""
+        ny, nu, size, m = self._ny, self._nu, self.size, len(self.drive)
+        y, q, v = slice(ny), slice(ny, ny + m * ny), slice(ny + m * ny, size)
+        y_next, u = slice(size, size + ny), slice(size + ny, size + ny + nu)
+        out = np.zeros((size + ny + nu, size))
+        out[y_next, y] = np.eye(ny)
+        out[y_next, q] = np.kron(self.drive, np.eye(ny))
+        out[y, q] = -out[y_next, q]
+        out[q, q] = np.kron(self.transition.T, np.eye(ny))
+        out[v, v] = np.kron(np.diag(self.input_decay), np.eye(nu))
+        out[u, v] = np.kron(self.input_drive, np.eye(nu))
+        return out
+
+    @property
+    def size(self) -> int:
+        """How many numbers are shown."""
+        return self._ny * (1 + len(self.time_constants)) + self._nu * len(self.input_time_constants)
+
+    def bounds(self, low: np.ndarray, high: np.ndarray, u_low: np.ndarray, u_high: np.ndarray) -> np.ndarray:
+        """The least and the largest that can be shown; the worst signals reach them.
+
+        Parameters
+        ----------
+        low, high : ndarray, shape (ny,)
+            Bounds of the outputs, which may be infinite.
+        u_low, u_high : ndarray, shape (nu,)
+            Bounds of the inputs.
+
+        Returns
+        -------
+        ndarray, shape (2, size)
+            Lower and upper bounds, infinite where a signal's are.
+        """
+        steps = np.arange(20 * math.ceil(self.time_constants[-1]))[:, None]  # after them e^-20 is left
+        pulse = np.vstack([self.rise, self.rise * (self.decay - 1) * self.decay**steps]) @ self.mixing.T
+        reach = np.maximum(pulse, 0.0).sum(0) * (1 + 1e-6)  # for rounding; responses to a pulse of y have the sum 0
+        of_outputs = np.outer(reach, high - low).ravel()
+        of_inputs = np.tile([np.minimum(u_low, 0.0), np.maximum(u_high, 0.0)], len(self.input_decay))  # 0 at first
+        return np.hstack([[low, high], [-of_outputs, of_outputs], of_inputs])
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Forget all, as if the outputs had rested at ``y0`` and no input had acted.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (ny,) or (n, ny)
+            First outputs, of a single row or of a batch.
+
+        Returns
+        -------
+        ndarray of float32, shape (size,) or (n, size)
+            As :meth:`advance`.
+        """
+        if y0.ndim == 1:
+            if self._update is None:
+                return self.reset(y0[None])[0]
+            self._row = np.zeros(self.size)
+            self._row[: self._ny] = y0
+            return self._row.astype(np.float32)
+        self._y = y0.copy()
+        self._q = np.zeros((len(self.drive), *y0.shape))
+        self._spare = np.empty_like(self._q)  # to find new memory at each step costs as much as to fill it
+        self._v = np.zeros((len(self.input_decay), len(y0), self._nu))
+        return self.shown()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Forget the past in some rows of a batch.
+
+        Parameters
+        ----------
+        y0 : ndarray, shape (number of True in rows, ny)
+            Their first outputs.
+        rows : ndarray of bool, shape (n,)
+            Which rows begin anew.
+
+        Returns
+        -------
+        ndarray of float32, shape (number of True in rows, size)
+            What is shown of them.
+        """
+        if self._y is None:
+            raise RuntimeError("reset all environments before some of them")
+        self._y[rows] = y0
+        self._q[:, rows] = self._v[:, rows] = 0.0
+        return self.shown(rows)
+
+    def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Take in the next outputs, and the inputs that led to them.
+
+        Parameters
+        ----------
+        y : ndarray, shape (ny,) or (n, ny)
+            Outputs.
+        u : ndarray, shape (nu,) or (n, nu)
+            Inputs, held since the outputs before.
+        rows : ndarray of bool, shape (n,), optional
+            Which rows of a batch take them in; None is all.
+
+        Returns
+        -------
+        ndarray of float32, shape (size,) or (n, size)
+            y, then the slowest coordinate of each output, and so on to the fastest; then the inputs, filtered by each
+            time constant.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        """
+        if y.ndim == 1:
+            if self._row is None:
+                return self.advance(y[None], u[None])[0]
+            self._row = np.concatenate((self._row, y, u)) @ self._update
+            return self._row.astype(np.float32)
+        if self._y is None:
+            raise RuntimeError("reset the environment before its first step")
+        if rows is not None:
+            y = np.where(rows[:, None], y, self._y)
+        change, q, m = y - self._y, self._spare, len(self.drive)
+        np.matmul(self.transition, self._q.reshape(m, -1), out=q.reshape(m, -1))
+        for coordinate, drive in zip(q, self.drive):
+            coordinate += drive * change
+        v = self.input_decay[:, None, None] * self._v + self.input_drive[:, None, None] * u
+        if rows is not None:
+            q[:, ~rows], v[:, ~rows] = self._q[:, ~rows], self._v[:, ~rows]
+        self._y[:] = y
+        self._q, self._spare, self._v = q, self._q, v
+        return self.shown()
+
+    def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """What is shown of a batch as things stand.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (n,), optional
+            Of which rows; None is all.
+
+        Returns
+        -------
+        ndarray of float32, shape (n, size) or (number of True in rows, size)
+            As :meth:`advance`.
+        """
+        parts = [self._y, *self._q, *self._v]
+        if rows is not None:
+            parts = [part[rows] for part in parts]
+        return np.concatenate(parts, axis=-1, dtype=np.float32)
+
+
+def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
+    """Gram's and Schmidt's, from the slowest w on, for the mean covariance of w over correlation times of y."""
+    covariance = np.zeros((len(decay), len(decay)))
+    for correlation in np.geomspace(2 * time_constants[0], 8 * time_constants[-1], 6):
+        forgotten = -math.expm1(-1 / correlation)  # of y, whose variance is 1, in a step
+        with_y = (
+            rise * forgotten / (1 - decay * (1 - forgotten))
+        )  # E[w y], and E[w (y_k+1 - y_k)] is -forgotten times it
+        crossed = np.outer(decay * with_y, rise)
+        # From w_k+1 = decay w_k + rise (y_k+1 - y_k), where E[(y_k+1 - y_k)^2] = 2 forgotten:
+        covariance += forgotten * (2 * np.outer(rise, rise) - crossed - crossed.T) / (1 - np.outer(decay, decay))
+    slowest_first = np.linalg.cholesky(covariance[::-1, ::-1] / 6)
+    return np.linalg.inv(slowest_first)[:, ::-1].copy()
+
+
+def _time_constants(name: str, values: Any) -> tuple[float, ...]:
+    """Time constants as floats, or ValueError."""
+    if not is_sequence(values):
+        raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
+    for value in values:
+        if not is_finite(value) or not SHORTEST <= value <= LONGEST:
+            raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {shown(value)}")
+    found = tuple(map(float, values))
+    for one, next_one in pairwise(found):
+        if next_one < (1 - 1e-9) * CLOSEST * one:
+            raise ValueError(
+                f"{name} must rise, each at least {CLOSEST} times the one before, got {one:g} and {next_one:g}: closer "
+                "ones would hold the same"
+            )
+    return found
+
+
+__all__ = ["Memory"]

@@ -1,0 +1,297 @@
+"""The real signals in values of Gymnasium's spaces, one or a batch of them: measured outputs, inputs that act."""
+
+import math
+import operator
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from observers.checks import LARGEST, all_finite, integer, is_sequence, real_array, shown
+
+Space = gym.Space[Any]
+Entries = Sequence[int] | Sequence[str]
+"""Indices in a flattened observation, or keys of a Dict."""
+
+
+class Outputs:
+    """What is measured of an environment's observations.
+
+    Observations are read as :func:`gymnasium.spaces.flatten` writes them: boxes row by row, the parts of a Dict or
+    Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
+
+    Parameters
+    ----------
+    space : gymnasium.Space
+        Of one observation.
+    measured : sequence of int or of str, optional
+        Indices in the flattened observation, or keys of a Dict, which stay in the order of the space; None is all.
+    angles : sequence of int or of str
+        Which of these are angles in rad. Each becomes a cosine and a sine.
+    source : str
+        Where observations come from, for messages.
+
+    Attributes
+    ----------
+    measured, angles : tuple of int or of str, or None
+        As given.
+    low, high : ndarray, shape (ny,)
+        Bounds, which may be infinite.
+
+    Raises
+    ------
+    ValueError
+        If images or what has no numbers are to be measured, or an index or a key is unknown or comes twice.
+    """
+
+    def __init__(self, space: Space, measured: Entries | None, angles: Entries, *, source: str) -> None:
+        self.measured = None if measured is None else _entries("measured", measured)
+        self.angles = _entries("angles", angles)
+        if self.measured == ():
+            raise ValueError("measured must name at least one entry of the observation; None measures all")
+        self._source = f"the observation of {source}"
+        self._parts: dict[Any, Space] = dict(space.items()) if isinstance(space, spaces.Dict) else {None: space}
+        keys = isinstance((self.measured or (0,))[0], str)
+        if self.measured and keys:
+            _check_keys("measured", self.measured, self._parts)
+            self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
+        for key, part in self._parts.items():
+            _check(part, self._source if key is None else f"{self._source}, {key!r},")
+        low, high = (np.concatenate(side) for side in zip(*map(_limits, self._parts.values())))
+        owners = [key for key, part in self._parts.items() for _ in _limits(part)[0]]
+        taken = list(range(len(owners)))
+        if self.measured and not keys:
+            taken = _positions("measured", self.measured, owners)
+        if keys and self.angles and not isinstance(self.angles[0], str):
+            raise ValueError(f"angles must be keys, as measured is, got {self.angles}")
+        turning = _positions("angles", self.angles, owners)
+        if not set(turning) <= set(taken):
+            raise ValueError(f"angles must be among what is measured, {self.measured}, got {self.angles}")
+        self._take = np.repeat(taken, [1 + (i in turning) for i in taken])  # angles twice
+        self._whole = self._take.tolist() == list(range(len(owners)))
+        self._sines = np.flatnonzero(np.isin(self._take, turning))[1::2]
+        self._cosines = self._sines - 1
+        self.low, self.high = low[self._take], high[self._take]
+        for at in (self._cosines, self._sines):
+            self.low[at], self.high[at] = -1.0, 1.0
+
+    def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The outputs in an observation.
+
+        Parameters
+        ----------
+        observation : object
+            A value of the space, or of what :func:`gymnasium.vector.utils.batch_space` makes of it.
+        batch : tuple of int
+            Its leading shape: nothing, or the number of environments.
+
+        Returns
+        -------
+        ndarray, shape (*batch, ny)
+            The outputs.
+
+        Raises
+        ------
+        ValueError
+            If the observation is not of the space, or what is measured holds NaN, infinity or values beyond 1e15.
+        """
+        parts = [
+            _signals(self._source, part, observation if key is None else observation[key], batch)
+            for key, part in self._parts.items()
+        ]
+        y = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+        if not self._whole:
+            y = y[..., self._take]
+        if not all_finite(y):
+            at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
+            row = f" in environment {at[0]}" if batch else ""
+            raise ValueError(
+                f"{self._source} holds {y[tuple(at)]} among what is measured, in entry {self._take[at[-1]]}{row}: it "
+                "would stay in the memory, so replace it, with gymnasium.wrappers.TransformObservation for instance"
+            )
+        if len(self._sines):
+            y[..., self._cosines] = np.cos(y[..., self._cosines])
+            y[..., self._sines] = np.sin(y[..., self._sines])
+        return y
+
+
+class Inputs:
+    """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete.
+
+    Parameters
+    ----------
+    space : gymnasium.Space
+        Of one action.
+    source : str
+        What acts, for messages.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (nu,)
+        Bounds, infinite where the space is not bounded.
+
+    Raises
+    ------
+    ValueError
+        If actions have no numbers.
+    """
+
+    def __init__(self, space: Space, *, source: str) -> None:
+        self._space, self._source = space, f"the action of {source}"
+        _check(space, self._source)
+        self.low, self.high = _limits(space)
+        boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in _limits(leaf)[0]]
+        scaled = np.array(boxes, dtype=bool) & np.isfinite(self.low) & np.isfinite(self.high)
+        low, high = np.where(scaled, self.low, -1.0), np.where(scaled, self.high, 1.0)
+        self._middle, self._half = (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
+        self._plain = not self._middle.any() and bool((self._half == 1.0).all())
+        self.low[scaled], self.high[scaled] = -1.0, 1.0
+
+    def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The inputs in an action.
+
+        Parameters
+        ----------
+        action : object
+            A value of the space, or of what :func:`gymnasium.vector.utils.batch_space` makes of it. One beyond the
+            bounds counts as the bound.
+        batch : tuple of int
+            Its leading shape: nothing, or the number of environments.
+
+        Returns
+        -------
+        ndarray, shape (*batch, nu)
+            The inputs.
+
+        Raises
+        ------
+        ValueError
+            If the action is not of the space's shape, or holds NaN, infinity or values beyond 1e15.
+        """
+        u = _signals(self._source, self._space, action, batch)
+        if not all_finite(u):
+            raise ValueError(f"{self._source} must hold numbers within ±{LARGEST:g}, got {shown(action)}")
+        if not self._plain:
+            u = (u - self._middle) / self._half
+        return np.minimum(np.maximum(u, self.low), self.high)
+
+
+def _entries(name: str, values: Any) -> tuple[Any, ...]:
+    """Indices or keys as a tuple, or ValueError."""
+    if not is_sequence(values):
+        raise ValueError(f"{name} must be a sequence of indices or of keys, such as [0, 2], got {shown(values)}")
+    keys = [value for value in values if isinstance(value, str)]
+    found = tuple(map(str, keys)) if keys else tuple(integer(f"an entry of {name}", value, 0) for value in values)
+    if len(found) != len(values):
+        raise ValueError(f"{name} must be indices or keys, not both, got {shown(values)}")
+    if len(set(found)) != len(found):
+        raise ValueError(f"{name} must name each entry once, got {shown(values)}")
+    return found
+
+
+def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> None:
+    for key in keys:
+        if key not in known:
+            there = "keys " + ", ".join(map(repr, known)) if None not in known else "no keys: name indices"
+            raise ValueError(f"{name} names {key!r}, but what is observed has {there}")
+
+
+def _positions(name: str, chosen: tuple[Any, ...], owners: list[Any]) -> list[int]:
+    """Where the chosen entries are among signals that belong to keys."""
+    if chosen and isinstance(chosen[0], str):
+        _check_keys(name, chosen, dict.fromkeys(owners))
+        return [i for i, key in enumerate(owners) if key in chosen]
+    for i in chosen:
+        if i >= len(owners):
+            raise ValueError(
+                f"{name} names entry {i}, but the flattened observation has entries 0 to {len(owners) - 1}"
+            )
+    return list(chosen)
+
+
+def _leaves(space: Space) -> Iterator[Space]:
+    """The spaces that a space is made of, in the order of the flattened value."""
+    if isinstance(space, spaces.Dict | spaces.Tuple):
+        for part in space.values() if isinstance(space, spaces.Dict) else space:
+            yield from _leaves(part)
+    else:
+        yield space
+
+
+def _check(space: Space, source: str) -> None:
+    """Raise ValueError unless all that a space is made of has real signals."""
+    for leaf in _leaves(space):
+        if isinstance(leaf, spaces.Box) and leaf.dtype == np.uint8 and len(leaf.shape) > 1:
+            raise ValueError(
+                f"{source} is an image, {leaf}: let an encoder turn it into a vector inside, with "
+                "gymnasium.wrappers.TransformObservation, or name what is measured beside it by measured=[...]"
+            )
+        if not isinstance(leaf, spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
+            raise ValueError(
+                f"{source} holds {shown(leaf)}, and only Box, Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple "
+                "of these can be remembered: convert it by a wrapper inside, or leave its key out of measured=[...]"
+            )
+
+
+def _limits(space: Space) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of a space's signals."""
+    low, high = [], []
+    for leaf in _leaves(space):
+        if isinstance(leaf, spaces.Box):
+            low.append(leaf.low.ravel().astype(float))
+            high.append(leaf.high.ravel().astype(float))
+        else:
+            low.append(np.zeros(spaces.flatdim(leaf)))
+            high.append(np.ones(spaces.flatdim(leaf)))
+    return np.concatenate(low or [np.zeros(0)]), np.concatenate(high or [np.zeros(0)])
+
+
+def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
+    """What :func:`gymnasium.spaces.flatten` makes of a value, or of each row of a batch."""
+    try:
+        return _read(space, value, batch)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        many = f", {batch[0]} times," if batch else ""
+        raise ValueError(f"{source} must be of {space}{many} got {shown(value)}") from error
+
+
+def _read(space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
+    if isinstance(space, spaces.Box):
+        return real_array("it", value).reshape(*batch, space.low.size)
+    if isinstance(space, spaces.MultiBinary):
+        return real_array("it", value).reshape(*batch, spaces.flatdim(space))
+    if isinstance(space, spaces.Discrete):
+        return _one_hot(value, int(space.n), int(space.start), batch)
+    if isinstance(space, spaces.MultiDiscrete):
+        columns = np.reshape(value, (*batch, space.nvec.size))
+        sizes = zip(space.nvec.ravel().tolist(), space.start.ravel().tolist())
+        parts = [_one_hot(columns[..., i], n, start, batch) for i, (n, start) in enumerate(sizes)]
+    elif isinstance(space, spaces.Dict):
+        parts = [_read(part, value[key], batch) for key, part in space.items()]
+    else:
+        parts = [_read(part, one, batch) for part, one in zip(space, value, strict=True)]  # type: ignore[call-overload]
+    return np.concatenate(parts, axis=-1)
+
+
+def _one_hot(value: Any, n: int, start: int, batch: tuple[int, ...]) -> np.ndarray:
+    if not batch:
+        one = operator.index(value) - start
+        if not 0 <= one < n:
+            raise ValueError("out of range")
+        row = np.zeros(n)
+        row[one] = 1.0
+        return row
+    index = np.reshape(value, -1)
+    if index.dtype.kind not in "iu" or index.size != math.prod(batch):
+        raise ValueError("no integers")
+    chosen = index.astype(np.int64) - start
+    if not 0 <= chosen.min() <= chosen.max() < n:
+        raise ValueError("out of range")
+    out = np.zeros((len(chosen), n))
+    out[np.arange(len(chosen)), chosen] = 1.0
+    return out.reshape(*batch, n)
+
+
+__all__ = ["Inputs", "Outputs"]
