@@ -18,7 +18,8 @@ class DataOptions:
     """The recorded data of a command; to be annotated with ``tyro.conf.OmitArgPrefixes``."""
 
     data: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]", help_behavior_hint="")] = ()
-    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns."""
+    """Records: .npz files with arrays t, y and, where recorded, u and x; .csv or .parquet files with named columns;
+    minari:ID or the folder of a Minari data set, of which measured and hidden signals are 0, 1, ..., keys, info[KEY]."""
     time: Annotated[str, tyro.conf.arg(metavar="COLUMN", help_behavior_hint="(default: t or time)")] = ""
     """Column of the time in seconds."""
     measured: Annotated[str, tyro.conf.arg(metavar="COLUMNS", help_behavior_hint=_BY_NAME)] = ""
@@ -50,7 +51,7 @@ class DataOptions:
         Returns
         -------
         list of Record
-            One of each file.
+            One of each file or episode.
 
         Raises
         ------

@@ -54,7 +54,7 @@ def read_records(
     """
     paths = [Path(path) for path in files]
     if not paths:
-        raise ValueError("name recorded data: .npz, .csv or .parquet files, or minari:ID (--data)")
+        raise ValueError("name a file of recorded data, .npz, .csv or .parquet, or a data set, minari:ID (--data)")
     twice = sorted({str(path) for path in paths if paths.count(path) > 1})
     if twice:
         raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
