@@ -30,8 +30,8 @@ def observed(space: Space) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        ``obs[0]``, ``obs[1]``, ...; of a Dict ``key[0]``, ``key[1]``, ..., or ``key`` where it holds one number. What has
-        no numbers is left out.
+        ``obs[0]``, ``obs[1]``, ...; of a Dict ``key[0]``, ``key[1]``, ..., or ``key`` where it holds one number. What
+        has no numbers is left out.
     """
     if not isinstance(space, spaces.Dict):
         return tuple(f"obs[{i}]" for i in range(_size(space)))
@@ -85,8 +85,8 @@ def resolved(names: Sequence[str], space: Space, *, role: str, source: str) -> t
             known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
             ask = "" if not entries else ": name one entry of it"
             raise ValueError(
-                f"{role} names {name!r}, but an observation of {source} is {known}{ask}; an index stands for its entry, "
-                "and info[KEY] for what info holds"
+                f"{role} names {name!r}, but an observation of {source} is {known}{ask}; an index stands for its entry "
+                "(2 for obs[2]), and info[KEY] for what info holds"
             )
         found += [f"{function[1]}({entry})" for entry in entries] if function else entries
     return tuple(found)
@@ -195,7 +195,9 @@ class Reader:
         values = real_array(entry, info[key])
         values = values.reshape(*batch, -1)
         if index is None and values.shape[-1] != 1:
-            raise ValueError(f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, such as {entry}[0]")
+            raise ValueError(
+                f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, such as {entry}[0]"
+            )
         if (index or 0) >= values.shape[-1]:
             raise ValueError(f"{entry}: info of {self._source} holds {values.shape[-1]} numbers there, from 0 on")
         return values[..., [index or 0]]

@@ -59,7 +59,11 @@ class NamedEstimator(KKLEstimator):
         known_start: bool,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
-        self._monitor, self._known_start, self._blind = flag("monitor", monitor), flag("known_start", known_start), False
+        self._monitor, self._known_start, self._blind = (
+            flag("monitor", monitor),
+            flag("known_start", known_start),
+            False,
+        )
         check_identity(artifact, env)
         if known_start:
             artifact.require_forward()

@@ -50,7 +50,9 @@ class RecordCommand:
     """An argument of the environment, once for each; values are JSON, or text."""
     seed: int = 0
     """Of the environment and of random actions."""
-    dataset: Annotated[str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")] = ""
+    dataset: Annotated[
+        str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")
+    ] = ""
     """Name of the data set, as in pendulum/random-v0."""
 
     def run(self, console: Console) -> str:
@@ -96,8 +98,8 @@ class RecordCommand:
             lengths = [len(episode.rewards) for episode in rollouts.episodes]
             ended = sum(episode.terminated for episode in rollouts.episodes)
             progress.say(
-                f"{len(lengths)} episodes of {min(lengths)} to {max(lengths)} steps of {rollouts.dt:g} s, {ended} ended by "
-                f"the environment, {sum(lengths)} steps together"
+                f"{len(lengths)} episodes of {min(lengths)} to {max(lengths)} steps of {rollouts.dt:g} s, "
+                f"{sum(lengths)} together; {ended} ended by the environment"
             )
             signals = rollouts.signals
             progress.say(f"measured {', '.join(signals.measured)}; hidden {', '.join(signals.hidden) or 'nothing'}")

@@ -90,7 +90,9 @@ class Rollouts:
         if wanted.time:
             raise ValueError(f"{self.name}: episodes have equal steps and no column of time; leave --time out")
         measured, hidden = (
-            resolved(getattr(wanted, role) or getattr(self.signals, role), self.observation_space, role=role, source=source)
+            resolved(
+                getattr(wanted, role) or getattr(self.signals, role), self.observation_space, role=role, source=source
+            )
             for role in ("measured", "hidden")
         )
         if not measured:

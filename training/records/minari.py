@@ -193,7 +193,7 @@ def _found(name: str) -> "MinariDataset":
 
 
 def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:
-    """Seconds between samples, asked of the environment if it is one of Gymnasium's own; those of others may run code."""
+    """Seconds between samples, asked of an environment of Gymnasium's own; to make others may run what a file says."""
     registered = None if spec is None else gym.registry.get(spec.id)
     if registered is not None and str(registered.entry_point).startswith("gymnasium."):
         try:
@@ -212,4 +212,6 @@ def _require() -> None:
         import h5py  # noqa: F401
         import minari  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f'{error}: Minari data sets need pip install "kkl-gym[envs]"', name=error.name) from None
+        raise ModuleNotFoundError(
+            f'{error}: Minari data sets need pip install "kkl-gym[envs]"', name=error.name
+        ) from None

@@ -61,7 +61,9 @@ def read_records(
     told = warn or (lambda text: warnings.warn(text, stacklevel=4))
     records = list[Record]()
     for path in paths:
-        records += read_dataset(path, told).records(signals) if is_dataset(path) else [_read(path, signals or Signals())]
+        records += (
+            read_dataset(path, told).records(signals) if is_dataset(path) else [_read(path, signals or Signals())]
+        )
     check_signals(records, system)
     if len(paths) > 1:  # episodes of one environment are in the same units
         check_between_records(records, told)

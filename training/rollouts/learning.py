@@ -67,18 +67,18 @@ def learn(
         steps = 100_000
     with tempfile.TemporaryDirectory() as scratch, progress_bars(console) as progress:
         folder = Path(scratch) / "run" if out is None else Path(out)
-        with make(env_id, env_kwargs) as env:
-            with progress.phase(f"playing {env_id}", steps or episodes or 1) as report:
-                rollouts = roll_out(
-                    env,
-                    policy_of(policy, env),
-                    measured=[str(name) for name in measured],
-                    hidden=[str(name) for name in hidden],
-                    episodes=episodes,
-                    steps=steps,
-                    seed=seed,
-                    report=report,
-                )
+        playing = progress.phase(f"playing {env_id}", steps or episodes or 1)
+        with make(env_id, env_kwargs) as env, playing as report:
+            rollouts = roll_out(
+                env,
+                policy_of(policy, env),
+                measured=[str(name) for name in measured],
+                hidden=[str(name) for name in hidden],
+                episodes=episodes,
+                steps=steps,
+                seed=seed,
+                report=report,
+            )
         records = rollouts.records()
         config = recorded_config(records, {"seed": seed, **settings})
         name = (rollouts.environment or {})["id"].replace("/", "-")

@@ -44,7 +44,8 @@ def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
         return lambda observation: space.sample()
     if not isinstance(policy, str) or ":" not in policy:
         raise ValueError(
-            f"a policy is random, script.py:function, module:function or an agent as in ppo:FILE.zip, got {shown(policy)}"
+            "a policy is random, script.py:function, module:function or an agent as in ppo:FILE.zip, "
+            f"got {shown(policy)}"
         )
     algorithm, _, file = policy.partition(":")
     if file.endswith(".zip"):
@@ -68,5 +69,7 @@ def _agent(name: str, path: Path, env: gym.Env[Any, Any]) -> Policy:
     for what in ("observation_space", "action_space"):
         here, there = getattr(env, what), getattr(agent, what)
         if here != there:
-            raise ValueError(f"{path} was trained on the {what.replace('_', ' ')} {there}, but the environment has {here}")
+            raise ValueError(
+                f"{path} was trained on the {what.replace('_', ' ')} {there}, but the environment has {here}"
+            )
     return lambda observation: agent.predict(observation, deterministic=True)[0]
