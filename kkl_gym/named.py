@@ -195,9 +195,7 @@ class Reader:
         values = real_array(entry, info[key])
         values = values.reshape(*batch, -1)
         if index is None and values.shape[-1] != 1:
-            raise ValueError(
-                f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, such as {entry}[0]"
-            )
+            raise ValueError(f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, as in {entry}[0]")
         if (index or 0) >= values.shape[-1]:
             raise ValueError(f"{entry}: info of {self._source} holds {values.shape[-1]} numbers there, from 0 on")
         return values[..., [index or 0]]

@@ -45,9 +45,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     """Shows a learned observer's estimate in place of the state.
 
     Around an environment of ours the observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment
-    applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and
-    not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit the
-    estimates (a faulty sensor, states that the map was not made for).
+    applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64
+    and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
+    the estimates (a faulty sensor, states that the map was not made for).
 
     With ``estimate="z"`` the network is not evaluated, unless there is a monitor. There is then no ``x_hat``, and
     :meth:`render` shows no estimate.
@@ -91,7 +91,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     ValueError
         If the environment is not one of ours and the observer not from its rollouts, ``estimate`` is unknown, a flag is
         no bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if the agent acts
-        on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
+        on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the
+        observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for. It is a ValueError.

@@ -149,10 +149,11 @@ class VectorEstimate(VectorWrapper):
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
         y, u = (np.where(ended[:, None], final[key], info[key]) for key in ("y", "u"))
         self._estimator.advance(y, u)
+        y0 = info["y"][ended]  # what is shown next may report y itself
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
-        self._estimator.restart(info["y"][ended], ended, _states(info, ended))
+        self._estimator.restart(y0, ended, _states(info, ended))
         self._sample = np.where(ended, 0, expected)
         first = self._estimator.report(ended)
         for key, values in first.items():

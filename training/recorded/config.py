@@ -16,8 +16,8 @@ MODES = 12  # for each output
 SLOWEST, FASTEST = 0.15, 10.0  # eigenvalues, in multiples of the rate of the signals
 MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt
-# Of rollouts, whose hidden signals an agent wants within steps: the slowest and the fastest mode per step, and how many.
-# A filter of few modes, which are apart, forgets its start soon and keeps apart what single steps did.
+# Of rollouts, whose hidden signals an agent wants within steps: how many modes, the slowest and the fastest per step.
+# Few modes that are far apart forget the start soon, and tell single steps from each other.
 EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
 EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
 NOISE_SHARE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
@@ -90,8 +90,8 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     """Choose what the records decide: dt, the eigenvalues of A, and the largest noise.
 
     dt is the median step, rounded where steps are uneven. The eigenvalues follow from the rate of the signals,
-    :func:`signal_rate`, and from the length of the records; those of rollouts from dt and the length of episodes. The largest noise is a tenth of the standard deviation of
-    each output.
+    :func:`signal_rate`, and from the length of the records; those of rollouts from dt and the length of episodes. The
+    largest noise is a tenth of the standard deviation of each output.
 
     Parameters
     ----------

@@ -122,7 +122,8 @@ def _episode(
     env: gym.Env[Any, Any], policy: Policy, keys: Sequence[str], *, seed: int | None, most: int | None
 ) -> Episode:
     observation, info = env.reset(seed=seed)
-    observations, actions, rewards, infos = [observation], [], [], [info]
+    observations, actions, infos = [observation], list[Any](), [info]
+    rewards = list[float]()
     terminated = truncated = False
     while not (terminated or truncated or len(rewards) == most):
         action = policy(observation)
@@ -153,4 +154,5 @@ def _values(values: list[Any], key: str) -> np.ndarray:
 
 def _stacked(space: gym.Space[Any], values: list[Any]) -> Any:
     """Values of a space, one upon the other: arrays, of a Dict or Tuple in its structure."""
-    return concatenate(space, values, create_empty_array(space, len(values), fn=np.zeros))
+    empty: Any = create_empty_array(space, len(values), fn=np.zeros)
+    return concatenate(space, values, empty)
