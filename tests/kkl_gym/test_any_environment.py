@@ -107,7 +107,7 @@ def test_other_environments_are_refused(saved):
         KKLObservation(gym.make("Pendulum-v1"), saved(observer_of("Pendulum-v1", ["obs[3]"], ["obs[2]"], [], dt=0.05)))
     with pytest.raises(ValueError, match="kkl-gym record CartPole-v1 --measured"):
         KKLObservation(gym.make("CartPole-v1"))
-    with pytest.raises(ValueError, match="needs a gymnasium.Env"):
+    with pytest.raises(ValueError, match=r"needs a gymnasium\.Env"):
         KKLObservation("CartPole-v1")
     with pytest.raises(ArtifactError, match="holds no forward map"):
         KKLObservation(gym.make("Pendulum-v1"), path, known_start=True)

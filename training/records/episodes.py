@@ -83,7 +83,8 @@ class Rollouts:
         Raises
         ------
         ValueError
-            If nobody says what is measured, there is no such signal, or it holds no numbers.
+            If nobody says what is measured, there is no such signal, it holds no numbers, or a reset does not say
+            what is measured.
         """
         source = self.name if self.environment is None else self.environment["id"]
         wanted = wanted or Signals()
@@ -106,6 +107,11 @@ class Rollouts:
             if not n:
                 continue
             y, x = (read(episode.observations, episode.infos, (n + 1,)) for read in (read_y, read_x))
+            if np.isnan(y[0]).any():
+                raise ValueError(
+                    f"{self.name}, episode {i}: {measured[int(np.isnan(y[0]).argmax())]} is not there after the reset, "
+                    "where an observer takes its first sample; measure something else"
+                )
             u = read_u(episode.actions, (n,))
             found.append(
                 Record(

@@ -144,6 +144,8 @@ def _episode(
 
 def _values(values: list[Any], key: str) -> np.ndarray:
     """What ``info`` held under a key at each step; NaN at the first where a reset says nothing."""
+    if all(value is None for value in values):
+        raise ValueError(f"info has no {key!r}, at the reset or at a step")
     if values[0] is None and len(values) > 1 and values[1] is not None:
         values = [np.full(np.shape(values[1]), np.nan), *values[1:]]
     try:
