@@ -33,7 +33,9 @@ def main(steps: int = 6_000, episodes: int = 20, seed: int = 0) -> dict[str, flo
     for name, wrapper in wrappers.items():
         envs = make_vec_env("Pendulum-v1", n_envs=4, seed=seed, **wrapper)
         networks = {"net_arch": [64, 64]}
-        agent = SAC("MlpPolicy", envs, learning_rate=2e-3, gradient_steps=2, policy_kwargs=networks, seed=seed, device="cpu")
+        agent = SAC(
+            "MlpPolicy", envs, learning_rate=2e-3, gradient_steps=2, policy_kwargs=networks, seed=seed, device="cpu"
+        )
         agent.learn(steps)
         unseen = make_vec_env("Pendulum-v1", n_envs=4, seed=seed + 1000, **wrapper)
         returns[name], spread = evaluate_policy(agent, unseen, n_eval_episodes=episodes)

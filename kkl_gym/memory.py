@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from observers import LinearFilter
-from observers.checks import is_finite, is_sequence, shown
+from observers.checks import real_array, shown
 
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than it saves
@@ -247,12 +247,13 @@ def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray
 
 def _time_constants(name: str, values: Any) -> tuple[float, ...]:
     """Time constants as floats, or ValueError."""
-    if not is_sequence(values):
+    array = real_array(name, values)
+    if array.ndim != 1:
         raise ValueError(f"{name} must be a sequence of numbers of steps, such as (1, 2, 4, 8), got {shown(values)}")
-    for value in values:
-        if not is_finite(value) or not SHORTEST <= value <= LONGEST:
-            raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {shown(value)}")
-    found = tuple(map(float, values))
+    found = tuple(array.tolist())
+    for value in found:
+        if not SHORTEST <= value <= LONGEST:  # nor is NaN
+            raise ValueError(f"{name} must be from {SHORTEST:g} to {LONGEST:,.0f} steps each, got {value:g}")
     for one, next_one in pairwise(found):
         if next_one < (1 - 1e-9) * CLOSEST * one:
             raise ValueError(

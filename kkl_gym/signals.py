@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from observers.checks import LARGEST, all_finite, integer, is_sequence, real_array, shown
+from observers.checks import LARGEST, all_finite, integer, real_array, shown
 
 Space = gym.Space[Any]
 Entries = Sequence[int] | Sequence[str]
@@ -180,7 +180,7 @@ class Inputs:
 
 def _entries(name: str, values: Any) -> tuple[Any, ...]:
     """Indices or keys as a tuple, or ValueError."""
-    if not is_sequence(values):
+    if not isinstance(values, list | tuple | range) and not (isinstance(values, np.ndarray) and values.ndim):
         raise ValueError(f"{name} must be a sequence of indices or of keys, such as [0, 2], got {shown(values)}")
     keys = [value for value in values if isinstance(value, str)]
     found = tuple(map(str, keys)) if keys else tuple(integer(f"an entry of {name}", value, 0) for value in values)

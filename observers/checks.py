@@ -43,11 +43,6 @@ def is_finite(value: object) -> bool:
         return False
 
 
-def is_sequence(values: object) -> bool:
-    """Whether a value is a list, a tuple, a range or an array with an axis: no text, nor what is gone through once."""
-    return isinstance(values, list | tuple | range) or (isinstance(values, np.ndarray) and values.ndim > 0)
-
-
 def all_finite(values: np.ndarray) -> bool:
     """Whether outputs or inputs are numbers, none of them beyond 1e15."""
     if values.ndim == 1:  # a single sample: numpy's own overhead would be felt

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import kkl_gym
 from training.cli import main
 from training.evaluation import calibration
 
@@ -128,6 +129,29 @@ def test_from_csv(tmp_path, capsys):
     assert with_state < with_estimate < 0.3  # 0.38 without control
     assert (tmp_path / "record-0.csv").read_text().startswith("t,u,y\n")
     assert "with x_hat" in capsys.readouterr().out
+
+
+def test_memory(capsys):
+    """What it prints is what it returns, and all is seeded; to learn something takes longer."""
+    sizes = {"steps": 150, "episodes": 2}
+    returns = example("memory")(**sizes)
+    printed = re.findall(r"(.*): mean return (-\d+) ± ", capsys.readouterr().out)
+    assert printed == [(name, f"{value:.0f}") for name, value in returns.items()]
+    assert example("memory")(**sizes) == returns
+    assert example("memory")(**sizes, seed=1) != returns
+
+
+def test_the_page_on_memory_runs():
+    page = (ROOT / "docs" / "memory.md").read_text()
+    small = {"20_000": "1", "1024": "3", "HalfCheetah-v5": "Pendulum-v1"}  # MuJoCo comes with the extra envs alone
+    made = {"kkl_gym": kkl_gym}
+    for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        for large, little in small.items():
+            block = block.replace(large, little)
+        exec(block, made)
+    assert made["env"].observation_space.shape == (12,)
+    assert made["agent"].num_timesteps == 1
+    assert made["envs"].observation_space.shape == (12,)
 
 
 def test_sb3_agent():

@@ -15,8 +15,10 @@ import observers
 from kkl_gym import (
     ActionRepeat,
     KKLEnv,
+    KKLMemory,
     KKLObservation,
     KKLVectorEnv,
+    KKLVectorMemory,
     KKLVectorObservation,
     VectorActionRepeat,
     get_system,
@@ -385,6 +387,14 @@ def wrappers():
             )
         yield Entry(WRAPPERS, f"{kind.__name__}(env)", "environments?", None, means.nothing,
                     lambda _, v, kind=kind: driven(kind(v)))  # fmt: skip
+    for kind, inside in ((KKLMemory, limited), (KKLVectorMemory, vector)):
+        yield from constructors(WRAPPERS, (
+            (f"{kind.__name__}(env)", "Env|VectorEnv", None, means.nothing, lambda v, kind=kind: driven(kind(v))),
+            (f"{kind.__name__}(measured)", "measured", [1], means.entries(2),
+             lambda v, kind=kind, inside=inside: driven(kind(inside(), v)), array_value),
+            (f"{kind.__name__}(time_constants)", "time_constants", [1.0, 4.0], means.array(means.time_constants),
+             lambda v, kind=kind, inside=inside: driven(kind(inside(), time_constants=v)), array_value),
+        ))  # fmt: skip
     yield from constructors(WRAPPERS, (
         ("ActionRepeat(repeat)", "repeat", 2, means.whole(1), lambda v: driven(ActionRepeat(limited(), v))),
         ("ActionRepeat(env)", "Env|KKLVectorEnv", None, means.nothing, lambda v: driven(ActionRepeat(v, 2))),
@@ -397,6 +407,8 @@ def wrappers():
     for name, make, rows in (
         ("KKLObservation", lambda: KKLObservation(single()), ()),
         ("ActionRepeat", lambda: ActionRepeat(KKLObservation(single()), 2), ()),
+        ("KKLMemory", lambda: KKLMemory(single()), ()),
+        ("KKLVectorMemory", lambda: KKLVectorMemory(vector()), (N,)),
         ("KKLVectorObservation", lambda: KKLVectorObservation(vector()), (N,)),
         ("z of SAME_STEP", lambda: KKLVectorObservation(vector(autoreset_mode="SameStep"), estimate="z"), (N,)),
         ("VectorActionRepeat", lambda: VectorActionRepeat(KKLVectorObservation(disabled()), 2), (N,)),

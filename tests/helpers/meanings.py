@@ -181,5 +181,27 @@ def mask(n):
     return means
 
 
+def entries(n):
+    """Some of n entries of an observation, each once; None is all."""
+
+    def means(value):
+        many = list(value) if isinstance(value, list | tuple | range | np.ndarray) and np.ndim(value) else []
+        right = bool(many) and len(set(many)) == len(many) and all(whole(0, n - 1)(one)[0] for one in many)
+        return value is None or right, many or None
+
+    return means
+
+
+def time_constants(values):
+    """Of an array: whether a memory can have these time constants."""
+    return (
+        values.ndim == 1
+        and values.size
+        and values.min() >= 0.5
+        and values.max() <= 1e4
+        and ((values[1:] >= 1.5 * values[:-1]).all())
+    )
+
+
 def actions(*shape):
     return array(lambda values: values.shape == shape and not np.isnan(values).any())

@@ -6,6 +6,7 @@ import pytest
 
 import kkl_gym.envs
 import kkl_gym.vector
+import kkl_gym.wrappers.memory
 import kkl_gym.wrappers.single
 import kkl_gym.wrappers.vector
 
@@ -15,6 +16,7 @@ import kkl_gym.wrappers.vector
     [
         (kkl_gym.envs, {"KKLEnv"}),
         (kkl_gym.vector, {"KKLVectorEnv"}),
+        (kkl_gym.wrappers.memory, {"KKLMemory", "KKLVectorMemory"}),
         (kkl_gym.wrappers.single, {"ActionRepeat", "KKLObservation"}),
         (kkl_gym.wrappers.vector, {"KKLVectorObservation", "VectorActionRepeat"}),
     ],

@@ -15,7 +15,6 @@ from gymnasium.envs.classic_control.cartpole import CartPoleVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
-from gymnasium.vector.utils import batch_space
 from gymnasium.wrappers import FrameStackObservation, MaxAndSkipObservation, RecordEpisodeStatistics, TimeLimit
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -83,6 +82,22 @@ def test_coordinates_are_uncorrelated_and_of_unit_size_for_wandering_signals(out
     assert (found.mixing[range(m), range(m - 1, -1, -1)] > 0).all()
 
 
+def test_the_coordinates_serve_a_real_motion():
+    """Of a pendulum that is pushed about: nearly collinear filters become features of one size."""
+    env = KKLMemory(gym.make("Pendulum-v1"), measured=[0, 1])
+    rng, shown = np.random.default_rng(0), []
+    for seed in range(10):
+        env.reset(seed=seed)
+        for _ in range(10):
+            action = rng.uniform(-2, 2, 1).astype(np.float32)
+            shown += [env.step(action)[0] for _ in range(20)]
+    coordinates = np.array(shown)[:, 2:10:2]  # of the cosine
+    filters = coordinates @ np.linalg.inv(memory(2, 1).mixing).T
+    assert np.linalg.cond(np.cov(coordinates.T)) < 0.01 * np.linalg.cond(np.cov(filters.T))
+    assert (coordinates.std(0) > 0.3).all()
+    assert (coordinates.std(0) < 1.0).all()
+
+
 @pytest.mark.parametrize("ratio", [1.5, 2.0, 10.0])
 @pytest.mark.parametrize("shortest", [0.5, 1.0, 50.0])
 def test_noise_is_amplified_at_most_threefold(shortest, ratio):
@@ -126,6 +141,13 @@ def test_bounds_hold_and_are_reached_by_the_worst_signals(outputs, inputs):
             assert reached > 0.999, (i, reached)
     assert high[1 + len(outputs) :].tolist() == [0.5] * len(inputs)
     assert low[1 + len(outputs) :].tolist() == [-1.0] * len(inputs)
+
+
+def test_signals_without_bounds_have_memories_without_bounds():
+    infinite = np.array([np.inf])
+    low, high = memory(1, 1).bounds(-infinite, infinite, np.array([2.0]), infinite)
+    assert high.tolist() == [np.inf] * 7
+    assert low.tolist() == [-np.inf] * 5 + [0.0] * 2  # where an input's filter begins
 
 
 def test_one_row_a_batch_and_a_wide_row_agree(monkeypatch):
@@ -292,6 +314,13 @@ def test_wrong_actions_are_refused(space, wrong):
 
 
 # Around environments
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """MuJoCo writes its warnings into the folder in which it runs."""
+    monkeypatch.chdir(tmp_path)
+
 
 PACKAGES = {"classic_control": "gymnasium", "toy_text": "gymnasium", "box2d": "Box2D", "mujoco": "mujoco"}
 IDS = {
@@ -610,9 +639,9 @@ def test_other_actions_and_environments_that_take_no_seed():
         ("time_constants", 4.0, "must be a sequence of numbers of steps"),
         ("time_constants", (1, 1.2), r"each at least 1\.5 times the one before, got 1 and 1\.2"),
         ("time_constants", (4, 2), "must rise"),
-        ("time_constants", (0.0,), r"from 0\.5 to 10,000 steps each, got 0\.0"),
+        ("time_constants", (0.0,), r"from 0\.5 to 10,000 steps each, got 0$"),
         ("input_time_constants", (1e9,), r"input_time_constants must be from 0\.5 to 10,000 steps each"),
-        ("input_time_constants", ("1",), r"got '1'"),
+        ("input_time_constants", ("1",), r"input_time_constants must hold real numbers, got \('1',\)"),
     ],
 )
 def test_wrong_arguments(argument, value, match):
@@ -629,10 +658,13 @@ bad = st.one_of(
 @settings(max_examples=100, deadline=None)
 @given(st.dictionaries(st.sampled_from(["measured", "angles", "time_constants", "input_time_constants"]), bad))
 def test_any_argument_is_taken_or_refused_by_a_ValueError(arguments):
+    refused = None
     try:
         env = KKLMemory(gym.make("CartPole-v1"), **arguments)
     except ValueError as error:
-        assert len(str(error)) < 700
+        refused = str(error)
+    if refused is not None:
+        assert any(name in refused for name in arguments)
         return
     assert env.reset(seed=0)[0] in env.observation_space
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
@@ -644,13 +676,17 @@ def test_any_argument_is_taken_or_refused_by_a_ValueError(arguments):
 def test_any_action_is_taken_or_refused(env_id, action):
     env, bare = KKLMemory(gym.make(env_id)), gym.make(env_id)
     env.reset(seed=0), bare.reset(seed=0)
+    refused = None
     try:
         obs = env.step(action)[0]
-    except ValueError as error:
-        assert "the action of" in str(error)
-        obs = env.step(env.action_space.sample())[0]
-    except Exception as error:  # the environment's own
-        with pytest.raises(type(error)):
+    except Exception as error:
+        refused = error
+    if refused is None:
+        assert np.isfinite(obs).all()
+    elif "the action of" in str(refused):
+        assert type(refused) is ValueError
+        sound = bare.action_space.sample()
+        assert np.array_equal(env.step(sound)[0][:2], bare.step(sound)[0][:2])  # as if it had not been asked
+    else:  # the environment's own
+        with pytest.raises(type(refused)):
             bare.step(action)
-        return
-    assert np.isfinite(obs).all()

@@ -7,6 +7,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
 from rich.console import Console
 from rich.table import Column, Table
 
@@ -25,7 +27,7 @@ class Speed:
 
     Actions are drawn beforehand. The environments take turns, several times over, and each ratio is the median of
     those to the reference in the same turn, because a shared machine's speed drifts. A system of yours has rows with an
-    observer if one is named.
+    observer if one is named; without one, what `kkl_gym.KKLMemory` takes is timed too.
     """
 
     system: OneSystem = None
@@ -57,7 +59,10 @@ class Speed:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         environments = shown(self.system, self.observer)
         with progress_bars(console) as progress:
-            return self._single(environments, progress) | self._vector(environments, progress)
+            ratios = self._single(environments, progress) | self._vector(environments, progress)
+            if self.system is None:
+                self._memory(progress)
+        return ratios
 
     def _single(self, environments: Sequence[Shown], progress: ProgressBars) -> dict[str, float]:
         envs = {REFERENCE: gym.make(REFERENCE)}
@@ -107,6 +112,24 @@ class Speed:
         progress.console.print(table)
         return {f"{name}, {self.num_envs} rows": ratio for name, ratio in ratios.items()}
 
+    def _memory(self, progress: ProgressBars) -> None:
+        """What a memory takes, around environments that take next to nothing."""
+        envs = {"bare": Still(), "with memory": kkl_gym.KKLMemory(Still())}
+        actions = _drawn(envs["bare"].action_space, self.steps)
+        tasks = {f"1, {name}": lambda env=env: timed(env, actions) for name, env in envs.items()}
+        n = self.num_envs
+        vectors = {"bare": StillVector(n), "with memory": kkl_gym.KKLVectorMemory(StillVector(n))}
+        drawn = _drawn(vectors["bare"].action_space, self.vector_steps)
+        tasks |= {f"{n}, {name}": lambda env=env: timed_vector(env, drawn) for name, env in vectors.items()}
+        seconds = self._in_turns(tasks, progress.bar("timing the memory", self._runs(tasks)))
+        title = Column("rows of 8 outputs and 2 inputs", no_wrap=True)
+        table = Table(title, "bare, µs per step", "with memory, µs per step", "µs more per row")
+        for rows, steps in ((1, self.steps), (n, self.vector_steps)):
+            # Of the fastest turns, for what others took of the machine is no part of the difference.
+            bare, remembering = (1e6 / steps * min(seconds[f"{rows}, {name}"]) for name in envs)
+            table.add_row(f"{rows}", f"{bare:.1f}", f"{remembering:.1f}", f"{(remembering - bare) / rows:.2f}")
+        progress.console.print(table)
+
     def _runs(self, tasks: Mapping[str, Any]) -> int:
         return len(tasks) * (self.turns + 1)
 
@@ -121,6 +144,49 @@ class Speed:
                     seconds[name].append(elapsed)
                 report(turn * len(tasks) + i)
         return seconds
+
+
+class Still(gym.Env[np.ndarray, np.ndarray]):
+    """Eight outputs that rest and two inputs that do nothing."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (8,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin."""
+        return np.zeros(8, np.float32), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Stay."""
+        return np.zeros(8, np.float32), 0.0, False, False, {}
+
+
+class StillVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many :class:`Still`.
+
+    Parameters
+    ----------
+    num_envs : int
+        How many.
+    """
+
+    def __init__(self, num_envs: int) -> None:
+        self.num_envs, self.metadata = num_envs, {"autoreset_mode": AutoresetMode.NEXT_STEP}
+        self.single_observation_space, self.single_action_space = Still.observation_space, Still.action_space
+        self.observation_space = batch_space(Still.observation_space, num_envs)
+        self.action_space = batch_space(Still.action_space, num_envs)
+        self._never = np.zeros(num_envs, dtype=bool)
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin."""
+        return np.zeros((self.num_envs, 8), np.float32), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Stay."""
+        never = self._never
+        return np.zeros((self.num_envs, 8), np.float32), never.astype(float), never, never, {}
 
 
 def timed(env: gym.Env, actions: list[np.ndarray]) -> float:

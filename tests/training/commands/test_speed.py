@@ -1,5 +1,7 @@
 """kkl-gym speed."""
 
+import re
+
 import linear_system
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from rich.console import Console
 import kkl_gym
 from training.commands import speed
 from training.commands.speed import Speed, timed, timed_vector
+from training.progress import progress_bars
 
 
 class Clock:
@@ -84,6 +87,24 @@ def test_speed_measures_every_environment(capsys):
                 simulated, network = ("%" in part for part in parts)
                 assert simulated == (name != reference)
                 assert network == name.endswith("x_hat")
+
+
+def test_what_a_memory_takes_is_the_difference_to_the_bare_environment(monkeypatch):
+    """In the fastest turns, by row."""
+    seconds = {"1, bare": [2, 1.5], "1, with memory": [4.5, 6], "4, bare": [1, 1], "4, with memory": [9, 9]}
+    played = []
+
+    def in_turns(self, tasks, report):
+        played.extend(task() for task in tasks.values())
+        return {name: [1e-6 * time for time in seconds[name]] for name in tasks}
+
+    monkeypatch.setattr(Speed, "_in_turns", in_turns)
+    console = Console(width=200, record=True)
+    with progress_bars(console) as progress:
+        Speed(steps=1, num_envs=4, vector_steps=1)._memory(progress)
+    table = [re.findall(r"[\d.]+", line) for line in console.export_text().splitlines() if re.match(r"│ \d", line)]
+    assert table == [["1", "1.5", "4.5", "3.00"], ["4", "1.0", "9.0", "2.00"]]
+    assert len(played) == 4
 
 
 def test_a_system_of_ones_own_alone(saved, capsys):
