@@ -22,6 +22,7 @@ from observers.artifact import resolve
 from training.evaluation.errors import errors, unseen_trajectories
 from training.identification import identify
 from training.records import Record
+from training.trajectories.noise import draw_process_noise
 
 FIRST_GUESSES = {
     "reverse_duffing": {"b": 0.6},  # beside a, which y does not tell from b
@@ -53,6 +54,7 @@ class Found:
 def main(
     system: tyro.conf.Positional[str],
     noise: float = 0.0,
+    process_noise: float = 0.0,
     records: int = 60,
     seconds: float = 30.0,
     seed: int = 11,
@@ -64,6 +66,7 @@ def main(
     Args:
         system: reverse_duffing, van_der_pol, rossler or lorenz.
         noise: standard deviation of the measurement noise.
+        process_noise: its level in the records; 0.05 is that of the environments.
         records: their number.
         seconds: length of each.
         seed: of the records; any will do.
@@ -73,7 +76,9 @@ def main(
     began, console = time.monotonic(), Console()
     plant, guesses = get_system(system), FIRST_GUESSES[system]
     rng, steps = np.random.default_rng(seed), round(seconds / plant.dt)
-    x = simulate(plant, plant.draw_starts(rng, records), steps, plant.dt)
+    x0 = plant.draw_starts(rng, records)
+    w = draw_process_noise(plant, process_noise, n=records, steps=steps, rng=rng) if process_noise else None
+    x = simulate(plant, x0, steps, plant.dt, w=w)
     y = plant.output(x) + noise * rng.standard_normal((steps + 1, records, plant.ny))
     t = np.arange(steps + 1) * plant.dt
     learned = identify(

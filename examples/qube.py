@@ -56,10 +56,10 @@ RATES = (2.5, 3.245, 4.212, 5.467, 7.096, 9.21, 11.95, 15.52, 20.14, 26.14, 33.9
 SETTINGS = {
     "eigenvalues": tuple(-rate for rate in RATES),
     "arbitrary_zero": ("theta",),
-    "measurement_noise_max": 0.01,  # rad; an encoder's step is 0.0031
+    "measurement_noise_max": 0.004,  # rad; an encoder's step is 0.0031
     "width": 192,
     "inverse_steps": 6000,
-    "members": 3,
+    "members": 4,
 }
 
 

@@ -41,8 +41,8 @@ class Identify:
     records: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Records of the plant."""
     unknown: Unknowns = ()
-    """Parameters that are not known: a first guess of each, and limits if you know them, as in mu=1.5 or
-    mu=1.5:0.5:6."""
+    """Parameters that are not known: a first guess of each, and limits if you know them, as in mu=1.5 or mu=1.5:0.5:6.
+    Without limits a parameter stays between a tenth of the guess and ten times that."""
     parameters: Parameters = field(default_factory=dict)
     """Other parameters that differ from the system's defaults."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME-identified)")] = None

@@ -380,7 +380,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
 
 def _brought_back(shooting: Shooting, fit: Fit, given: np.ndarray) -> Fit:
     """What explains the records as well, with parameters as near to what was given as the system's bounds allow."""
-    values, hidden = np.array(list(fit.parameters.values())), _hidden(fit)
+    values, hidden = np.array(list(fit.parameters.values())), hidden_directions(fit.relative_information)
     if not hidden.size:
         return fit
     near = np.clip(nearest(values, given, hidden), shooting.low, shooting.high)
@@ -394,18 +394,6 @@ def _brought_back(shooting: Shooting, fit: Fit, given: np.ndarray) -> Fit:
     return fit
 
 
-def _size(fit: Fit) -> np.ndarray:
-    """Sizes (p,) of the parameters found."""
-    values = np.abs(list(fit.parameters.values()))
-    return np.where(values == 0, fit.unit, values)
-
-
-def _hidden(fit: Fit) -> np.ndarray:
-    """Directions (p, k) of relative changes that the outputs do not tell."""
-    relative = _size(fit) / fit.unit
-    return hidden_directions(fit.information * np.outer(relative, relative))
-
-
 def _judged(
     fit: Fit,
     system: System,
@@ -416,18 +404,18 @@ def _judged(
     expected_noise: np.ndarray,
 ) -> Identified:
     """What the fit says of each parameter."""
-    names, hidden = tuple(unknown), _hidden(fit)
-    values, size = np.array(list(fit.parameters.values())), _size(fit)
+    names, hidden = tuple(unknown), hidden_directions(fit.relative_information)
+    values = np.array(list(fit.parameters.values()))
     told = np.abs(hidden).max(1, initial=0.0) < TOLD
     seen = np.linalg.svd(hidden)[0][:, hidden.shape[1] :] if hidden.size else np.eye(len(names))
 
     def relative_error(exponents: np.ndarray) -> float:
         """Of a product of powers."""
-        direction = (exponents * fit.unit / size)[:, None]
-        return max(float(fit.errors(direction, seen * (size / fit.unit)[:, None])[0]), SIMULATED)
+        found = fit.errors((exponents / fit.size)[:, None], seen * fit.size[:, None])
+        return max(float(found[0]), SIMULATED)
 
     errors = {
-        name: float(size[i] * relative_error(np.eye(len(names))[i])) if told[i] else None
+        name: float(fit.unit[i] * fit.size[i] * relative_error(np.eye(len(names))[i])) if told[i] else None
         for i, name in enumerate(names)
     }
     products = []
@@ -441,7 +429,7 @@ def _judged(
         standard_errors=errors,
         products=products,
         at_limits=tuple(name for name, value in fit.parameters.items() if value in unknown[name] and errors[name]),
-        hanging_states=_hanging(fit, found, hidden * (size / fit.unit)[:, None]),
+        hanging_states=_hanging(fit, found, hidden * fit.size[:, None]),
         symmetries=sign_symmetries(
             found,
             [name for name in names if unknown[name][0] <= -found.parameters[name]],

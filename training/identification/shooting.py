@@ -7,7 +7,7 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.identification.identifiability import NOTHING, told_directions
+from training.identification.identifiability import PART, told_directions
 from training.trajectories.parameters import with_parameters
 
 STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
@@ -119,11 +119,23 @@ class Fit:
         return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
 
     @property
+    def size(self) -> np.ndarray:
+        """Sizes (p,) of the parameters found, over their units."""
+        values = np.abs(list(self.parameters.values())) / self.unit
+        return np.where(values == 0, 1.0, values)
+
+    @property
+    def relative_information(self) -> np.ndarray:
+        """The information (p, p) of relative changes of the parameters."""
+        return self.information * np.outer(self.size, self.size)
+
+    @property
     def standard_errors(self) -> np.ndarray:
         """Of the parameters, (p,); infinite where the outputs do not tell one."""
-        told = told_directions(self.information)
-        silent = 1.0 - (told**2).sum(1) > NOTHING
-        return np.where(silent, np.inf, self.unit * self.errors(np.eye(len(self.unit)), told))
+        told = told_directions(self.relative_information)
+        silent = 1.0 - (told**2).sum(1) > PART**2
+        errors = self.errors(np.eye(len(self.unit)), told * self.size[:, None])
+        return np.where(silent, np.inf, self.unit * errors)
 
     @property
     def coloured(self) -> bool:

@@ -43,8 +43,8 @@ def fit_windows(
     """Fit parameters and starts on windows of growing length.
 
     Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
-    explain most of them. Chaos and process noise set an end to their growth: no start explains them for long, and
-    standard errors grow that follow the scatter of windows.
+    explain most of them. Chaos and process noise set an end to their growth, which no start explains for long:
+    residuals are no longer white then, and standard errors that follow the scatter of windows fall no further.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def fit_windows(
             break
         starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
         fit = shoot(shooting, np.array(list(best.parameters.values())), windows(records, starts, length))
-        if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost:
+        if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
             break
         report(described(fit, length))
         told = told_directions(best.information)

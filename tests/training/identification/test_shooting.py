@@ -1,6 +1,6 @@
 """Windows of records: standard errors, and first guesses that explain nothing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -8,8 +8,11 @@ import pytest
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from training.identification import windows as fitting
 from training.identification.identify import _brought_back, nearest
 from training.identification.shooting import Shooting, UnexplainedError, Windows, shoot
+from training.identification.windows import fit_windows
+from training.records import Record
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,24 @@ class Decay(System):
 
     def h(self, x):
         return (self.gain * x[0],)
+
+
+@dataclass(frozen=True)
+class Swing(System):
+    """A mass on a spring."""
+
+    stiffness: float = 4.0
+
+    name: ClassVar[str] = "swing"
+    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
+    bounds: ClassVar = ((-9.0, 9.0), (-30.0, 30.0))
+    dt: ClassVar = 0.02
+
+    def f(self, x):
+        return x[1], -self.stiffness * x[0]
+
+    def h(self, x):
+        return (x[0],)
 
 
 def windows(system, n, steps, *, noise, process_noise, seed):
@@ -61,6 +82,36 @@ def test_standard_errors_cover_the_truth_under_process_noise(process_noise, colo
     assert 0.5 < np.std(off) < 1.6
     assert abs(np.mean(off)) < 1.0
     assert (np.mean(white) < 0.5) == coloured
+
+
+@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 160), (0.1, 40)])
+def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (20,))
+    rng, steps, n = np.random.default_rng(1), 160, 45
+    w = process_noise * rng.standard_normal((steps, n, 2))
+    x = simulate(Swing(), Swing().draw_starts(rng, n), steps, Swing.dt, w=w)
+    y = x[..., :1] + 0.02 * rng.standard_normal((steps + 1, n, 1))
+    records = [Record(str(i), Swing.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
+    shooting = Shooting(Swing(), Swing.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
+    fit = fit_windows(shooting, np.array([4.1]), records, lambda record, at: x[at, int(record.name)], first=0)
+    assert len(fit.windows.u) == length
+    assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
+
+
+def test_standard_errors_are_of_any_units():
+    """Outputs tell a parameter that came out far larger than its unit, and none of a second in sum with a third."""
+    _, fit = fitted(windows(Decay(), 5, 60, noise=0.01, process_noise=0.0, seed=0), rate_constant=1.1)
+    told = np.diag([1e4, 1e-4, 1.0, 1.0])
+    told[2, 3] = told[3, 2] = 1.0
+    found = replace(
+        fit,
+        parameters={"a": 1.0, "b": 1e5, "c": 1.0, "d": 1.0},
+        unit=np.ones(4),
+        information=told,
+        curvature=told,
+        white=told,
+    )
+    assert found.standard_errors == pytest.approx([0.01, 100.0, np.inf, np.inf])
 
 
 def test_few_windows_say_nothing_of_their_scatter():
