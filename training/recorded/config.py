@@ -9,7 +9,7 @@ from pydantic.dataclasses import dataclass
 
 from observers.checks import check_dt
 from training.config import STRICT, Activation, Count, Levels, NotNegative, Optimiser, Positive, Share
-from training.records import Record, sampling_interval
+from training.records import Record, median_step, sampling_interval
 from training.spectrum import evenly_spaced
 
 MODES = 12  # for each output
@@ -113,6 +113,11 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records)} | given
     check_dt(chosen["dt"])
+    if records[0].environment is not None and not np.isclose(chosen["dt"], median_step(*records), rtol=1e-6):
+        raise ValueError(
+            f"dt = {chosen['dt']:g} s: an observer for {records[0].environment['id']} takes a sample at each step, "
+            f"every {median_step(*records):g} s; leave dt out"
+        )
     if "eigenvalues" not in given and records[0].source:
         steps = float(np.median([len(record.t) for record in records]))
         slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * np.log(1e3) / steps), EPISODE_FASTEST / 4)

@@ -30,7 +30,7 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
     Raises
     ------
     ValueError
-        If there is none, columns differ, or a number of columns.
+        If there is none, columns differ, or a number of columns, or they are of different environments.
     """
     if not records:
         raise ValueError("there is no record")
@@ -41,6 +41,10 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
             if here != there:
                 told = [", ".join(names) or "none" for names in (here, there)]
                 raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
+        if record.environment != first.environment:
+            raise ValueError(
+                f"{record.name} is of {_of(record)}, but {first.name} of {_of(first)}: one observer serves one of them"
+            )
     if system is None:
         return
     counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
@@ -51,6 +55,11 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
                 f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; "
                 f"name others by --{role}"
             )
+
+
+def _of(record: Record) -> str:
+    found = record.environment
+    return "no environment that is known" if found is None else f"{found['id']} with arguments {found['kwargs']}"
 
 
 def check_between_records(records: Sequence[Record], warn: Warn) -> None:

@@ -1,3 +1,5 @@
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import training
 from kkl_gym import KKLObservation
 from observers import Artifact
 from training.recorded.config import recorded_config
-from training.records import Signals, resampled
+from training.records import Signals, check_signals, resampled
 from training.rollouts import make, policy_of, roll_out
 
 TINY = {"inverse_steps": 20, "members": 1, "width": 8, "samples": 5, "windows": 200, "batch": 64}
@@ -153,6 +155,17 @@ def test_modes_follow_steps_and_the_length_of_episodes(drift):
         assert config.dt == pytest.approx(dt)
         rates = -np.array(config.eigenvalues) * dt
         assert rates[[0, -1]] == pytest.approx([slowest, 4.0])
+
+
+def test_other_steps_and_other_environments_do_not_go_together(drift):
+    records = played(make(drift)).records()
+    with pytest.raises(
+        ValueError, match=r"dt = 0\.3 s: an observer for Drift-v0 takes a sample at each step, every 0\.1"
+    ):
+        recorded_config(records, {"dt": 0.3})
+    other = dataclasses.replace(records[0], environment={"id": "Drift-v0", "kwargs": {"text": False}})
+    with pytest.raises(ValueError, match=r"with arguments {'text': False}, but .* with arguments {}: one observer"):
+        check_signals([records[0], other])
 
 
 def test_learns_an_observer_that_fits_the_environment(tmp_path):
