@@ -192,8 +192,9 @@ class Reader:
         if key not in info:
             there = textwrap.shorten(", ".join(map(str, info)), 200, placeholder=" ...") or "nothing"
             raise ValueError(f"info of {self._source} has no {key!r}; there is {there}")
-        values = real_array(entry, info[key])
-        values = values.reshape(*batch, -1)
+        values = info[key]
+        flags = isinstance(values, bool | np.bool_) or getattr(values, "dtype", None) == np.bool_
+        values = (np.asarray(values, dtype=float) if flags else real_array(entry, values)).reshape(*batch, -1)
         if index is None and values.shape[-1] != 1:
             raise ValueError(f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, as in {entry}[0]")
         if (index or 0) >= values.shape[-1]:

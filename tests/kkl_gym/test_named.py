@@ -53,6 +53,11 @@ def test_reads_one_and_many_alike():
     assert reader.keys == ("speed",)
 
 
+def test_flags_in_info_are_numbers():
+    reader = Reader(PLAIN, ["info[closed]"], source="Env-v0")
+    assert [reader(np.zeros((2, 2)), {"closed": flag}).tolist() for flag in (True, np.False_)] == [[1.0], [0.0]]
+
+
 def test_images_beside_what_is_read_are_not_looked_at():
     reader = Reader(KEYED, names("gap", "arm[1]", space=KEYED), source="Env-v0")
     assert reader({"arm": np.array([0.1, 0.2]), "camera": None, "gap": np.array([4.0])}, {}).tolist() == [4.0, 0.2]

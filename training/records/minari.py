@@ -1,5 +1,6 @@
 """Minari data sets, the format in which rollouts of environments are exchanged. Nothing in one runs."""
 
+import json
 import os
 import secrets
 import shutil
@@ -186,10 +187,16 @@ def _at_the_end(episode: Episode, value: bool) -> list[bool]:
 
 def _found(name: str) -> "MinariDataset":
     import minari
+    from minari.storage.datasets_root_dir import get_dataset_path
 
-    if name.startswith(PREFIX):
-        return minari.load_dataset(name.removeprefix(PREFIX))
-    return minari.MinariDataset(next(part for part in (Path(name) / DATA, Path(name)) if (part / METADATA).is_file()))
+    folder = Path(get_dataset_path(name.removeprefix(PREFIX)) if name.startswith(PREFIX) else name)
+    data = next((part for part in (folder / DATA, folder) if (part / METADATA).is_file()), None)
+    if data is None:
+        raise ValueError(f"there is none in {folder}; `minari list local` says which there are")
+    said = json.loads((data / METADATA).read_text(encoding="utf-8"))
+    if not {"observation_space", "action_space"} <= said.keys():  # Minari would make the environment, whatever it runs
+        raise ValueError("it does not say its spaces")
+    return minari.MinariDataset(data)
 
 
 def _interval(name: str, spec: Any, kwargs: Mapping[str, Any], warn: Callable[[str], object]) -> float:

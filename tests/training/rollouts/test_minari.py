@@ -95,6 +95,12 @@ def test_what_is_no_data_set(datasets):
     (folder / "data" / "main_data.hdf5").write_bytes(b"nothing")
     with pytest.raises(ValueError, match="cannot be read as a Minari data set"):
         read_records([folder])
+    path = folder / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    del metadata["action_space"]
+    path.write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match="does not say its spaces"):  # nothing is made of what the file names
+        read_records([folder])
 
 
 @pytest.mark.parametrize(
