@@ -326,7 +326,10 @@ class Artifact:
         Versions of the libraries that made it.
     signals : mapping of str to sequence of str, optional
         Of an observer that was learned from recorded states: names of the columns "measured", y, "inputs", u, and
-        "hidden", x. There are no equations behind it, and it fits no environment.
+        "hidden", x. There are no equations behind it.
+    environment : mapping of str to object, optional
+        Of an observer that was learned from rollouts of an environment: its "id" and its arguments, "kwargs". It fits
+        that environment alone. Without it, an observer that was learned from recorded states fits none.
 
     Raises
     ------
@@ -352,6 +355,7 @@ class Artifact:
     training: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
     signals: Mapping[str, Sequence[str]] | None = None
+    environment: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.system, str):
@@ -397,6 +401,8 @@ class Artifact:
             )
         if self.signals is not None:
             self._check_signals(self.signals)
+        if self.environment is not None:
+            self._check_environment(self.environment)
         if self.limits is not None and (not self.knows_output or self.limits.mean.shape[1] != self.ny):
             raise ArtifactError(f"limits of {self.limits.mean.shape[1]} residuals need a C or h with as many outputs")
 
@@ -411,10 +417,10 @@ class Artifact:
         if self.signals is not None:
             names = {role: ", ".join(of) for role, of in self.signals.items()}
             given = " and ".join(of for of in (names["measured"], names["inputs"]) if of)
+            fits = "fits no environment" if self.environment is None else f"fits {self.environment['id']} alone"
             raise ArtifactError(
                 f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
-                f"{self.filter.dt:g} s. It has no equations, and fits no environment; observers.load(path) runs it on "
-                "samples"
+                f"{self.filter.dt:g} s. It has no equations, and {fits}; observers.load(path) runs it on samples"
             )
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
@@ -427,6 +433,13 @@ class Artifact:
                 raise ArtifactError(f"the signals {role} must be names, got {shown(names)}")
             if len(names) != count:
                 raise ArtifactError(f"the signals {role} must be {count}, got {shown(names)}")
+
+    def _check_environment(self, environment: Mapping[str, Any]) -> None:
+        of = isinstance(environment, Mapping) and set(environment) == {"id", "kwargs"}
+        if not of or not isinstance(environment["id"], str) or not isinstance(environment["kwargs"], Mapping):
+            raise ArtifactError(f"environment must be an id and kwargs, got {shown(environment)}")
+        if self.signals is None:
+            raise ArtifactError(f"an observer for the environment {environment['id']} must name its signals")
 
     def _check_ranges(self) -> None:
         """Raise an error unless there is a range about each uncertain parameter, and a state beside those estimated."""
@@ -621,6 +634,8 @@ class Artifact:
             described["measurement_noise"] = self.measurement_noise
         if self.signals is not None:
             described["signals"] = {role: list(names) for role, names in self.signals.items()}
+        if self.environment is not None:
+            described["environment"] = dict(self.environment)
         if self.parameter_ranges:
             described["system"]["ranges"] = {name: list(ends) for name, ends in self.parameter_ranges.items()}
         if self.estimated_parameters:
@@ -701,6 +716,7 @@ class Artifact:
             training=described["training"],
             versions=described["versions"],
             signals=described.get("signals"),
+            environment=described.get("environment"),
         )
 
 

@@ -38,6 +38,12 @@ def test_known_start(capsys):
     assert "reverse duffing" in capsys.readouterr().out
 
 
+def test_any_environment(capsys):
+    small = {"steps": 3000, "held_out": 500, "batches": 150}
+    assert example("any_environment")(**small)["exploring"] < 0.5
+    assert "the agent sees 3 numbers" in capsys.readouterr().out
+
+
 def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=500, trajectories=100, out=tmp_path) < 20.0
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from training.identification.learning import adapt, identify
     from training.pipeline import Result, train
     from training.presets import preset
+    from training.rollouts import learn
 
 __all__ = [
     "Certificate",
@@ -22,6 +23,7 @@ __all__ = [
     "certify",
     "errors",
     "identify",
+    "learn",
     "nrmse",
     "preset",
     "smape",
@@ -38,6 +40,7 @@ _MODULES = {
     "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
     "identify": "identification.learning",
+    "learn": "rollouts",
     "nrmse": "evaluation.metrics",
     "preset": "presets",
     "smape": "evaluation.metrics",

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
     "check": ("check", "Check"),
+    "record": ("record", "RecordCommand"),
     "train": ("train", "Train"),
     "identify": ("identify", "Identify"),
     "adapt": ("identify", "Adapt"),
@@ -52,6 +53,7 @@ EXTRAS = {
     "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
+    "envs": {"h5py", "minari"},
 }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
-from observers import Artifact, KKLObserver, shipped
+from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.artifact import resolve
 from observers.checks import choice, flag
 
@@ -103,8 +103,9 @@ class KKLEstimator:
     ----------
     plant : Plant
         What is observed.
-    observer : str or path or None
-        A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the plant's system.
+    observer : str or path or Artifact or None
+        A shipped name, a path if it ends in ``.safetensors``, or what is behind one; None takes the map shipped for the
+        plant's system.
     estimate : {"x", "z"}
         Whether the state estimate is shown, or the filter's state.
     measurement_noise : float, sequence of float or None
@@ -138,7 +139,7 @@ class KKLEstimator:
     def __init__(
         self,
         plant: Plant,
-        observer: str | os.PathLike[str] | None,
+        observer: str | os.PathLike[str] | Artifact | None,
         *,
         estimate: str,
         measurement_noise: float | Sequence[float] | None,
@@ -153,7 +154,7 @@ class KKLEstimator:
         system = plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
-        artifact = Artifact.read(resolve(system.name if observer is None else observer))
+        artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if known_start:
             artifact.require_forward()  # an error now, not at the first reset
@@ -296,18 +297,41 @@ def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:
     """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
 
-    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
-    constant output would have led, so that its start lies within as well. A known start may lie outside for a while,
-    where the motion that led to it did; what is shown is then clipped.
+    A known start may lie outside for a while, where the motion that led to it did; what is shown is then clipped.
     """
     linear = observer.artifact.filter
     y_max = np.maximum(np.abs(plant.output_space.low), np.abs(plant.output_space.high)).astype(float)
+    bound = reach(linear, y_max, np.array(plant.system.u_max[: linear.nu])).astype(np.float32)
+    return gym.spaces.Box(-bound, bound, dtype=np.float32)
+
+
+def reach(linear: LinearFilter, y_max: np.ndarray, u_max: np.ndarray) -> np.ndarray:
+    """Largest sizes that the state of a filter can have.
+
+    Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
+    constant output would have led, so that its start lies within as well.
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    y_max : ndarray, shape (ny,)
+        Largest sizes of the outputs, which may be infinite.
+    u_max : ndarray, shape (nu,)
+        Those of the inputs, likewise.
+
+    Returns
+    -------
+    ndarray, shape (size,)
+        Infinite where a signal's size is that acts there.
+    """
     driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
-    limits = np.concatenate([y_max, y_max, plant.system.u_max[: linear.nu]])
+    limits = np.concatenate([y_max, y_max, u_max])
+    endless = (driven[:, np.isinf(limits)] != 0).any(1)
+    limits = np.where(np.isinf(limits), 0.0, limits)
     forgetting = np.abs(np.linalg.eigvals(linear.transition)).max()
     bound = np.zeros(linear.size)
     for _ in range(int(np.ceil(np.log(1e-4) / np.log(forgetting)))):
         bound += np.abs(driven) @ limits
         driven = linear.transition @ driven
-    bound = (1.001 * bound).astype(np.float32)  # for the tail of the sum
-    return gym.spaces.Box(-bound, bound, dtype=np.float32)
+    return np.where(endless, np.inf, 1.001 * bound)  # for the tail of the sum

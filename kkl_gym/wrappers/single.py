@@ -10,26 +10,58 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from kkl_gym.envs import KKLEnv
+from kkl_gym.identity import how_to_make_one, source_of
 from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, observation
+from kkl_gym.wrappers.named import NamedEstimator, Samples
+from observers import Artifact
+from observers.artifact import resolve
 from observers.checks import integer, shown
+
+
+class _SystemSamples:
+    """What an observer sees of environments of systems: ``info`` says it, and numbers the samples."""
+
+    count = 0  # of the sample that the observer has seen last
+
+    def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Output and state after a reset."""
+        self.count = int(info["sample"])
+        return info["y"], info["x"]
+
+    def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Output after a step, and the input that led to it; ValueError if a sample was skipped."""
+        sample = int(info["sample"])
+        if sample != self.count + 1:
+            raise ValueError(
+                f"the observer was to see sample {self.count + 1} and was shown sample {sample}: put "
+                "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
+                "reset after an error"
+            )
+        return info["y"], info["u"]
 
 
 class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):
     """Shows a learned observer's estimate in place of the state.
 
-    The observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment applied. ``info`` gains
-    ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64 and not clipped. With
-    ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit the estimates (a
-    faulty sensor, states that the map was not made for).
+    Around an environment of ours the observer sees only ``info["y"]`` and the input ``info["u"]`` that the environment
+    applied. ``info`` gains ``z``, the filter's state, and with ``estimate="x"`` ``x_hat``, shape (nx,), both float64
+    and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
+    the estimates (a faulty sensor, states that the map was not made for).
 
     With ``estimate="z"`` the network is not evaluated, unless there is a monitor. There is then no ``x_hat``, and
     :meth:`render` shows no estimate.
 
+    Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
+    ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
+    observation is then [y, x_hat] or [y, z]: what is measured, and beside it what is estimated. ``info`` gains ``y``
+    as well.
+
     Parameters
     ----------
     env : gymnasium.Env
-        A :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone.
+        A :class:`KKLEnv`, bare or under wrappers that leave ``info`` alone; or the environment that the observer's file
+        names, under wrappers that leave its measured signals, its actions and its steps alone.
     observer : str or path, optional
         A shipped name, or a path if it ends in ``.safetensors``; None takes the map shipped for the environment's
         system.
@@ -37,8 +69,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         "x" shows the state estimate, clipped to the system's declared bounds. "z" shows the filter's state [z_y, z_u],
         within the bounds that bounded outputs and inputs imply.
     measurement_noise : float or sequence of float, length ny, optional
-        The noise level that the observer assumes, of all outputs or each; None takes the environment's. (Process noise
-        is always taken from the environment, by maps that ask for it.)
+        The noise level that the observer assumes, of all outputs or each; None takes the environment's, or none where
+        it is not ours. (Process noise is always taken from the environment, by maps that ask for it.)
     ignore_input : bool
         Whether to use a map that knows no inputs (the paper's) although the agent acts.
     monitor : bool
@@ -57,9 +89,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Raises
     ------
     ValueError
-        If the environment is not one of ours, ``estimate`` is unknown, a flag is no bool, no map ships for the system,
-        or the noise level is beyond the map's range. At a step, if the agent acts on a map that knows no inputs and
-        ``ignore_input`` is false, or a wrapper inside hides samples from the observer.
+        If the environment is not one of ours and the observer not from its rollouts, ``estimate`` is unknown, a flag is
+        no bool, no map ships for the system, or the noise level is beyond the map's range. At a step, if the agent acts
+        on a map that knows no inputs and ``ignore_input`` is false, or a wrapper inside hides samples from the
+        observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
         forward map and ``known_start`` is asked for. It is a ValueError.
@@ -89,18 +122,41 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         monitor: bool = False,
         known_start: bool = False,
     ) -> None:
-        base = env.unwrapped if isinstance(env, gym.Env) else env
-        if not isinstance(base, KKLEnv):
-            raise ValueError(f"KKLObservation needs a kkl_gym environment, got {shown(base)}")
-        estimator = KKLEstimator(
-            base.plant,
-            observer,
-            estimate=estimate,
-            measurement_noise=measurement_noise,
-            ignore_input=ignore_input,
-            monitor=monitor,
-            known_start=known_start,
-        )
+        if not isinstance(env, gym.Env):
+            raise ValueError(
+                f"KKLObservation needs a gymnasium.Env (for vectors: KKLVectorObservation), got {shown(env)}"
+            )
+        base, artifact = env.unwrapped, None if observer is None else Artifact.read(resolve(observer))
+        estimator: KKLEstimator
+        samples: Samples | _SystemSamples
+        if artifact is not None and artifact.environment is not None:
+            estimator = NamedEstimator(
+                env,
+                env.observation_space,
+                env.action_space,
+                artifact=artifact,
+                estimate=estimate,
+                measurement_noise=measurement_noise,
+                monitor=monitor,
+                known_start=known_start,
+            )
+            samples = estimator.samples
+        elif isinstance(base, KKLEnv):
+            estimator = KKLEstimator(
+                base.plant,
+                artifact,
+                estimate=estimate,
+                measurement_noise=measurement_noise,
+                ignore_input=ignore_input,
+                monitor=monitor,
+                known_start=known_start,
+            )
+            samples = _SystemSamples()
+        else:
+            raise ValueError(
+                f"KKLObservation needs a kkl_gym environment, or an observer from rollouts of {source_of(env)}: "
+                f"{how_to_make_one(source_of(env))}"
+            )
         # As the specification can write them down, once they are known to be what they should.
         RecordConstructorArgs.__init__(
             self,
@@ -112,7 +168,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             known_start=bool(known_start),
         )
         gym.Wrapper.__init__(self, env)
-        self._estimator = estimator
+        self._estimator, self._samples = estimator, samples
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
@@ -137,10 +193,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         info : dict
             The environment's, with what the observer adds.
         """
-        _, info = self.env.reset(seed=seed, options=options)
-        self._sample = int(info["sample"])
+        obs, info = self.env.reset(seed=seed, options=options)
         self._trail.clear()
-        self._estimator.reset(info["y"], info["x"])
+        self._estimator.reset(*self._samples.first(obs, info))
         return self._show(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -167,28 +222,21 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ValueError
             As described above.
         """
-        _, reward, terminated, truncated, info = self.env.step(action)
-        sample = int(info["sample"])
-        if sample != self._sample + 1:
-            raise ValueError(
-                f"the observer was to see sample {self._sample + 1} and was shown sample {sample}: put "
-                "wrappers that skip steps or reset by themselves, such as ActionRepeat, outside KKLObservation, and "
-                "reset after an error"
-            )
-        self._estimator.advance(info["y"], info["u"])
-        self._sample = sample
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        self._estimator.advance(*self._samples.next(obs, info, action))
+        self._samples.count += 1
         return self._show(info), float(reward), terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Draw the phase portrait with states and estimates so far.
+        """Draw the phase portrait with states and estimates so far; other environments draw what they draw.
 
         Returns
         -------
         ndarray of uint8, shape (height, width, 3), or None
             An RGB image; None without ``render_mode``.
         """
-        base: KKLEnv = self.unwrapped  # type: ignore[assignment]
-        return base.draw(self._trail)
+        base = self.unwrapped
+        return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
 
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()

@@ -9,10 +9,14 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from kkl_gym.identity import how_to_make_one
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import Trails
 from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episodes, with_mask
 from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
+from kkl_gym.wrappers.named import NamedEstimator, Samples
+from observers import Artifact
+from observers.artifact import resolve
 from observers.checks import integer, shown
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
@@ -81,9 +85,9 @@ class VectorEstimate(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         if mask.all():
-            self._estimator.reset(info["y"], info["x"])
+            self._estimator.reset(info["y"], _states(info, mask))
         else:
-            self._estimator.restart(info["y"][mask], mask, info["x"][mask])
+            self._estimator.restart(info["y"][mask], mask, _states(info, mask))
         self._ended = self._ended & ~mask
         self._sample = np.where(mask, info["sample"], self._sample)
         obs = self._show(info, mask)
@@ -132,7 +136,7 @@ class VectorEstimate(VectorWrapper):
         else:
             self._estimator.advance(y, u)
             if over:
-                self._estimator.restart(y[before], before, info["x"][before])
+                self._estimator.restart(y[before], before, _states(info, before))
         self._sample = expected
         obs = self._show(info, np.ones_like(ended))
         self._trace(info)
@@ -145,10 +149,11 @@ class VectorEstimate(VectorWrapper):
         self._check(expected, np.where(ended, final["sample"], info["sample"]), np.zeros_like(ended))
         y, u = (np.where(ended[:, None], final[key], info[key]) for key in ("y", "u"))
         self._estimator.advance(y, u)
+        y0 = info["y"][ended]  # what is shown next may report y itself
         shown = self._show(info, np.ones_like(ended))
         for row in np.flatnonzero(ended):
             info["final_obs"][row] = shown[row].copy()
-        self._estimator.restart(info["y"][ended], ended, info["x"][ended])
+        self._estimator.restart(y0, ended, _states(info, ended))
         self._sample = np.where(ended, 0, expected)
         first = self._estimator.report(ended)
         for key, values in first.items():
@@ -195,17 +200,68 @@ class VectorEstimate(VectorWrapper):
         return observation(self._estimator.shown(report), self.single_observation_space)
 
 
+class _Telling(VectorWrapper):
+    """Lets any vector environment say of its signals what ours say in ``info``: y, u, and the number of the sample."""
+
+    def __init__(self, env: VectorEnv, samples: Samples) -> None:
+        super().__init__(env)
+        self._mode, self._read, n = autoreset_mode_in(env), samples, env.num_envs
+        if samples.outputs.keys:
+            raise ValueError(
+                f"the observer measures info[{samples.outputs.keys[0]}], which vectors do not say at each step: put "
+                "KKLObservation into each environment"
+            )
+        self._ended, self._count = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, Infos]:
+        options, mask = with_mask(options, self.num_envs)
+        obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
+        return obs, info | {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
+
+    def step(self, actions: Any) -> Step:
+        batch = (self.num_envs,)
+        u = self._read.inputs(actions, batch)
+        obs, reward, terminated, truncated, info = self.env.step(actions)
+        y, before, ended = self._read.outputs(obs, info, batch), self._ended, terminated | truncated
+        count = self._count + 1
+        if self._mode is AutoresetMode.SAME_STEP:
+            if ended.any():
+                last, final = y.copy(), np.full(self.num_envs, None, dtype=object)
+                for row in np.flatnonzero(ended):
+                    final[row] = info["final_obs"][row]
+                    last[row] = self._read.outputs(final[row], {})
+                told = {"y": last, "u": u, "sample": count}
+                info = info | {"final_obs": final, "final_info": {**info.get("final_info", {}), **told}}
+            self._count = np.where(ended, 0, count)
+        else:
+            waits = self._count if self._mode is AutoresetMode.DISABLED else 0
+            self._ended, self._count = ended, np.where(before, waits, count)
+        return obs, reward, terminated, truncated, info | {"y": y, "u": u, "sample": self._count.copy()}
+
+
+def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
+    """True states in some rows, as far as ``info`` says them."""
+    return info["x"][rows] if "x" in info else np.full((int(rows.sum()), 0), np.nan)
+
+
 class KKLVectorObservation(VectorEstimate):
     """:class:`kkl_gym.KKLObservation` for vector environments: one batched observer, reset row by row.
 
     Works on the package's vector environments and on Gymnasium's Sync and Async ones over the package's environments,
-    in every autoreset mode. ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a
-    row for each environment; so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
+    in every autoreset mode. Around vectors of another environment it needs an observer from rollouts of that, and shows
+    what is measured beside the estimates, as :class:`kkl_gym.KKLObservation` does.
+
+    ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a row for each environment;
+    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
 
     Parameters
     ----------
     env : gymnasium.vector.VectorEnv
-        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
+        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone, or over the
+        environment that the observer's file names.
     observer : str or path, optional
         As for :class:`kkl_gym.KKLObservation`.
     estimate : {"x", "z"}
@@ -257,17 +313,32 @@ class KKLVectorObservation(VectorEstimate):
         monitor: bool = False,
         known_start: bool = False,
     ) -> None:
-        estimator = KKLEstimator(
-            plant_of(env),
-            observer,
-            estimate=estimate,
-            measurement_noise=measurement_noise,
-            ignore_input=ignore_input,
-            monitor=monitor,
-            known_start=known_start,
-        )
-        if estimator.observer.artifact.process_noise_max is not None:
-            plant_of(env, "process_noise")
+        artifact = None if observer is None else Artifact.read(resolve(observer))
+        estimator: KKLEstimator
+        if artifact is not None and artifact.environment is not None and isinstance(env, gym.vector.VectorEnv):
+            estimator = NamedEstimator(
+                env,
+                env.single_observation_space,
+                env.single_action_space,
+                artifact=artifact,
+                estimate=estimate,
+                measurement_noise=measurement_noise,
+                monitor=monitor,
+                known_start=known_start,
+            )
+            env = _Telling(env, estimator.samples)
+        else:
+            estimator = KKLEstimator(
+                plant_of(env),
+                artifact,
+                estimate=estimate,
+                measurement_noise=measurement_noise,
+                ignore_input=ignore_input,
+                monitor=monitor,
+                known_start=known_start,
+            )
+            if estimator.observer.artifact.process_noise_max is not None:
+                plant_of(env, "process_noise")
         super().__init__(env, estimator)
         self.observer = estimator.observer
         self.estimate = estimate
@@ -456,7 +527,11 @@ def plant_of(env: VectorEnv, *also: str) -> Plant:
     try:
         plants: tuple[Plant, ...] = base.get_attr("plant")
     except AttributeError:
-        raise ValueError(f"KKLVectorObservation needs a vector of kkl_gym environments, got {shown(base)}") from None
+        raise ValueError(
+            "KKLVectorObservation needs a vector of kkl_gym environments, or an observer from rollouts, got "
+            f"{shown(base)}; "
+            f"{how_to_make_one('ENV_ID')} (KKLVectorMemory here)"
+        ) from None
     first = plants[0]
     for plant in plants:
         for name in ("system", "dt", "measurement_noise", *also):

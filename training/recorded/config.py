@@ -9,13 +9,17 @@ from pydantic.dataclasses import dataclass
 
 from observers.checks import check_dt
 from training.config import STRICT, Activation, Count, Levels, NotNegative, Optimiser, Positive, Share
-from training.records import Record, sampling_interval
+from training.records import Record, median_step, sampling_interval
 from training.spectrum import evenly_spaced
 
 MODES = 12  # for each output
 SLOWEST, FASTEST = 0.15, 10.0  # eigenvalues, in multiples of the rate of the signals
 MEMORIES = 3.0  # of the filter in a record at least, unless its slowest mode were faster than the signals
 FASTEST_MODE = 0.5  # bound of |eigenvalue| * dt
+# Of rollouts, whose hidden signals an agent wants within steps: how many modes, the slowest and the fastest per step.
+# Few modes that are far apart forget the start soon, and tell single steps from each other.
+EPISODE_MODES, EPISODE_SLOWEST, EPISODE_FASTEST = 6, 0.2, 4.0
+EPISODE_MEMORIES = 1.5  # of the filter in an episode at least
 NOISE_SHARE = 0.1  # of an output's standard deviation: the largest noise beside that of the records
 
 
@@ -86,8 +90,8 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     """Choose what the records decide: dt, the eigenvalues of A, and the largest noise.
 
     dt is the median step, rounded where steps are uneven. The eigenvalues follow from the rate of the signals,
-    :func:`signal_rate`, and from the length of the records. The largest noise is a tenth of the standard deviation of
-    each output.
+    :func:`signal_rate`, and from the length of the records; those of rollouts from dt and the length of episodes. The
+    largest noise is a tenth of the standard deviation of each output.
 
     Parameters
     ----------
@@ -109,7 +113,17 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records)} | given
     check_dt(chosen["dt"])
-    if "eigenvalues" not in given:
+    if records[0].environment is not None and not np.isclose(chosen["dt"], median_step(*records), rtol=1e-6):
+        raise ValueError(
+            f"dt = {chosen['dt']:g} s: an observer for {records[0].environment['id']} takes a sample at each step, "
+            f"every {median_step(*records):g} s; leave dt out"
+        )
+    if "eigenvalues" not in given and records[0].source:
+        steps = float(np.median([len(record.t) for record in records]))
+        slowest = min(max(EPISODE_SLOWEST, EPISODE_MEMORIES * np.log(1e3) / steps), EPISODE_FASTEST / 4)
+        spaced = evenly_spaced(EPISODE_MODES, -slowest / chosen["dt"], -EPISODE_FASTEST / chosen["dt"])
+        chosen["eigenvalues"] = tuple(float(f"{value:.6g}") for value in spaced)
+    elif "eigenvalues" not in given:
         rate = signal_rate(records)
         length = np.median([record.duration for record in records])
         slowest = min(max(SLOWEST * rate, MEMORIES * np.log(1e3) / length), rate)

@@ -131,7 +131,7 @@ def train_recorded(
             training={
                 "pipeline": "recorded",
                 **dataclasses.asdict(config),
-                "records": {Path(record.name).name: each for record, each in zip(records, identity["records"])},
+                "records": _fingerprints(records),
                 "seconds": round(time.monotonic() - began),
                 "device": device.type,
                 "threads": torch.get_num_threads(),
@@ -148,12 +148,24 @@ def train_recorded(
                 "inputs": signals.inputs if config.inputs else (),
                 "hidden": signals.hidden,
             },
+            environment=records[0].environment,
         )
         found = recorded_errors(artifact, held_out)
     known = {signal: error for signal, error in found.relative.items() if math.isfinite(error)}  # as JSON can hold it
     training = {**artifact.training, "held_out_errors": known, "held_out_after": found.after}
     artifact = dataclasses.replace(artifact, training=training)
     return Recorded(artifact, run.losses, held_out, found)
+
+
+def _fingerprints(records: Sequence[Record]) -> dict[str, str]:
+    """What identifies each file, or all episodes of a data set together, by its name."""
+    found = dict[str, list[str]]()
+    for record in records:
+        found.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
+    return {
+        name: each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()[:16]
+        for name, each in found.items()
+    }
 
 
 def _sampler(

@@ -10,6 +10,7 @@ from training.records.resampling import LONGEST_GAP, median_step
 
 Warn = Callable[[str], object]
 
+MANY = 5  # records of which the same is to be said
 OTHER_UNITS = 100.0  # times what is expected: no motion does that, but a unit a thousand times smaller
 OTHER_SPREAD = 300.0  # times that of other records of the same signal
 OTHER_CLOCK = 30.0  # times the sampling interval of other records
@@ -29,7 +30,7 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
     Raises
     ------
     ValueError
-        If there is none, columns differ, or a number of columns.
+        If there is none, columns differ, or a number of columns, or they are of different environments.
     """
     if not records:
         raise ValueError("there is no record")
@@ -40,6 +41,10 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
             if here != there:
                 told = [", ".join(names) or "none" for names in (here, there)]
                 raise ValueError(f"{record.name}: {role} are columns {told[0]}, but {told[1]} in {first.name}")
+        if record.environment != first.environment:
+            raise ValueError(
+                f"{record.name} is of {_of(record)}, but {first.name} of {_of(first)}: one observer serves one of them"
+            )
     if system is None:
         return
     counts = {"measured": system.ny, "inputs": system.nu, "hidden": system.nx}
@@ -50,6 +55,11 @@ def check_signals(records: Sequence[Record], system: System | None = None) -> No
                 f"{first.name}: {system.name} has {count} {role}, but the columns are {', '.join(found) or 'none'}; "
                 f"name others by --{role}"
             )
+
+
+def _of(record: Record) -> str:
+    found = record.environment
+    return "no environment that is known" if found is None else f"{found['id']} with arguments {found['kwargs']}"
 
 
 def check_between_records(records: Sequence[Record], warn: Warn) -> None:
@@ -117,17 +127,28 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
                     f"{records[0].name}: column {column}: {value:g} in all rows, and no other file says more; there is "
                     "nothing to learn from what never moves"
                 )
+            still, wrapped = list[str](), list[str]()
             for record in records:
                 values = getattr(record, letter)[:, j]
                 if not _spread(record, letter, j):
-                    warn(f"{record.name}: column {column} never moves")
+                    still.append(f"{record.name}: column {column} never moves")
                 jumps = abs(np.diff(values))
                 turns = np.flatnonzero((jumps > WHOLE_TURN) & (jumps < 2 * np.pi + 0.1))
                 if len(turns) and np.nanmax(values) - np.nanmin(values) < 2 * np.pi + 0.1:
-                    warn(
+                    wrapped.append(
                         f"{record.name}: column {column}, row {turns[0] + 2}: a jump by a whole turn, as of an angle "
                         f"that is wrapped; take cos({column}) and sin({column}), or unwrap it"
                     )
+            _warn_of(still, warn)
+            _warn_of(wrapped, warn)
+
+
+def _warn_of(found: Sequence[str], warn: Warn) -> None:
+    """Tell what was found in several records; of many, as episodes are, the first alone."""
+    if len(found) > MANY:
+        found = [f"{found[0]} (and {len(found) - 1} more like that)"]
+    for text in found:
+        warn(text)
 
 
 def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
@@ -201,8 +222,7 @@ def check_memory(records: Sequence[Record], seconds: float, warn: Warn) -> None:
     ]
     if len(short) == len(records):
         raise ValueError(f"{told[0]}, and no other is longer; record longer runs, or take faster eigenvalues")
-    for text in told:
-        warn(text)
+    _warn_of(told, warn)
 
 
 def check_dt(records: Sequence[Record], dt: float) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from kkl_gym.system import System
 from training.records.checks import check_against_system, check_between_records, check_motion, check_signals
 from training.records.files import read_columns
+from training.records.minari import is_dataset, read_dataset
 from training.records.record import Record, refuse_infinite
 from training.records.signals import Signals, column_of, values_of
 
@@ -20,14 +21,16 @@ def read_records(
     system: System | None = None,
     warn: Callable[[str], object] | None = None,
 ) -> list[Record]:
-    """Read records, one from each file, and check them.
+    """Read records, one from each file or episode, and check them.
 
     Parameters
     ----------
     files : iterable of str or Path
-        NPZ, CSV or Parquet files, see :func:`training.records.files.read_columns`.
+        NPZ, CSV or Parquet files, see :func:`training.records.files.read_columns`; Minari data sets of rollouts,
+        ``minari:ID`` or their folders.
     signals : Signals, optional
-        Which columns are what; by default they are found by their names.
+        Which columns are what; by default they are found by their names. Of rollouts they are entries of observations,
+        see :func:`kkl_gym.named.resolved`.
     system : System, optional
         What was recorded: numbers of outputs, inputs and states have to fit it, and so do their sizes.
     warn : callable, optional
@@ -46,18 +49,24 @@ def read_records(
     OSError
         If a file cannot be read.
     ModuleNotFoundError
-        For a Parquet file without pyarrow, which the extra ``parquet`` brings.
+        For a Parquet file without pyarrow, which the extra ``parquet`` brings, or a Minari data set without the extra
+        ``envs``.
     """
     paths = [Path(path) for path in files]
     if not paths:
-        raise ValueError("name a file of recorded data: .npz, .csv or .parquet (--data)")
+        raise ValueError("name a file of recorded data, .npz, .csv or .parquet, or a data set, minari:ID (--data)")
     twice = sorted({str(path) for path in paths if paths.count(path) > 1})
     if twice:
         raise ValueError(f"{', '.join(twice)}: named twice, which would count each sample twice")
-    records = [_read(path, signals or Signals()) for path in paths]
     told = warn or (lambda text: warnings.warn(text, stacklevel=4))
+    records = list[Record]()
+    for path in paths:
+        records += (
+            read_dataset(path, told).records(signals) if is_dataset(path) else [_read(path, signals or Signals())]
+        )
     check_signals(records, system)
-    check_between_records(records, told)
+    if len(paths) > 1:  # episodes of one environment are in the same units
+        check_between_records(records, told)
     check_motion(records, told)
     if system is not None:
         check_against_system(records, system, told)

@@ -1,6 +1,7 @@
 """A record: samples of a plant's outputs, and of its inputs and states where they were recorded."""
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NoReturn
 
@@ -31,6 +32,10 @@ class Record:
         States, NaN where one is missing.
     signals : Signals, optional
         Names of the columns; by default y1, y2, ..., u1, ..., x1, ....
+    source : str, default ""
+        The data set of which this is an episode; empty where the record is a file of its own.
+    environment : mapping of str to object, optional
+        Id and arguments of the environment of which this is an episode.
 
     Raises
     ------
@@ -46,6 +51,8 @@ class Record:
     u: np.ndarray | None = None
     x: np.ndarray | None = None
     signals: Signals = field(default_factory=Signals)
+    source: str = ""
+    environment: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
         for letter in "tyux":

@@ -1,0 +1,122 @@
+"""An observer for an environment of others: its rollouts, what is hidden in them, and the observer around it.
+
+The policies are simple ones. An agent of yours does as well: ``kkl-gym record ENV_ID --policy ppo:agent.zip``.
+"""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import tyro
+
+import training
+from kkl_gym import KKLObservation
+from training.recorded.errors import recorded_errors
+from training.rollouts import make, roll_out
+
+AFTER = 20  # steps, of which errors are left out
+GAINS = np.array([0.09, 1.01, 4.53, 0.18, 0.62, 0.68])  # a linear-quadratic regulator of the double pendulum
+
+
+def swing_up(obs: np.ndarray) -> np.ndarray:
+    """Pumps energy into Pendulum-v1, and balances it at the top."""
+    cos, sin, rate = obs
+    if cos > 0.9 and abs(rate) < 3:
+        torque = -10 * np.arctan2(sin, cos) - 2 * rate
+    else:
+        torque = -2 * np.sign((rate**2 / 6 + 5 * (cos - 1)) * rate) if rate else 2.0
+    return np.float32([np.clip(torque, -2, 2)])
+
+
+def balance(obs: np.ndarray) -> int:
+    """Balances CartPole-v1."""
+    return int(obs @ [0.1, 0.25, 3.0, 0.6] > 0)
+
+
+def climb(obs: np.ndarray) -> np.ndarray:
+    """Pushes MountainCarContinuous-v0 the way that it goes."""
+    return np.float32([1.0 if obs[1] >= 0 else -1.0])
+
+
+def balance_both(obs: np.ndarray) -> np.ndarray:
+    """Balances InvertedDoublePendulum-v5."""
+    angles = np.arctan2(obs[1:3], obs[3:5])
+    return np.float32([np.clip(-GAINS @ [obs[0], *angles, *obs[5:8]], -1, 1)])
+
+
+# What is measured, what is hidden, and who acts.
+CASES: dict[str, tuple[list[int], list[int], Callable]] = {
+    "Pendulum-v1": ([0, 1], [2], swing_up),
+    "CartPole-v1": ([0, 2], [1, 3], balance),
+    "MountainCarContinuous-v0": ([0], [1], climb),
+    "InvertedDoublePendulum-v5": ([0, 1, 2, 3, 4], [5, 6, 7], balance_both),
+}
+
+
+def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
+    """A policy of which now none, now a part and now all actions are random, for a hundred steps each."""
+    rng, calls = np.random.default_rng(seed), 0
+    env.action_space.seed(seed)
+    share = 0.0
+
+    def act(obs: np.ndarray) -> object:
+        nonlocal calls, share
+        if calls % 100 == 0:
+            share = rng.choice([0.0, 0.3, 1.0], p=[0.4, 0.4, 0.2])
+        calls += 1
+        return env.action_space.sample() if rng.random() < share else policy(obs)
+
+    return act
+
+
+def main(
+    env_id: str = "Pendulum-v1",
+    steps: int = 40_000,
+    held_out: int = 6_000,
+    batches: int = 2_000,
+    members: int = 1,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Learn an observer for an environment; returns errors of held-out rollouts.
+
+    Args:
+        env_id: one of Pendulum-v1, CartPole-v1, MountainCarContinuous-v0 and, with MuJoCo, InvertedDoublePendulum-v5.
+        steps: that are played for the training.
+        held_out: steps of other episodes, in which the policy does not explore.
+        batches: of the training, for each network.
+        members: networks that are trained and averaged.
+        seed: of everything random.
+    """
+    measured, hidden, policy = CASES[env_id]
+    with tempfile.TemporaryDirectory() as folder:
+        artifact = training.learn(
+            env_id,
+            measured=measured,
+            hidden=hidden,
+            policy=exploring(policy, make(env_id), seed),
+            steps=steps,
+            seed=seed,
+            out=folder,
+            inverse_steps=batches,
+            members=members,
+        )
+        env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
+    obs, _ = env.reset(seed=seed)
+    print(f"{env_id}: the agent sees {obs.size} numbers, what is measured and {len(hidden)} estimates")
+    unseen = make(env_id)
+    names = {"measured": list(map(str, measured)), "hidden": list(map(str, hidden))}
+    found = {}
+    for label, acting in (("exploring", exploring(policy, unseen, seed + 1)), ("not exploring", policy)):
+        rollouts = roll_out(unseen, acting, steps=held_out, seed=seed + 10_000, **names)
+        records = [record for record in rollouts.records() if len(record.t) > AFTER + 1]
+        errors = recorded_errors(artifact, records, AFTER * artifact.filter.dt)
+        shown = ", ".join(f"{name} {error:.2%}" for name, error in errors.relative.items())
+        print(f"held-out rollouts, {label}: rms error over standard deviation, after {AFTER} steps: {shown}")
+        found[label] = max(errors.relative.values())
+    return found
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,120 @@
+"""What identifies an environment: its id, its arguments and its sampling interval."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from observers import Artifact, ArtifactError
+from observers.checks import is_finite, shown
+
+# Arguments that change nothing of the plant; vector environments add the last three.
+APPEARANCE = ("render_mode", "max_episode_steps", "num_envs", "vectorization_mode")
+Env = gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
+
+
+def source_of(env: Any) -> str:
+    """What messages call an environment: its id, or its class."""
+    return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+
+
+def identity(env: Env) -> dict[str, Any]:
+    """Id and arguments of an environment.
+
+    Parameters
+    ----------
+    env : gymnasium.Env or gymnasium.vector.VectorEnv
+        Made by ``gym.make`` or ``gym.make_vec``, or a vector of such.
+
+    Returns
+    -------
+    dict of str to object
+        ``id``, and ``kwargs`` as JSON holds them, without those that change nothing but what is drawn.
+
+    Raises
+    ------
+    ValueError
+        If it has no specification, or an argument that JSON cannot hold, or the environments of a vector differ.
+    """
+    base: Any = env.unwrapped
+    specs = base.get_attr("spec") if _of_rows(base) else [env.spec]
+    found = [_identity(spec, env) for spec in specs]
+    for other in found[1:]:
+        if other != found[0]:
+            raise ValueError(f"the environments differ, {found[0]} and {other}: one observer cannot serve all")
+    return found[0]
+
+
+def _identity(spec: Any, env: Env) -> dict[str, Any]:
+    if spec is None:
+        raise ValueError(
+            f"{shown(env)} has no specification, which is what identifies an environment: register it, and make it by "
+            "gym.make(ID)"
+        )
+    kwargs = {name: value for name, value in spec.kwargs.items() if name not in APPEARANCE}
+    try:
+        return {"id": spec.id, "kwargs": json.loads(json.dumps(kwargs))}
+    except TypeError as error:
+        raise ValueError(
+            f"the arguments of {spec.id} identify it, but a file cannot hold them ({error}): {shown(kwargs)}"
+        ) from None
+
+
+def sampling_interval(env: Env) -> float:
+    """Seconds between the samples of an environment, by its attribute ``dt``; 1 where it has none."""
+    base: Any = env.unwrapped
+    if _of_rows(base):
+        dt = base.get_attr("dt")[0] if all(base.call("has_wrapper_attr", "dt")) else None
+    else:
+        dt = getattr(base, "dt", None)
+    return float(dt) if dt is not None and is_finite(dt) and dt > 0 else 1.0
+
+
+def _of_rows(base: Any) -> bool:
+    """Whether it is a vector of environments, which can be asked one by one."""
+    return isinstance(base, gym.vector.SyncVectorEnv | gym.vector.AsyncVectorEnv)
+
+
+def check_identity(artifact: Artifact, env: Env) -> None:
+    """See that an observer was made for an environment.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        An observer from rollouts of an environment.
+    env : gymnasium.Env or gymnasium.vector.VectorEnv
+        The environment.
+
+    Raises
+    ------
+    ArtifactError
+        If id, arguments or sampling interval differ; the message names both values.
+    ValueError
+        As :func:`identity`.
+    """
+    made: Mapping[str, Any] = artifact.environment or {}
+    found = identity(env)
+
+    def differ(what: str, there: Any, here: Any) -> None:
+        raise ArtifactError(
+            f"the observer {artifact.system!r} was made for {what} {shown(there)}, but this is {shown(here)}; "
+            f"{how_to_make_one(found['id'])}"
+        )
+
+    if made["id"] != found["id"]:
+        differ("the environment", made["id"], found["id"])
+    if made["kwargs"] != found["kwargs"]:
+        differ(f"{made['id']} with arguments", made["kwargs"], found["kwargs"])
+    dt = sampling_interval(env)
+    if not math.isclose(artifact.filter.dt, dt, rel_tol=1e-6):
+        differ("the sampling interval", artifact.filter.dt, dt)
+
+
+def how_to_make_one(name: str) -> str:
+    """What makes an observer for an environment, for messages."""
+    return (
+        f"an observer is learned by `kkl-gym record {name} --measured ... --hidden ...` and `kkl-gym train NAME --data "
+        "minari:DATASET`; kkl_gym.KKLMemory needs none"
+    )

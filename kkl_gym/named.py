@@ -1,0 +1,267 @@
+"""Signals of any environment by their names: entries of observations, of actions and of ``info``."""
+
+import re
+import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from kkl_gym.signals import Inputs, Outputs
+from observers.checks import real_array
+
+Space = gym.Space[Any]
+FUNCTIONS = {"cos": np.cos, "sin": np.sin}
+_FUNCTION = re.compile(r"(cos|sin)\((.+)\)")
+_INDEX = re.compile(r"(?:obs\[)?(\d+)\]?")
+_INFO = re.compile(r"info\[([^\[\]]+)\](?:\[(\d+)\])?")
+
+
+def observed(space: Space) -> tuple[str, ...]:
+    """Names of the entries of a flattened observation.
+
+    Parameters
+    ----------
+    space : gymnasium.Space
+        Of one observation.
+
+    Returns
+    -------
+    tuple of str
+        ``obs[0]``, ``obs[1]``, ...; of a Dict ``key[0]``, ``key[1]``, ..., or ``key`` where it holds one number. What
+        has no numbers is left out.
+    """
+    if not isinstance(space, spaces.Dict):
+        return tuple(f"obs[{i}]" for i in range(_size(space)))
+    sizes = {key: _size(part) for key, part in space.items()}
+    return tuple(key if n == 1 else f"{key}[{i}]" for key, n in sizes.items() for i in range(n))
+
+
+def acting(space: Space) -> tuple[str, ...]:
+    """Names of the inputs of a flattened action, ``action[0]`` and so on; those of discrete ones are one-hot."""
+    return tuple(f"action[{i}]" for i in range(_size(space)))
+
+
+def _size(space: Space) -> int:
+    try:
+        return spaces.flatdim(space)
+    except (NotImplementedError, ValueError):  # graphs and sequences
+        return 0
+
+
+def resolved(names: Sequence[str], space: Space, *, role: str, source: str) -> tuple[str, ...]:
+    """Full names of signals.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Each an index in the flattened observation (``0`` or ``obs[0]``), a key of a Dict, which stands for all of its
+        entries, one of those (``key[0]``), what ``info`` holds (``info[key]``, ``info[key][0]``), or ``cos(...)`` or
+        ``sin(...)`` of one of these.
+    space : gymnasium.Space
+        Of one observation.
+    role : str
+        What the signals are, for messages.
+    source : str
+        The environment, for messages.
+
+    Returns
+    -------
+    tuple of str
+        As :func:`observed` names entries.
+
+    Raises
+    ------
+    ValueError
+        If there is no such entry; the message says which there are.
+    """
+    there, found = observed(space), list[str]()
+    for name in names:
+        function = _FUNCTION.fullmatch(name)
+        entries = _entries(name if function is None or name in there else function[2].strip(), space, there)
+        if not entries or (function and len(entries) > 1):
+            known = textwrap.shorten(", ".join(there), 200, placeholder=" ...") or "no numbers"
+            ask = "" if not entries else ": name one entry of it"
+            raise ValueError(
+                f"{role} names {name!r}, but an observation of {source} is {known}{ask}; an index stands for its entry "
+                "(2 for obs[2]), and info[KEY] for what info holds"
+            )
+        found += [f"{function[1]}({entry})" for entry in entries] if function else entries
+    return tuple(found)
+
+
+def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]:
+    """The entries that a name without a function stands for, none if there are none."""
+    if name in there or _INFO.fullmatch(name):
+        return (name,)
+    if index := _INDEX.fullmatch(name):
+        return there[int(index[1]) : int(index[1]) + 1]
+    keys = space.keys() if isinstance(space, spaces.Dict) else ()
+    if name.endswith("[0]") and name[:-3] in keys and name[:-3] in there:
+        return (name[:-3],)
+    return tuple(entry for entry in there if name in keys and entry.startswith(f"{name}["))
+
+
+class Reader:
+    """Reads named signals from observations and from what ``info`` holds.
+
+    Parameters
+    ----------
+    space : gymnasium.Space
+        Of one observation.
+    names : sequence of str
+        As :func:`resolved` returns them.
+    source : str
+        The environment, for messages.
+
+    Attributes
+    ----------
+    low, high : ndarray, shape (n,)
+        Bounds of the signals, which may be infinite.
+    keys : tuple of str
+        What is asked of ``info``.
+
+    Raises
+    ------
+    ValueError
+        If a signal is of an image, or of what has no numbers.
+    """
+
+    def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
+        there, self._source = observed(space), source
+        functions = [None if name in there else _FUNCTION.fullmatch(name) for name in names]
+        entries = [name if function is None else function[2] for name, function in zip(names, functions)]
+        infos = dict.fromkeys(entry for entry in entries if entry not in there)
+        self._infos = {entry: _info(entry) for entry in infos}
+        self.keys = tuple(dict.fromkeys(key for key, _ in self._infos.values()))
+        chosen = sorted({there.index(entry) for entry in entries if entry in there})
+        columns = [there[i] for i in chosen]
+        self._outputs = None
+        low, high = np.zeros(0), np.zeros(0)
+        if chosen and isinstance(space, spaces.Dict):
+            keys = [key for key in space if any(column.partition("[")[0] == key or column == key for column in columns)]
+            self._outputs = Outputs(space, keys, (), source=source)
+            columns = list(observed(spaces.Dict({key: space[key] for key in keys})))
+        elif chosen:
+            self._outputs = Outputs(space, chosen, (), source=source)
+        if self._outputs is not None:
+            low, high = self._outputs.low, self._outputs.high
+        columns += infos
+        self._take = np.array([columns.index(entry) for entry in entries], dtype=int)
+        self._functions = [(i, FUNCTIONS[function[1]]) for i, function in enumerate(functions) if function]
+        unbounded = np.full(len(infos), np.inf)
+        self.low, self.high = (
+            np.concatenate([side, end])[self._take] for side, end in ((low, -unbounded), (high, unbounded))
+        )
+        for i, _ in self._functions:
+            self.low[i], self.high[i] = -1.0, 1.0
+
+    def __call__(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The signals.
+
+        Parameters
+        ----------
+        observation : object
+            A value of the space, or as many as ``batch`` says.
+        info : mapping
+            What came with it.
+        batch : tuple of int
+            Leading shape of both.
+
+        Returns
+        -------
+        ndarray, shape (*batch, n)
+            Values.
+
+        Raises
+        ------
+        ValueError
+            If the observation is not of the space, holds NaN among what is read, or ``info`` lacks a number.
+        """
+        parts = [] if self._outputs is None else [self._outputs(observation, batch)]
+        parts += [self._of_info(info, entry, batch) for entry in self._infos]
+        y = np.concatenate(parts, axis=-1)[..., self._take]
+        for i, function in self._functions:
+            y[..., i] = function(y[..., i])
+        return y
+
+    def _of_info(self, info: Mapping[str, Any], entry: str, batch: tuple[int, ...]) -> np.ndarray:
+        key, index = self._infos[entry]
+        if key not in info:
+            there = textwrap.shorten(", ".join(map(str, info)), 200, placeholder=" ...") or "nothing"
+            raise ValueError(f"info of {self._source} has no {key!r}; there is {there}")
+        values = info[key]
+        flags = isinstance(values, bool | np.bool_) or getattr(values, "dtype", None) == np.bool_
+        values = (np.asarray(values, dtype=float) if flags else real_array(entry, values)).reshape(*batch, -1)
+        if index is None and values.shape[-1] != 1:
+            raise ValueError(f"{entry} of {self._source} holds {values.shape[-1]} numbers: name one, as in {entry}[0]")
+        if (index or 0) >= values.shape[-1]:
+            raise ValueError(f"{entry}: info of {self._source} holds {values.shape[-1]} numbers there, from 0 on")
+        return values[..., [index or 0]]
+
+
+def _info(entry: str) -> tuple[str, int | None]:
+    """The key in ``info``, and the index in what is there."""
+    found = _INFO.fullmatch(entry)
+    if found is None:
+        raise ValueError(f"there is no entry {entry!r}")
+    return found[1], None if found[2] is None else int(found[2])
+
+
+class InputReader:
+    """Reads named inputs from actions.
+
+    Parameters
+    ----------
+    space : gymnasium.Space
+        Of one action.
+    names : sequence of str
+        Some of those of :func:`acting`.
+    source : str
+        The environment, for messages.
+
+    Attributes
+    ----------
+    largest : ndarray, shape (n,)
+        Bounds of their sizes.
+
+    Raises
+    ------
+    ValueError
+        If actions have no numbers, or there is no such input.
+    """
+
+    def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
+        self._inputs, there = Inputs(space, source=source), acting(space)
+        for name in names:
+            if name not in there:
+                raise ValueError(f"inputs names {name!r}, but an action of {source} is {', '.join(there)}")
+        self._take = np.array([there.index(name) for name in names], dtype=int)
+        self.largest = np.maximum(abs(self._inputs.low), abs(self._inputs.high))[self._take]
+
+    def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The inputs: bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot.
+
+        Parameters
+        ----------
+        action : object
+            A value of the space, or as many as ``batch`` says.
+        batch : tuple of int
+            Leading shape.
+
+        Returns
+        -------
+        ndarray, shape (*batch, n)
+            Values.
+
+        Raises
+        ------
+        ValueError
+            If the action is not of the space.
+        """
+        return self._inputs(action, batch)[..., self._take]
+
+
+__all__ = ["InputReader", "Reader", "acting", "observed", "resolved"]

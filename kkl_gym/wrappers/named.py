@@ -1,0 +1,163 @@
+"""Observers that were learned from rollouts, inside the environment that these are of."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kkl_gym.identity import check_identity, source_of
+from kkl_gym.named import InputReader, Reader, observed, resolved
+from kkl_gym.wrappers.estimator import KKLEstimator, reach
+from observers import Artifact, ArtifactError, KKLObserver
+from observers.checks import choice, flag
+
+
+class NamedEstimator(KKLEstimator):
+    """An observer from rollouts: what is measured is shown beside what it estimates.
+
+    Parameters
+    ----------
+    env : gymnasium.Env or gymnasium.vector.VectorEnv
+        The environment that the artifact says.
+    observation_space, action_space : gymnasium.Space
+        Of one environment.
+    artifact : Artifact
+        With an environment.
+    estimate : {"x", "z"}
+        Whether the estimates of hidden signals are shown, or the filter's state.
+    measurement_noise : float, sequence of float or None
+        The noise level that the observer assumes; None takes the artifact's.
+    monitor : bool
+        Whether to keep the score.
+    known_start : bool
+        Refused where it is True, as no map from rollouts has T.
+
+    Attributes
+    ----------
+    samples : Samples
+        What the observer sees of the environment.
+
+    Raises
+    ------
+    ValueError
+        If an argument makes no sense.
+    observers.ArtifactError
+        If the environment is another, or lacks a signal.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        observation_space: gym.Space[Any],
+        action_space: gym.Space[Any],
+        *,
+        artifact: Artifact,
+        estimate: str,
+        measurement_noise: float | Sequence[float] | None,
+        monitor: bool,
+        known_start: bool,
+    ) -> None:
+        choice("estimate", estimate, ("x", "z"))
+        self._monitor, self._known_start, self._blind = (
+            flag("monitor", monitor),
+            flag("known_start", known_start),
+            False,
+        )
+        check_identity(artifact, env)
+        if known_start:
+            artifact.require_forward()
+        self.observer = KKLObserver(artifact, measurement_noise, monitor=monitor)
+        self.estimate = estimate
+        try:
+            self.samples = Samples(artifact, observation_space, action_space, source=source_of(env))
+        except ValueError as error:
+            raise ArtifactError(f"the observer {artifact.system!r} does not fit: {error}") from error
+        measured, inputs = self.samples.outputs, self.samples.inputs
+        if estimate == "x":
+            low, high = _bounds(artifact, observation_space)
+        else:
+            high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
+            low = -high
+        low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
+        with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+            self.space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+
+    def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
+        """Forget the past and take in the first samples; see :class:`KKLEstimator`."""
+        super().reset(y0, x0)
+        self._y = y0.copy()
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
+        """Forget the past in some rows; see :class:`KKLEstimator`."""
+        super().restart(y0, rows, x0)
+        self._y[rows] = y0
+
+    def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
+        """Take in samples and the inputs that led to them; see :class:`KKLEstimator`."""
+        super().advance(y, u, rows)
+        self._y = y.copy() if rows is None else np.where(rows[..., None], y, self._y)
+
+    def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
+        """What ``info`` gains: as :class:`KKLEstimator`, and ``y``, what is measured."""
+        return super().report(rows) | {"y": self._y.copy() if rows is None else self._y[rows]}
+
+    def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What of a report is the observation: y, then x_hat or z."""
+        return np.concatenate([report["y"], super().shown(report)], axis=-1)
+
+
+class Samples:
+    """What an observer from rollouts sees of an environment.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        It names the signals.
+    observation_space, action_space : gymnasium.Space
+        Of one environment.
+    source : str
+        The environment, for messages.
+
+    Attributes
+    ----------
+    outputs, inputs : callable
+        What reads them.
+    count : int
+        Samples since the reset.
+
+    Raises
+    ------
+    ValueError
+        If the environment lacks a signal.
+    """
+
+    def __init__(
+        self, artifact: Artifact, observation_space: gym.Space[Any], action_space: gym.Space[Any], *, source: str
+    ) -> None:
+        signals = artifact.signals or {}
+        names = resolved(signals["measured"], observation_space, role="measured", source=source)
+        self.outputs = Reader(observation_space, names, source=source)
+        self.inputs = InputReader(action_space, signals["inputs"], source=source)
+        self._nothing = np.full(artifact.nx, np.nan)
+        self.count = 0
+
+    def first(self, observation: Any, info: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a reset, and states, which nobody knows."""
+        self.count = 0
+        return self.outputs(observation, info), self._nothing
+
+    def next(self, observation: Any, info: Mapping[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a step, and the inputs that led to them."""
+        return self.outputs(observation, info), self.inputs(action)
+
+
+def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the hidden signals, as the observation has them; infinite where it does not show them."""
+    low, high = np.full(artifact.nx, -np.inf), np.full(artifact.nx, np.inf)
+    there = observed(space)
+    for i, name in enumerate((artifact.signals or {})["hidden"]):
+        if name in there or name.startswith(("cos(", "sin(")):
+            of = Reader(space, [name], source="") if name in there else None
+            low[i], high[i] = (-1.0, 1.0) if of is None else (of.low[0], of.high[0])
+    return low, high

@@ -1,0 +1,175 @@
+"""Observers from rollouts around the environments that these are of."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env
+from rollout_observers import observer_of
+
+from kkl_gym import KKLObservation, KKLVectorObservation
+from observers import Artifact, ArtifactError, KKLObserver
+
+PENDULUM = partial(observer_of, "Pendulum-v1", ["obs[0]", "obs[1]"], ["obs[2]", "cos(obs[2])"], ["action[0]"], dt=0.05)
+CART_POLE = partial(
+    observer_of, "CartPole-v1", ["obs[0]", "obs[2]"], ["obs[1]", "info[other]"], ["action[0]", "action[1]"]
+)
+
+
+@pytest.fixture
+def saved(tmp_path):
+    def save(artifact):
+        path = tmp_path / "observer.safetensors"
+        artifact.save(path)
+        return str(path)
+
+    return save
+
+
+@pytest.mark.parametrize("estimate", ["x", "z"])
+def test_shows_what_is_measured_and_what_the_observer_says_of_it(saved, estimate):
+    artifact, plain = PENDULUM(), gym.make("Pendulum-v1")
+    env = KKLObservation(gym.make("Pendulum-v1"), saved(artifact), estimate=estimate)
+    raw, _ = plain.reset(seed=5)
+    obs, info = env.reset(seed=5)
+    expected = KKLObserver(artifact)
+    expected.reset(raw[:2])
+    env.action_space.seed(0)
+    for _ in range(30):
+        action = env.action_space.sample()
+        raw, *_ = plain.step(action)
+        obs, _, _, _, info = env.step(action)
+        x_hat = expected.step(raw[:2], action / 2.0)
+        shown = x_hat if estimate == "x" else expected.z
+        np.testing.assert_allclose(info["x_hat" if estimate == "x" else "z"], shown)
+        np.testing.assert_array_equal(info["y"], raw[:2])
+        clipped = np.clip(np.concatenate([raw[:2], shown]), env.observation_space.low, env.observation_space.high)
+        np.testing.assert_allclose(obs, clipped, rtol=1e-6)
+        assert estimate == "x" or (abs(shown) <= env.observation_space.high[2:]).all()
+    if estimate == "x":
+        assert env.observation_space.high.tolist() == [1.0, 1.0, 8.0, 1.0]
+    assert obs in env.observation_space
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_is_an_environment_that_is_made_again_from_its_specification(saved):
+    env = KKLObservation(gym.make("CartPole-v1"), saved(CART_POLE()))
+    check_env(env, skip_render_check=True)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert np.isinf(again.observation_space.high[-1])  # the observation does not show it
+    obs, _ = env.reset(seed=1)
+    same, _ = again.reset(seed=1)
+    np.testing.assert_array_equal(obs, same)
+
+
+def test_renders_what_the_environment_draws(saved):
+    pytest.importorskip("pygame")
+    env = KKLObservation(gym.make("CartPole-v1", render_mode="rgb_array"), saved(CART_POLE()))
+    env.reset(seed=0)
+    assert env.render().shape == (400, 600, 3)
+
+
+def test_artifacts_keep_the_environment(saved):
+    artifact = PENDULUM(kwargs={"g": 9.5})
+    assert Artifact.read(saved(artifact)).environment == {"id": "Pendulum-v1", "kwargs": {"g": 9.5}}
+    with pytest.raises(ArtifactError, match="fits Pendulum-v1 alone"):
+        artifact.require_system()
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"environment": {"id": "Pendulum-v1"}}, "environment must be an id and kwargs"),
+        ({"environment": {"id": 3, "kwargs": {}}}, "environment must be an id and kwargs"),
+        ({"signals": None}, "must name its signals"),
+    ],
+)
+def test_wrong_environments_of_artifacts(changes, told):
+    with pytest.raises(ArtifactError, match=told):
+        Artifact(**{**vars(PENDULUM()), **changes})
+
+
+def test_other_environments_are_refused(saved):
+    path = saved(PENDULUM())
+    for env, told in (
+        (gym.make("CartPole-v1"), "made for the environment 'Pendulum-v1', but this is 'CartPole-v1'; an observer is"),
+        (gym.make("Pendulum-v1", g=3.0), r"Pendulum-v1 with arguments {}, but this is {'g': 3.0}"),
+        (gym.make("Pendulum-v1").unwrapped.__class__(), "has no specification"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            KKLObservation(env, path)
+    KKLObservation(gym.make("Pendulum-v1", render_mode="rgb_array", max_episode_steps=7), path)
+    with pytest.raises(ArtifactError, match=r"the sampling interval 0\.1, but this is 0\.05"):
+        KKLObservation(gym.make("Pendulum-v1"), saved(observer_of("Pendulum-v1", ["obs[0]"], ["obs[2]"], [], dt=0.1)))
+    with pytest.raises(ArtifactError, match=r"does not fit: measured names 'obs\[3\]'"):
+        KKLObservation(gym.make("Pendulum-v1"), saved(observer_of("Pendulum-v1", ["obs[3]"], ["obs[2]"], [], dt=0.05)))
+    with pytest.raises(ValueError, match="kkl-gym record CartPole-v1 --measured"):
+        KKLObservation(gym.make("CartPole-v1"))
+    with pytest.raises(ValueError, match=r"needs a gymnasium\.Env"):
+        KKLObservation("CartPole-v1")
+    with pytest.raises(ArtifactError, match="holds no forward map"):
+        KKLObservation(gym.make("Pendulum-v1"), path, known_start=True)
+
+
+def test_arguments_that_no_file_can_hold(saved):
+    gym.register("Odd-v0", entry_point=lambda thing: gym.make("CartPole-v1").unwrapped)
+    try:
+        with pytest.raises(ValueError, match="a file cannot hold them"):
+            KKLObservation(gym.make("Odd-v0", thing=np.zeros(2)), saved(CART_POLE()))
+    finally:
+        gym.registry.pop("Odd-v0")
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_rows_of_a_vector_are_single_environments(saved, mode):
+    path, steps, n = saved(CART_POLE()), 60, 3
+    make = partial(gym.make, "CartPole-v1", max_episode_steps=17)
+    envs = KKLVectorObservation(gym.vector.SyncVectorEnv([make] * n, autoreset_mode=mode), path)
+    singles = [KKLObservation(make(), path) for _ in range(n)]
+    obs, info = envs.reset(seed=4)
+    expected = np.stack([env.reset(seed=4 + row)[0] for row, env in enumerate(singles)])
+    np.testing.assert_allclose(obs, expected, rtol=1e-6)
+    rng, ended, finals = np.random.default_rng(0), np.zeros(n, bool), 0
+    for _ in range(steps):
+        actions = rng.integers(2, size=n)
+        if mode is gym.vector.AutoresetMode.DISABLED and ended.any():
+            obs, info = envs.reset(options={"reset_mask": ended})
+            for row in np.flatnonzero(ended):
+                expected[row] = singles[row].reset()[0]
+            np.testing.assert_allclose(obs, expected, rtol=1e-6)
+            ended[:] = False
+        obs, _, terminated, truncated, info = envs.step(actions)
+        for row, env in enumerate(singles):
+            if ended[row] and mode is gym.vector.AutoresetMode.NEXT_STEP:
+                expected[row] = env.reset()[0]
+                continue
+            expected[row], _, over, cut, _ = env.step(actions[row])
+            if (over or cut) and mode is gym.vector.AutoresetMode.SAME_STEP:
+                np.testing.assert_allclose(info["final_obs"][row], expected[row], rtol=1e-6)
+                np.testing.assert_allclose(info["final_info"]["y"][row], expected[row][:2], rtol=1e-6)
+                expected[row], finals = env.reset()[0], finals + 1
+        np.testing.assert_allclose(obs, expected, rtol=1e-6)
+        np.testing.assert_allclose(info["y"], expected[:, :2], rtol=1e-6)
+        ended = terminated | truncated
+    assert finals > 3 or mode is not gym.vector.AutoresetMode.SAME_STEP
+
+
+def test_vectors_that_are_no_rows_of_environments(saved):
+    envs = KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=4), saved(CART_POLE()))
+    envs.reset(seed=0)
+    obs, *_ = envs.step(envs.action_space.sample())
+    assert obs.shape == (4, 4)
+
+
+def test_vectors_that_are_refused(saved):
+    path = saved(PENDULUM())
+    different = gym.vector.SyncVectorEnv([partial(gym.make, "Pendulum-v1", g=g) for g in (9.0, 10.0)])
+    with pytest.raises(ValueError, match="the environments differ"):
+        KKLVectorObservation(different, path)
+    with pytest.raises(ValueError, match="KKLVectorMemory"):
+        KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=2))
+    told = observer_of("Pendulum-v1", ["info[angle]"], ["obs[2]"], [], dt=0.05)
+    with pytest.raises(ValueError, match=r"measures info\[angle\], which vectors do not say"):
+        KKLVectorObservation(gym.vector.SyncVectorEnv([partial(gym.make, "Pendulum-v1")] * 2), saved(told))

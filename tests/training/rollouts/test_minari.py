@@ -1,0 +1,163 @@
+"""Minari data sets: written whole, and read again."""
+
+import json
+import shutil
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from observers import Artifact
+from training.cli import main
+from training.commands.record import read_argument
+from training.records import Signals, read_records
+from training.records.minari import is_dataset, read_dataset, write_dataset
+from training.rollouts import make, policy_of, roll_out
+
+minari = pytest.importorskip("minari")
+pytest.importorskip("h5py")
+
+
+@pytest.fixture(autouse=True)
+def datasets(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    return tmp_path / "datasets"
+
+
+def rollouts(name="cart/random-v0", env_id="CartPole-v1", **changes):
+    wanted = {"measured": ["0", "cos(2)"], "hidden": ["1"], "steps": 60} | changes
+    env = make(env_id)
+    return roll_out(env, policy_of("random", env), name=name, **wanted), env.spec
+
+
+def test_what_is_written_is_read(datasets):
+    told, (found, spec) = [], rollouts()
+    folder = write_dataset(found, spec, policy="random")
+    assert folder == datasets / "cart" / "random-v0"
+    assert [path.name for path in folder.parent.iterdir() if path.name.startswith(".")] == []
+    expected = [record.fingerprint for record in found.records()]
+    for name in ("minari:cart/random-v0", folder, folder / "data"):
+        assert is_dataset(name)
+        records = read_records([name], warn=told.append)
+        assert [record.fingerprint for record in records] == expected
+        assert records[0].environment == {"id": "CartPole-v1", "kwargs": {}}
+    assert told == []
+    other = read_records([folder], signals=Signals(measured=("obs[2]",), hidden=("3",)))
+    assert other[0].signals.hidden == ("obs[3]",)
+    dataset = minari.load_dataset("cart/random-v0")
+    assert [len(episode) for episode in dataset] == [len(episode.rewards) for episode in found.episodes]
+    assert dataset.recover_environment().spec.id == "CartPole-v1"
+
+
+def test_dicts_and_infos_are_kept():
+    class Keyed(gym.Env):
+        observation_space = gym.spaces.Dict({"a": gym.spaces.Box(-1, 1, (2,)), "b": gym.spaces.Box(-1, 1, (1,))})
+        action_space = gym.spaces.Tuple([gym.spaces.Discrete(2), gym.spaces.Box(-1, 1, (1,))])
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.observation_space.sample(), {"speed": self.np_random.normal(size=2)}
+
+        def step(self, action):
+            return self.observation_space.sample(), 0.0, False, False, {"speed": self.np_random.normal(size=2)}
+
+    gym.register("Keyed-v0", entry_point=Keyed, disable_env_checker=True)
+    try:
+        found, spec = rollouts(env_id="Keyed-v0", measured=["a"], hidden=["b", "info[speed][1]"], steps=20)
+    finally:
+        gym.registry.pop("Keyed-v0")
+    spec.entry_point = None  # of a class that no file can name
+    write_dataset(found, spec, policy="random")
+    read = read_dataset("minari:cart/random-v0", print).records()
+    assert read[0].signals.inputs == ("action[0]", "action[1]", "action[2]")
+    assert [record.fingerprint for record in read] == [record.fingerprint for record in found.records()]
+
+
+def test_half_a_data_set_is_none(datasets, monkeypatch):
+    found, spec = rollouts()
+    monkeypatch.setattr("minari.dataset.minari_storage.MinariStorage.update_metadata", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_dataset(found, spec, policy="random")
+    assert [path.name for path in (datasets / "cart").iterdir()] == ["namespace_metadata.json"]
+
+
+def test_what_is_no_data_set(datasets):
+    with pytest.raises(ValueError, match="minari:none/none-v0 cannot be read"):
+        read_records(["minari:none/none-v0"])
+    found, spec = rollouts()
+    folder = write_dataset(found, spec, policy="random")
+    with pytest.raises(ValueError, match="there is a data set cart/random-v0 already"):
+        write_dataset(found, spec, policy="random")
+    with pytest.raises(ValueError, match="called as in"):
+        write_dataset(rollouts("no name")[0], spec, policy="random")
+    with pytest.raises(ValueError, match="no column of time"):
+        read_records([folder], signals=Signals(time="t"))
+    (folder / "data" / "main_data.hdf5").write_bytes(b"nothing")
+    with pytest.raises(ValueError, match="cannot be read as a Minari data set"):
+        read_records([folder])
+    path = folder / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    del metadata["action_space"]
+    path.write_text(json.dumps(metadata))
+    with pytest.raises(ValueError, match="does not say its spaces"):  # nothing is made of what the file names
+        read_records([folder])
+
+
+@pytest.mark.parametrize(
+    ("spec", "dt", "told"),
+    [
+        ('{"id": "Pendulum-v1"', 0.05, None),
+        ('{"id": "Other-v1"', 1.0, "says no sampling interval: a step counts as 1 s"),
+        (None, 1.0, "says no sampling interval"),
+    ],
+)
+def test_sampling_intervals_of_data_sets_of_others(spec, dt, told):
+    found, own = rollouts(env_id="Pendulum-v1", measured=["0", "1"], hidden=["2"])
+    folder = write_dataset(found, own, policy="random")
+    path = folder / "data" / "metadata.json"
+    metadata = json.loads(path.read_text())
+    del metadata["kkl_gym"]
+    if spec is None:
+        del metadata["env_spec"]
+    else:
+        metadata["env_spec"] = metadata["env_spec"].replace('{"id": "Pendulum-v1"', spec)
+    path.write_text(json.dumps(metadata))
+    heard = []
+    read = read_dataset(folder, heard.append)
+    assert read.dt == dt
+    assert (not heard) if told is None else told in heard[0]
+    with pytest.raises(ValueError, match="say which entries of the observation are measured"):
+        read.records()
+    assert (read.environment is None) == (spec is None)
+
+
+def test_record_and_train(tmp_path, capsys, datasets):
+    record = ["record", "Pendulum-v1", "--measured", "0,1", "--hidden", "2", "--episodes", "6", "--env-kwargs", "g=9"]
+    main(record)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "6 episodes of 200 to 200 steps of 0.05 s" in said
+    assert "kkl-gym train NAME --data minari:pendulum-v1/random-v0" in said
+    with pytest.raises(SystemExit, match="there is a data set"):
+        main(record)
+    with pytest.raises(SystemExit):
+        main([*record, "--env-kwargs", "g"])
+    train = "train swing --data minari:pendulum-v1/random-v0 --inverse-steps 9 --members 1 --width 4 --samples 4"
+    main([*train.split(), "--windows", "99", "--batch", "64", "--out", str(tmp_path / "run")])
+    artifact = Artifact.read(tmp_path / "run" / "swing.safetensors")
+    assert artifact.environment == {"id": "Pendulum-v1", "kwargs": {"g": 9}}
+    shutil.rmtree(datasets)
+
+
+def test_arguments_of_environments():
+    assert read_argument("g=9.5") == ("g", 9.5)
+    assert read_argument("name=plain text") == ("name", "plain text")
+    assert read_argument("box=[1, 2]") == ("box", [1, 2])
+    with pytest.raises(ValueError, match="NAME=VALUE"):
+        read_argument("9=g")
+
+
+def test_noise_free_values_are_kept_exactly():
+    found, spec = rollouts(env_id="Pendulum-v1", measured=["0", "1"], hidden=["2"])
+    write_dataset(found, spec, policy="random")
+    read = read_dataset("minari:cart/random-v0", print)
+    np.testing.assert_array_equal(read.episodes[0].observations, found.episodes[0].observations)

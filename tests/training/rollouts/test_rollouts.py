@@ -1,0 +1,187 @@
+import dataclasses
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+import training
+from kkl_gym import KKLObservation
+from observers import Artifact
+from training.recorded.config import recorded_config
+from training.records import Signals, check_signals, resampled
+from training.rollouts import make, policy_of, roll_out
+
+TINY = {"inverse_steps": 20, "members": 1, "width": 8, "samples": 5, "windows": 200, "batch": 64}
+
+
+class Drift(gym.Env):
+    """A position that the input drives; a Dict says it, info its speed, but not at reset. It ends beyond 3."""
+
+    observation_space = spaces.Dict({"place": spaces.Box(-9.0, 9.0, (1,)), "goal": spaces.Discrete(2)})
+    action_space = spaces.Discrete(3, start=-1)
+    dt = 0.1
+
+    def __init__(self, text=False):
+        self.text = text
+
+    def _seen(self):
+        return {"place": np.float32([self.place]), "goal": 1}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place = float(self.np_random.uniform(-1, 1))
+        return self._seen(), {}
+
+    def step(self, action):
+        self.place += 0.5 * float(action)
+        speed = "fast" if self.text else 0.5 * float(action)
+        return self._seen(), 0.0, abs(self.place) > 3, False, {"speed": speed}
+
+
+@pytest.fixture
+def drift():
+    gym.register("Drift-v0", entry_point=Drift, max_episode_steps=30, disable_env_checker=True)
+    yield "Drift-v0"
+    gym.registry.pop("Drift-v0")
+
+
+def played(env, **changes):
+    wanted = {"measured": ["place"], "hidden": ["info[speed]"], "steps": 100, "seed": 3} | changes
+    return roll_out(env, policy_of(wanted.pop("policy", "random"), env), **wanted)
+
+
+def test_inputs_lead_from_each_sample_to_the_next(drift):
+    rollouts = played(make(drift))
+    records = rollouts.records()
+    assert sum(len(episode.rewards) for episode in rollouts.episodes) == 100
+    assert len({len(record.t) for record in records}) > 1  # of different lengths
+    for record, episode in zip(records, rollouts.episodes):
+        assert record.signals == Signals("t", ("place",), ("action[0]", "action[1]", "action[2]"), ("info[speed]",))
+        push = record.u @ [-0.5, 0.0, 0.5]
+        np.testing.assert_allclose(np.diff(record.y[:, 0]), push[:-1], atol=1e-6)
+        np.testing.assert_array_equal(record.u[-1], record.u[-2])
+        assert np.isnan(record.x[0, 0])  # a reset says no speed
+        np.testing.assert_allclose(record.x[1:, 0], push[:-1])
+        np.testing.assert_allclose(np.diff(record.t), 0.1)
+        assert episode.terminated == (abs(record.y[-1, 0]) > 3)
+        assert record.environment == {"id": "Drift-v0", "kwargs": {}}
+        np.testing.assert_allclose(resampled(record, 0.1).u[:-1], record.u[:-1], atol=1e-12)
+
+
+def test_the_same_seed_plays_the_same(drift):
+    one, same, other = (played(make(drift), seed=seed).records() for seed in (1, 1, 2))
+    assert [record.fingerprint for record in one] == [record.fingerprint for record in same]
+    assert one[0].fingerprint != other[0].fingerprint
+
+
+def test_stops_after_episodes_or_steps(drift):
+    told = []
+    rollouts = played(make(drift), episodes=4, steps=None, report=told.append)
+    assert told == [1, 2, 3, 4] == list(range(1, len(rollouts.episodes) + 1))
+    assert len(played(make(drift), episodes=1).episodes) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"measured": ["far"]}, r"names 'far', but an observation of Drift-v0 is goal\[0\], goal\[1\], place; an"),
+        ({"measured": []}, "which entries of the observation are measured"),
+        ({"measured": ["info[speed]"]}, r"episode 0: info\[speed\] is not there after the reset"),
+        ({"hidden": ["info[height]"]}, "info has no 'height'"),
+        ({"steps": None}, "say how much to record"),
+        ({"steps": 0}, "steps must be"),
+        ({"seed": -1}, "seed must be"),
+    ],
+)
+def test_what_cannot_be_recorded(drift, changes, told):
+    with pytest.raises(ValueError, match=told):
+        played(make(drift), **changes)
+
+
+def test_texts_are_no_signals(drift):
+    with pytest.raises(ValueError, match=r"info\[speed\] holds no number"):
+        played(make(drift, {"text": True}))
+
+
+def test_environments_that_cannot_be_made():
+    with pytest.raises(ValueError, match="cannot make 'None-v0'"):
+        make("None-v0")
+    with pytest.raises(ValueError, match=r"cannot make 'CartPole-v1'.*height"):
+        make("CartPole-v1", {"height": 2})
+
+
+def test_images_are_refused():
+    class Picture(gym.Env):
+        observation_space, action_space = spaces.Box(0, 255, (8, 8, 3), np.uint8), spaces.MultiBinary(2)
+
+    gym.register("Picture-v0", entry_point=Picture, disable_env_checker=True)
+    try:
+        with pytest.raises(ValueError, match=r"Picture-v0 is an image.*encoder"):
+            roll_out(make("Picture-v0"), None, measured=["0"], hidden=["1"], steps=1)
+    finally:
+        gym.registry.pop("Picture-v0")
+
+
+def test_policies(tmp_path, drift):
+    env = make(drift)
+    (tmp_path / "mine.py").write_text("def right(observation):\n    return 1\n")
+    right = policy_of(f"{tmp_path}/mine.py:right", env)
+    assert all((np.diff(record.y[:, 0]) > 0.4).all() for record in played(env, policy=right).records())
+    assert policy_of(right, env) is right
+    for wrong in ("clever", 3, "none.py:right"):
+        with pytest.raises(ValueError, match=r"a policy is random|cannot load"):
+            policy_of(wrong, env)
+
+
+def test_agents_of_stable_baselines3(tmp_path):
+    sb3 = pytest.importorskip("stable_baselines3")
+    env, path = make("CartPole-v1"), tmp_path / "agent.zip"
+    sb3.PPO("MlpPolicy", env, device="cpu", n_steps=16, batch_size=16, seed=0).save(path)
+    policy = policy_of(f"ppo:{path}", env)
+    assert roll_out(env, policy, measured=["0"], hidden=["1"], episodes=1).episodes[0].actions.shape[0] > 3
+    with pytest.raises(ValueError, match="trained on the observation space"):
+        policy_of(f"ppo:{path}", make("Pendulum-v1"))
+    with pytest.raises(ValueError, match="'clever' is no algorithm"):
+        policy_of(f"clever:{path}", env)
+    with pytest.raises(ValueError, match="there is no file"):
+        policy_of("ppo:none.zip", env)
+
+
+def test_modes_follow_steps_and_the_length_of_episodes(drift):
+    for env, n, slowest, dt in (("Pendulum-v1", 200, 0.2, 0.05), (drift, 8, 1.0, 0.1)):
+        names = {"hidden": ["2"], "measured": ["0"]} if n == 200 else {}
+        config = recorded_config(played(make(env), steps=n, **names).records())
+        assert config.dt == pytest.approx(dt)
+        rates = -np.array(config.eigenvalues) * dt
+        assert rates[[0, -1]] == pytest.approx([slowest, 4.0])
+
+
+def test_other_steps_and_other_environments_do_not_go_together(drift):
+    records = played(make(drift)).records()
+    with pytest.raises(
+        ValueError, match=r"dt = 0\.3 s: an observer for Drift-v0 takes a sample at each step, every 0\.1"
+    ):
+        recorded_config(records, {"dt": 0.3})
+    other = dataclasses.replace(records[0], environment={"id": "Drift-v0", "kwargs": {"text": False}})
+    with pytest.raises(ValueError, match=r"with arguments {'text': False}, but .* with arguments {}: one observer"):
+        check_signals([records[0], other])
+
+
+def test_learns_an_observer_that_fits_the_environment(tmp_path):
+    artifact = training.learn(
+        "Pendulum-v1", measured=[0, 1], hidden=[2], episodes=6, env_kwargs={"g": 9.0}, out=tmp_path, **TINY
+    )
+    assert artifact.environment == {"id": "Pendulum-v1", "kwargs": {"g": 9.0}}
+    assert artifact.training["held_out_errors"]["obs[2]"] > 0
+    assert list(artifact.training["records"]) == ["Pendulum-v1"]
+    path = tmp_path / "Pendulum-v1.safetensors"
+    assert Artifact.read(path).signals["measured"] == ["obs[0]", "obs[1]"]
+    env = KKLObservation(gym.make("Pendulum-v1", g=9.0), path)
+    assert env.reset(seed=0)[0].shape == (3,)
+
+
+def test_learns_without_writing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], steps=400, **TINY)
+    assert not list(tmp_path.iterdir())

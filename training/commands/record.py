@@ -1,0 +1,146 @@
+"""``kkl-gym record ENV_ID``."""
+
+import json
+import re
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import tyro
+from rich.console import Console
+from tyro.constructors import PrimitiveConstructorSpec
+
+from training.progress import progress_bars
+
+Argument = Annotated[
+    tuple[str, Any],
+    PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME=VALUE",
+        instance_from_str=lambda words: read_argument(words[0]),
+        is_instance=lambda value: True,
+        str_from_instance=lambda argument: [f"{argument[0]}={json.dumps(argument[1])}"],
+    ),
+]
+_NAMES = tyro.conf.arg(metavar="SIGNALS", help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class RecordCommand:
+    """Play episodes of any environment, and write them as a Minari data set for `kkl-gym train --data minari:ID`."""
+
+    env_id: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(metavar="ENV_ID", help="An environment as gym.make takes it, such as Pendulum-v1."),
+    ]
+    measured: Annotated[str, _NAMES] = ""
+    """Signals that an observer will see, with commas between them: indices in the flattened observation, keys of a
+    Dict, info[KEY], or cos(...) and sin(...) of one."""
+    hidden: Annotated[str, _NAMES] = ""
+    """Signals that it will estimate, likewise."""
+    policy: str = "random"
+    """Who acts: random, a function from observation to action as script.py:function or module:function, or an agent of
+    stable-baselines3 as ppo:FILE.zip, of which loading may run what is in the file."""
+    episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
+    """Episodes to play."""
+    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
+    """Steps to play, at most."""
+    env_kwargs: Annotated[
+        tuple[Argument, ...], tyro.conf.UseAppendAction, tyro.conf.arg(help_behavior_hint="(default: none)")
+    ] = ()
+    """An argument of the environment, once for each; values are JSON, or text."""
+    seed: int = 0
+    """Of the environment and of random actions."""
+    dataset: Annotated[
+        str, tyro.conf.arg(metavar="ID", help_behavior_hint="(default: from environment and policy)")
+    ] = ""
+    """Name of the data set, as in pendulum/random-v0."""
+
+    def run(self, console: Console) -> str:
+        """Record.
+
+        Parameters
+        ----------
+        console : rich.console.Console
+            For people.
+
+        Returns
+        -------
+        str
+            Name of the data set.
+
+        Raises
+        ------
+        ValueError
+            If an option makes no sense, as :func:`training.rollouts.roll_out` says, or there is such a data set.
+        """
+        from training.records.minari import dataset_folder, write_dataset
+        from training.rollouts import make, policy_of, roll_out
+
+        steps = 100_000 if self.episodes is None and self.steps is None else self.steps
+        name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
+        dataset_folder(name)  # an error now, not at the end
+        with progress_bars(console) as progress, make(self.env_id, dict(self.env_kwargs)) as env:
+            policy = policy_of(self.policy, env)
+            with progress.phase(f"playing {self.env_id}", steps or self.episodes or 1) as report:
+                rollouts = roll_out(
+                    env,
+                    policy,
+                    measured=names_in(self.measured),
+                    hidden=names_in(self.hidden),
+                    episodes=self.episodes,
+                    steps=steps,
+                    seed=self.seed,
+                    name=name,
+                    report=report,
+                )
+            with progress.phase("writing the data set"):
+                folder = write_dataset(rollouts, env.spec, policy=self.policy)
+            lengths = [len(episode.rewards) for episode in rollouts.episodes]
+            ended = sum(episode.terminated for episode in rollouts.episodes)
+            progress.say(
+                f"{len(lengths)} episodes of {min(lengths)} to {max(lengths)} steps of {rollouts.dt:g} s, "
+                f"{sum(lengths)} together; {ended} ended by the environment"
+            )
+            signals = rollouts.signals
+            progress.say(f"measured {', '.join(signals.measured)}; hidden {', '.join(signals.hidden) or 'nothing'}")
+            progress.say(f"wrote {folder}: kkl-gym train NAME --data minari:{name}")
+        return name
+
+
+def names_in(text: str) -> list[str]:
+    """The names between commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def read_argument(text: str) -> tuple[str, Any]:
+    """Read ``NAME=VALUE``.
+
+    Parameters
+    ----------
+    text : str
+        What the user wrote.
+
+    Returns
+    -------
+    name : str
+        Of the argument.
+    value : object
+        As JSON says, or the text itself.
+
+    Raises
+    ------
+    ValueError
+        If it is not of that form.
+    """
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise ValueError(f"an argument of an environment is given as NAME=VALUE, got {text!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def _word(text: str) -> str:
+    """A text as a part of a data set's name."""
+    return re.sub(r"\W+", "-", text.rpartition("/")[2].lower()).strip("-") or "data"

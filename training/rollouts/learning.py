@@ -1,0 +1,91 @@
+"""From an environment to an observer for it, in one call."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from observers import Artifact
+from training.progress import ProgressBars, progress_bars
+from training.recorded.config import recorded_config
+from training.recorded.fit import train_recorded
+from training.rollouts.playing import make, roll_out
+from training.rollouts.policies import RANDOM, Policy, policy_of
+
+
+def learn(
+    env_id: str,
+    *,
+    measured: Sequence[str | int],
+    hidden: Sequence[str | int],
+    policy: str | Policy = RANDOM,
+    episodes: int | None = None,
+    steps: int | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    console: Console | ProgressBars | None = None,
+    **settings: Any,
+) -> Artifact:
+    """Learn an observer for any environment from rollouts in which the hidden signals are seen.
+
+    Parameters
+    ----------
+    env_id : str
+        As ``gym.make`` takes it.
+    measured, hidden : sequence of str or int
+        What the observer sees, and what it estimates: indices in the flattened observation, keys of a Dict, or
+        ``info[key]``, see :func:`kkl_gym.named.resolved`.
+    policy : str or callable
+        Who acts, see :func:`training.rollouts.policy_of`. Estimates are good where it has been.
+    episodes, steps : int, optional
+        How much is played, to whichever is reached first; by default 100,000 steps.
+    env_kwargs : mapping of str to object, optional
+        Arguments of the environment.
+    seed : int
+        Of the rollouts and of the training.
+    out : str or Path, optional
+        A folder, which then receives checkpoints and ENV_ID.safetensors; by default nothing is written.
+    console : rich.console.Console or ProgressBars, optional
+        Where progress is shown; by default nowhere.
+    **settings : object
+        Of :class:`training.recorded.config.RecordedConfig`.
+
+    Returns
+    -------
+    Artifact
+        The observer; ``training["held_out_errors"]`` are its errors on episodes that were not trained on.
+
+    Raises
+    ------
+    ValueError
+        If an argument makes no sense, or as :func:`training.recorded.fit.train_recorded`.
+    """
+    if episodes is None and steps is None:
+        steps = 100_000
+    with tempfile.TemporaryDirectory() as scratch, progress_bars(console) as progress:
+        folder = Path(scratch) / "run" if out is None else Path(out)
+        playing = progress.phase(f"playing {env_id}", steps or episodes or 1)
+        with make(env_id, env_kwargs) as env, playing as report:
+            rollouts = roll_out(
+                env,
+                policy_of(policy, env),
+                measured=[str(name) for name in measured],
+                hidden=[str(name) for name in hidden],
+                episodes=episodes,
+                steps=steps,
+                seed=seed,
+                report=report,
+            )
+        records = rollouts.records()
+        config = recorded_config(records, {"seed": seed, **settings})
+        name = (rollouts.environment or {})["id"].replace("/", "-")
+        artifact = train_recorded(records, config, folder, name=name, console=progress).artifact
+        if out is not None:
+            artifact.save(folder / f"{name}.safetensors")
+    return artifact
+
+
+__all__ = ["learn"]

@@ -1,0 +1,75 @@
+"""Who acts in rollouts: random actions, a function, or an agent of stable-baselines3."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from kkl_gym.loading import load_function
+from observers.checks import shown
+
+Policy = Callable[[Any], Any]  # from an observation to an action
+RANDOM = "random"
+
+
+def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
+    """Find who acts.
+
+    Parameters
+    ----------
+    policy : str or callable
+        ``random``: actions drawn from their space. ``script.py:function`` or ``module:function``: a function from an
+        observation to an action. ``ppo:FILE.zip``, or another algorithm of stable-baselines3 or sb3-contrib: an agent
+        that it saved, of which loading may run what is in the file.
+    env : gymnasium.Env
+        Where it acts.
+
+    Returns
+    -------
+    callable
+        From an observation to an action.
+
+    Raises
+    ------
+    ValueError
+        If it is none of these, or acts on other observations.
+    OSError
+        If a file cannot be read.
+    """
+    if callable(policy):
+        return policy
+    if policy == RANDOM:
+        space = env.action_space
+        return lambda observation: space.sample()
+    if not isinstance(policy, str) or ":" not in policy:
+        raise ValueError(
+            "a policy is random, script.py:function, module:function or an agent as in ppo:FILE.zip, "
+            f"got {shown(policy)}"
+        )
+    algorithm, _, file = policy.partition(":")
+    if file.endswith(".zip"):
+        return _agent(algorithm, Path(file), env)
+    return load_function(policy)
+
+
+def _agent(name: str, path: Path, env: gym.Env[Any, Any]) -> Policy:
+    import stable_baselines3
+
+    found = getattr(stable_baselines3, name.upper(), None)
+    if found is None:
+        import sb3_contrib
+
+        found = {cls.lower(): getattr(sb3_contrib, cls) for cls in sb3_contrib.__all__}.get(name.lower())
+    if found is None:
+        raise ValueError(f"{name!r} is no algorithm of stable-baselines3 or sb3-contrib; name it as in ppo:FILE.zip")
+    if not path.is_file():
+        raise ValueError(f"there is no file {path}")
+    agent = found.load(path, device="cpu")
+    for what in ("observation_space", "action_space"):
+        here, there = getattr(env, what), getattr(agent, what)
+        if here != there:
+            raise ValueError(
+                f"{path} was trained on the {what.replace('_', ' ')} {there}, but the environment has {here}"
+            )
+    return lambda observation: agent.predict(observation, deterministic=True)[0]
