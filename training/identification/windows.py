@@ -21,14 +21,14 @@ from training.identification.shooting import (
 from training.records import Record
 
 FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
-FIRST_ROUNDS = 15  # steps in which the longer of these have to find theirs
+FIRST_ROUNDS = 25  # steps in which the longer of these have to find theirs
 MORE_NOISE = 1.5  # standard deviation of their residuals, over that of the noise that neighbouring samples show
 SMALL = 0.01  # of an output's standard deviation: residuals that are no matter without noise either
 LEAST_USED = 0.8  # share of the windows that the model must explain at a new length
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
-LEFT = 0.5  # standard errors that a fit may be from where its squares are least
+LEFT = 1.0  # standard errors that a fit may be from where its squares are least
 MOST_SAMPLES = 6400  # of a window
 
 Starts = dict[tuple[int, int], np.ndarray]
