@@ -385,7 +385,7 @@ def wrappers():
                 meaning,
                 lambda _, v, kind=kind, inside=inside, name=name: driven(kind(inside(), **{name: v})),
             )
-        yield Entry(WRAPPERS, f"{kind.__name__}(env)", "environments?", None, means.nothing,
+        yield Entry(WRAPPERS, f"{kind.__name__}(env)", "environments?|Env", None, means.nothing,
                     lambda _, v, kind=kind: driven(kind(v)))  # fmt: skip
     for kind, inside in ((KKLMemory, limited), (KKLVectorMemory, vector)):
         yield from constructors(WRAPPERS, (

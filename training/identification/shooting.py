@@ -17,6 +17,7 @@ WORSE = 1.0  # times the mean square of before, from which on a window's start i
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
 SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
+EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which less is no better
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
@@ -370,7 +371,8 @@ def shoot(
             )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
         better = False
-        if _left(*_reduced(H, g, used=used, nx=nx)[:2], at.each[used].mean()) < precision:
+        cost = at.each[used].mean()
+        if cost < EXACT or _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision:
             break
         while damping < MOST_DAMPING and not better:
             S, s, along = _reduced(H, g, used=used, nx=nx, damping=damping)
@@ -387,7 +389,7 @@ def shoot(
         if not better:
             break
         theta, at = new, tried
-        if fall * len(windows.y) < precision**2 * at.each[used].mean():
+        if fall * len(windows.y) < precision**2 * cost:
             break  # rounding leaves no more; the fit says how far off it is
     return _fit(problem, theta, at)
 
