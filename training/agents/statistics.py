@@ -1,5 +1,6 @@
 """What trained agents' scores say together: normalised means of seeds, with intervals."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
     Returns
     -------
     ndarray
-        NaN where ``top`` is no better than zero input.
+        NaN where ``top`` is no better than that.
     """
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
@@ -56,8 +57,11 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
         return normalised(middle(mine, axis), middle(tops, axis), idle)
 
     found = float(statistic(values))
-    if min(len(values), len(best)) < 3:
+    if min(len(values), len(best)) < 3 or np.isnan(found):
         return found, np.nan, np.nan
     samples = (values,) if values is best else (values, best)
-    ends = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
+    with warnings.catch_warnings():  # where some resamples of the best are no better than zero, there are no ends
+        warnings.simplefilter("ignore", scipy.stats.DegenerateDataWarning)
+        found_in = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
+    ends = found_in.confidence_interval
     return found, float(ends.low), float(ends.high)

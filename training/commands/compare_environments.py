@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from observers.storage import write
-from training.agents.any_environment.comparison import RANDOM, collect, planned, run_case
+from training.agents.any_environment.comparison import MANY, RANDOM, collect, planned, run_case
 from training.agents.any_environment.information import SHOWN, Shown
 from training.agents.any_environment.tables import curves, draw_curves, draw_scores, write_table
 from training.agents.any_environment.task import HiddenTask
@@ -61,11 +61,13 @@ def compare_environments(
             failures = run_missing(run_case, cases, workers=jobs, what="agents", progress=progress)
     finally:  # also after an interruption
         with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
-            results = collect(cases)
+            every = planned(tasks, out, seeds=MANY, episodes=episodes, timesteps=timesteps, aggregate=aggregate)
+            there = [case for case in every if case.done]  # whichever run it is from
+            results = collect(there)
             if len(results) and set(results.shown) - {"state", RANDOM}:
-                missing = len(cases) - len(results)
+                missing = sum(not case.done for case in cases)
                 partial = f" Partial: {missing} of {len(cases)} agents are missing." if missing else ""
-                learned = curves(cases)
+                learned = curves(there)
                 write(out / "results.csv", results.to_csv(index=False))
                 write(out / "curves.csv", learned.to_csv(index=False))
                 write_table(out / "table.md", results, partial)

@@ -245,7 +245,9 @@ def estimate_parameters(
         rough = np.array([system.parameters[name] for name in unknown])
         unit = np.where(rough == 0, [0.1 * (high - low) for low, high in unknown.values()], np.abs(rough))
         shooting = Shooting(system, dt, unknown, unit)
-        fit = fit_windows(shooting, [rough] if observer else [rough, given], fitted, guess, first=first, report=progress.say)
+        fit = fit_windows(
+            shooting, [rough] if observer else [rough, given], fitted, guess, first=first, report=progress.say
+        )
         fit = _brought_back(shooting, fit, given)
         found, length = np.array(list(fit.parameters.values())), len(fit.windows.y) - 1
         predictions = predict(shooting, found, held_out, guess, first=first, length=length)

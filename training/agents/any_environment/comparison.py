@@ -27,6 +27,7 @@ ROWS = 10  # episodes that are played at a time
 PROTOCOL = 1  # changes where results must not be mixed with earlier ones
 OTHER = "an agent of another comparison"
 RESULT = "result.json"
+MANY = 100  # seeds, more than anyone trains
 assert get_args(Shown) == SHOWN
 
 

@@ -6,6 +6,7 @@ from typing import Any, Literal, get_args
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils import RecordConstructorArgs
 from gymnasium.wrappers import TransformObservation
 
 from kkl_gym import KKLMemory, KKLObservation
@@ -67,7 +68,7 @@ def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
     return observation[entries].astype(np.float32)
 
 
-class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
+class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Shows the last observations, each with the action before it, the latest last.
 
     Before an episode's first step there were its first observation and no action.
@@ -81,7 +82,8 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any]):
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], count: int = STACKED) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, count=count)
+        gym.Wrapper.__init__(self, env)
         self._inputs = Inputs(env.action_space, source=source_of(env))
         self._rows: deque[np.ndarray] = deque(maxlen=count)
         of: Any = env.observation_space

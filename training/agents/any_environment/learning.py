@@ -119,7 +119,7 @@ def hyperparameters(algorithm: str, env_id: str, timesteps: int | None = None) -
         If there is no such algorithm, or the number of steps is not positive.
     """
     known = settings_of(algorithm)
-    found = deepcopy(known.get(env_id, known["default"]))  # stable-baselines3 adds to what it is given
+    found = deepcopy(known.get(env_id, known["default"]))
     if timesteps is not None:
         if timesteps < 1:
             raise ValueError(f"timesteps must be positive, got {timesteps}")
@@ -199,7 +199,7 @@ def learn_to_play(
             observer = str(learn_observer(task, folder, steps=spent, seed=seed, progress=bars))
         model = _fit(
             ALGORITHMS[name],
-            settings,
+            deepcopy(settings),  # to which stable-baselines3 adds
             lambda: show(task, information, observer),
             seed=seed,
             steps=steps - spent,

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
 
 from observers.checks import LARGEST, integer, is_finite, shown
 from training.rollouts.playing import make
@@ -102,7 +103,7 @@ class HiddenTask:
         return tuple(sorted({*hidden, *self.measured})) if self.measurement_noise else hidden
 
 
-class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
+class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], RecordConstructorArgs):
     """Adds independent Gaussian noise to some entries of an observation.
 
     Its generator is its own, seeded as the environment is: with noise and without, the same seed begins the same
@@ -119,7 +120,8 @@ class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:
-        super().__init__(env)
+        RecordConstructorArgs.__init__(self, entries=list(entries), standard_deviation=standard_deviation)
+        gym.ObservationWrapper.__init__(self, env)
         self._entries, self._size = list(entries), standard_deviation
         self._rng = np.random.default_rng()
         low, high = env.observation_space.low.copy(), env.observation_space.high.copy()  # type: ignore[attr-defined]
