@@ -20,12 +20,10 @@ from training.agents.comparison import (
     MORE_NOISE,
     OTHER,
     collect,
-    interval,
-    middle,
-    normalised,
     planned,
     run_case,
 )
+from training.agents.statistics import interval, middle, normalised
 from training.commands.compare import Compare, report
 from training.jobs import claimed_job, locked
 from training.systems import PROFILES
