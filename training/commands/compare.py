@@ -105,7 +105,7 @@ class Compare:
                 f"seeds, episodes and jobs must be positive, got {self.seeds}, {self.episodes} and {self.jobs}"
             )
         known: tuple[Any, ...] = SHOWN if self.environments else COMPARED
-        information = self.information or known
+        information = known if self.information is None else self.information
         for what, given in (
             ("systems", self.systems),
             ("environments", self.environments),
