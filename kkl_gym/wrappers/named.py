@@ -150,14 +150,17 @@ class Samples:
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """The outputs after a reset, and states, which no such observer is told; ``info`` gains what ours says."""
         self.count = 0
-        y = self.outputs(observation, info)
-        info |= self.states(observation, info) | {"sample": np.array(0)}
+        y, x = self.outputs(observation, info), self.states(observation, info)
+        info.pop("x", None)  # whatever else the environment calls so
+        info |= x | {"sample": np.array(0)}
         return y, self._nothing
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
         """The outputs after a step, and the inputs that led to them; ``info`` gains what ours says."""
         y, u = self.outputs(observation, info), self.inputs(action)
-        info |= self.states(observation, info) | {"u": u, "sample": np.array(self.count + 1)}
+        x = self.states(observation, info)
+        info.pop("x", None)
+        info |= x | {"u": u, "sample": np.array(self.count + 1)}
         return y, u
 
     def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:

@@ -221,7 +221,8 @@ class _Telling(VectorWrapper):
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
         told = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
-        return obs, info | told | self._states(obs, info)
+        told |= self._states(obs, info)
+        return obs, info | told
 
     def step(self, actions: Any) -> Step:
         batch = (self.num_envs,)
@@ -241,7 +242,7 @@ class _Telling(VectorWrapper):
                     there = {key: reported[key][row] for key in asked if reported.get(f"_{key}", ended)[row]}
                     shown = self._read.states(final[row], there)
                     x[row], known[row] = shown.get("x", np.nan), bool(shown)
-                told = {"y": last, "u": u, "sample": count} | ({"x": x, "_x": known} if known.any() else {})
+                told = {"y": last, "u": u, "sample": count, "x": x, "_x": known}
                 info = info | {"final_obs": final, "final_info": {**reported, **told}}
             self._count = np.where(ended, 0, count)
         else:
@@ -258,6 +259,8 @@ class _Telling(VectorWrapper):
             for key in self._asked:
                 known &= info.get(f"_{key}", True)
             found = {"x": np.where(known[:, None], found["x"], np.nan), "_x": known}
+        for key in ("x", "_x"):  # whatever else the environment calls so
+            info.pop(key, None)
         return found
 
 
