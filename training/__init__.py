@@ -59,7 +59,7 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(f"training.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
-        extra = "agents" if error.name == "stable_baselines3" else "train"
+        extra = "agents" if (error.name or "").startswith("stable_baselines3") else "train"
         raise ModuleNotFoundError(
             f'{error}: training.{name} needs pip install "kkl-gym[{extra}]"', name=error.name
         ) from None
