@@ -85,6 +85,9 @@ class KKLTrainingCallback(BaseCallback):
         Steps before the first one; by default ``every``.
     keep : int, default 100_000
         Steps that are kept; older ones are forgotten.
+    outputs : str, default "y"
+        What of ``info`` is recorded as outputs: by default what the observer saw, with whatever noise there was. Where
+        an environment tells them without noise, the key under which it does.
     path : str or path, optional
         A ``.safetensors`` file that receives the observer in use at each refit, whole or not at all.
     on_refit : callable, optional
@@ -110,7 +113,7 @@ class KKLTrainingCallback(BaseCallback):
     Notes
     -----
     Records hold what the observer saw. Noise that an environment adds is therefore that of the records, to which the
-    map's level 0 refers, as for :func:`training.learn`.
+    map's level 0 refers, as for :func:`training.learn`; with ``outputs`` level 0 is no noise.
 
     Examples
     --------
@@ -133,6 +136,7 @@ class KKLTrainingCallback(BaseCallback):
         *,
         first: int | None = None,
         keep: int = 100_000,
+        outputs: str = "y",
         path: str | os.PathLike[str] | None = None,
         on_refit: Callable[[Refit], object] | None = None,
         verbose: int = 0,
@@ -141,7 +145,7 @@ class KKLTrainingCallback(BaseCallback):
         super().__init__(verbose)
         self._every = integer("every", every, 1)
         self._next = self._every if first is None else integer("first", first, 1)
-        self._keep = integer("keep", keep, 1)
+        self._keep, self._outputs = integer("keep", keep, 1), outputs
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
             raise ValueError(f"path must end in .safetensors, got {shown(path)}")
         self._path = None if path is None else Path(path)
@@ -169,7 +173,7 @@ class KKLTrainingCallback(BaseCallback):
                     "observer in use assumes"
                 )
         if not hasattr(self, "_gathering"):
-            self._gathering = Gathering(artifact, keep=self._keep, held_out=config.held_out)
+            self._gathering = Gathering(artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs)
         else:
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config

@@ -35,6 +35,8 @@ class Gathering:
         Steps that are kept at most; the oldest are forgotten.
     held_out : float
         Share of the pieces that is held out. Each has its role for good.
+    outputs : str
+        What of ``info`` is recorded as outputs.
 
     Attributes
     ----------
@@ -42,9 +44,10 @@ class Gathering:
         Steps that were taken in so far, forgotten ones included.
     """
 
-    def __init__(self, artifact: Artifact, *, keep: int, held_out: float) -> None:
+    def __init__(self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y") -> None:
         signals, self._environment = artifact.signals or {}, artifact.environment or {}
         names = (tuple(signals[role]) for role in ("measured", "inputs", "hidden"))
+        self._outputs = outputs
         self._signals, self._dt, self._nx = Signals("t", *names), artifact.filter.dt, artifact.nx
         self._keep, self._every = keep, max(2, round(1 / held_out)) if held_out else 0
         self._open = defaultdict[int, _Piece](_Piece)  # by row
@@ -59,14 +62,14 @@ class Gathering:
         row : int
             Which environment.
         info : mapping
-            Of the reset. Without ``y`` the episode begins with the sample after it.
+            Of the reset. Without outputs the episode begins with the sample after it.
         goes_on : bool
             Whether the episode may be further than that already.
         """
         self._close(row)
         piece = self._open[row] = _Piece(goes_on=goes_on)
-        if "y" in info:
-            piece.y, piece.x = [info["y"]], [info.get("x", np.full(self._nx, np.nan))]
+        if self._outputs in info:
+            piece.y, piece.x = [info[self._outputs]], [info.get("x", np.full(self._nx, np.nan))]
 
     def add(self, row: int, info: Mapping[str, Any]) -> None:
         """Take in the sample after a step.
@@ -83,7 +86,7 @@ class Gathering:
         ValueError
             If it lacks something, or a sample was skipped.
         """
-        if missing := [key for key in ("y", "u", "x", "sample") if key not in info]:
+        if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
             raise ValueError(
                 f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation tells the true "
                 f"{', '.join(self._signals.hidden)} as 'x' where the environment inside shows them at each step; an "
@@ -100,7 +103,7 @@ class Gathering:
             piece = self._open[row] = _Piece()
         if piece.y:
             piece.u.append(info["u"])
-        piece.y.append(info["y"])
+        piece.y.append(info[self._outputs])
         piece.x.append(info["x"])
         piece.sample, piece.goes_on = sample, False
         self.steps += 1

@@ -11,7 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from rich.console import Console
 
-from observers import MLP
+from observers import MLP, Artifact
 from training.agents.agent import AgentError
 from training.agents.any_environment import learning
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
@@ -344,3 +344,21 @@ def test_the_commands_train_and_play(tmp_path, small, capsys):
         Compare(("CartPole-v1",), information=("ekf",), out=tmp_path / "g").run(Console())
     with pytest.raises(ValueError, match="environments, each once"):
         Compare(("CartPole-v1", "CartPole-v1"), out=tmp_path / "g").run(Console())
+
+
+def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, monkeypatch):
+    monkeypatch.setattr("training.agents.any_environment.observing.SETTINGS", {"inverse_steps": 100, "members": 1})
+    task = replace(PENDULUM, measurement_noise=0.1)
+    learn_to_play(task, "x_hat", tmp_path, timesteps=1700, observer_steps=400, aggregate=1, algorithm="ppo")
+    player = Player.read(tmp_path / "agent.safetensors")
+    artifact = Artifact.read(player.observer)
+    assert tuple(artifact.signals["hidden"]) == ("info[clean][0]", "info[clean][1]", "info[clean][2]")
+    assert tuple(artifact.signals["measured"]) == ("obs[0]", "obs[1]")
+    env = player.make()
+    obs, info = env.reset(seed=0)
+    assert obs.shape == (5,)
+    np.testing.assert_array_equal(info["x"], info["clean"])
+    assert not np.allclose(info["y"], info["clean_y"])
+    first = [record for record in (tmp_path / "observer").rglob("*") if record.is_file()]
+    assert first  # of the one that the agent began with
+    assert "held_out_after" in artifact.training  # as refits say it

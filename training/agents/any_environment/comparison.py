@@ -121,9 +121,10 @@ def _run(case: Case) -> dict[str, Any]:
     from stable_baselines3.common.evaluation import evaluate_policy
 
     from training.agents.any_environment.learning import learn_to_play
+    from training.agents.any_environment.observing import OBSERVER
 
     torch.set_num_threads(1)
-    kind, observer = case.kind, str(case.folder / "observer.safetensors")
+    kind, observer = case.kind, str(case.folder / OBSERVER)
     began = time.process_time()
     model: Any = None
     if kind != RANDOM:

@@ -27,7 +27,7 @@ from observers import MLP
 from observers.storage import replacing
 from training.agents.agent import fingerprint
 from training.agents.any_environment.information import Shown, show
-from training.agents.any_environment.observing import learn_observer
+from training.agents.any_environment.observing import OBSERVER, learn_observer, refitting
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
 from training.progress import ProgressBars, progress_bars
@@ -197,17 +197,23 @@ def learn_to_play(
             if not 0 < spent < steps:
                 raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
             observer = str(learn_observer(task, folder, steps=spent, seed=seed, progress=bars))
+        callbacks: list[BaseCallback] = [Curve(folder / CURVE, spent=spent, began=began)]
+        newest = folder / OBSERVER
+        if aggregate:
+            callbacks.append(refitting(task, aggregate, steps - spent, newest))
         model = _fit(
             ALGORITHMS[name],
             deepcopy(settings),  # to which stable-baselines3 adds
             lambda: show(task, information, observer),
             seed=seed,
             steps=steps - spent,
-            curve=Curve(folder / CURVE, spent=spent, began=began),
+            callbacks=callbacks,
             progress=bars,
             description=f"{task.name} {information} {seed}",
         )
     if name != RECURRENT:
+        if newest.exists():  # which is what the agent has seen last
+            observer = str(newest)
         how = {"algorithm": name, **settings, "seed": seed, "observer_steps": spent, "aggregate": aggregate}
         player_of(model, task, information, observer=observer, training=how).save(folder / "agent.safetensors")
     return model
@@ -220,7 +226,7 @@ def _fit(
     *,
     seed: int,
     steps: int,
-    curve: "Curve",
+    callbacks: list[BaseCallback],
     progress: ProgressBars,
     description: str,
 ) -> BaseAlgorithm:
@@ -240,8 +246,7 @@ def _fit(
     vec_env.seed(first)  # the model has seeded it with ``seed``
     try:
         with progress.phase(description, steps) as report:
-            curve.report = report
-            model.learn(steps, callback=curve)
+            model.learn(steps, callback=[Bar(report), *callbacks])
     finally:
         vec_env.close()
     return model
@@ -263,6 +268,24 @@ def linear(start: float) -> Callable[[float], float]:
     return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
 
 
+class Bar(BaseCallback):
+    """Tells how many steps are done.
+
+    Parameters
+    ----------
+    report : callable
+        Whom.
+    """
+
+    def __init__(self, report: Callable[[float], object]) -> None:
+        super().__init__()
+        self._report = report
+
+    def _on_step(self) -> bool:
+        self._report(self.num_timesteps)
+        return True
+
+
 class Curve(BaseCallback):
     """Writes the learning curve: steps, CPU seconds and return, at the end of each episode.
 
@@ -278,7 +301,6 @@ class Curve(BaseCallback):
 
     def __init__(self, path: Path, *, spent: int, began: float) -> None:
         super().__init__()
-        self.report: Callable[[float], object] = lambda done: None
         self._path, self._spent, self._began = path, spent, began
         self._rows = list[tuple[int, float, float]]()
 
@@ -287,7 +309,6 @@ class Curve(BaseCallback):
             if "episode" in info:  # of the monitor that make_vec_env puts around
                 seconds = round(time.process_time() - self._began, 2)
                 self._rows.append((self.num_timesteps + self._spent, seconds, round(float(info["episode"]["r"]), 4)))
-        self.report(self.num_timesteps)
         return True
 
     def _on_training_end(self) -> None:

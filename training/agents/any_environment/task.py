@@ -12,6 +12,8 @@ from gymnasium.utils import RecordConstructorArgs
 from observers.checks import LARGEST, integer, is_finite, shown
 from training.rollouts.playing import make
 
+CLEAN, CLEAN_Y = "clean", "clean_y"  # of info, what was before noise was added
+
 
 @dataclass(frozen=True)
 class HiddenTask:
@@ -60,8 +62,13 @@ class HiddenTask:
         noise = f" noise {self.measurement_noise:g}" if self.measurement_noise else ""
         return f"{self.env_id.replace('/', '-')}{noise}"
 
-    def make(self) -> gym.Env[np.ndarray, Any]:
+    def make(self, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
         """Make the environment, with flat observations and noise on what is measured.
+
+        Parameters
+        ----------
+        noisy : bool
+            Whether the noise is there; ``info`` is the same without it.
 
         Returns
         -------
@@ -84,9 +91,11 @@ class HiddenTask:
                 raise ValueError(
                     f"there is no entry {entry} in an observation of {self.env_id}: it has 0 to {space.shape[0] - 1}"
                 )
-        return MeasurementNoise(env, self.measured, self.measurement_noise) if self.measurement_noise else env
+        if not self.measurement_noise:
+            return env
+        return MeasurementNoise(env, self.measured, self.measurement_noise if noisy else 0.0)
 
-    def estimated(self, size: int) -> tuple[int, ...]:
+    def estimated(self, size: int) -> tuple[str, ...]:
         """What an observer estimates of an observation of some size.
 
         Parameters
@@ -96,18 +105,22 @@ class HiddenTask:
 
         Returns
         -------
-        tuple of int
-            Entries, in their order.
+        tuple of str
+            Signals as :func:`kkl_gym.named.resolved` takes them, in the order of the entries; under noise as they were
+            before it.
         """
         hidden = tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
-        return tuple(sorted({*hidden, *self.measured})) if self.measurement_noise else hidden
+        if not self.measurement_noise:
+            return tuple(f"obs[{i}]" for i in hidden)
+        return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*hidden, *self.measured}))
 
 
-class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], RecordConstructorArgs):
+class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Adds independent Gaussian noise to some entries of an observation.
 
     Its generator is its own, seeded as the environment is: with noise and without, the same seed begins the same
-    episodes.
+    episodes. ``info`` holds what was before the noise: ``clean``, the whole observation, and ``clean_y``, the entries
+    on which noise lies.
 
     Parameters
     ----------
@@ -121,7 +134,7 @@ class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], Reco
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:
         RecordConstructorArgs.__init__(self, entries=list(entries), standard_deviation=standard_deviation)
-        gym.ObservationWrapper.__init__(self, env)
+        gym.Wrapper.__init__(self, env)
         self._entries, self._size = list(entries), standard_deviation
         self._rng = np.random.default_rng()
         low, high = env.observation_space.low.copy(), env.observation_space.high.copy()  # type: ignore[attr-defined]
@@ -134,11 +147,17 @@ class MeasurementNoise(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], Reco
         """Reset the environment, and with a seed the noise."""
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])
-        return super().reset(seed=seed, options=options)
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._noisy(observation, info), info
 
-    def observation(self, observation: np.ndarray) -> np.ndarray:
-        """Add noise to an observation."""
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Step the environment, and add noise."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._noisy(observation, info), float(reward), terminated, truncated, info
+
+    def _noisy(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
         noisy = np.array(observation, dtype=np.float32)
+        info[CLEAN], info[CLEAN_Y] = noisy.astype(float), noisy[self._entries].astype(float)
         noisy[self._entries] += self._size * self._rng.standard_normal(len(self._entries))
         return noisy
 
