@@ -15,9 +15,8 @@ from rich.table import Table
 from kkl_gym import SYSTEMS, System, get_system
 from observers.storage import is_kind
 from training.agents.agent import Agent, AgentError
-from training.agents.any_environment.information import Shown
 from training.agents.any_environment.player import KEY, Player
-from training.agents.information import INFORMATION, Information
+from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.commands.compare import Compare
@@ -27,6 +26,8 @@ from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
+
+Knows = Literal["state", "x_hat", "z", "y", "stacked", "ekf", "recurrent"]
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Train:
             "takes it, such as Pendulum-v1.",
         ),
     ]
-    information: Annotated[Information | Shown, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
+    information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
     """What the agent knows: docs/agents.md explains each. In an environment: state, x_hat, z, stacked, recurrent or
     y."""
     seed: int = 0
@@ -73,6 +74,9 @@ class Train:
     """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
     threads: int = 1
     """CPU threads of the networks."""
+    observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
+    """Steps with random actions from which the observer of an agent in an environment is learned first, where none is
+    named; they count as the agent's."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of an agent in an environment."""
 
@@ -116,8 +120,8 @@ class Train:
             if elsewhere:
                 self._in_environment(folder, progress)
                 return
-            if self.information not in INFORMATION:
-                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got {self.information!r}")
+            if self.information == "recurrent":
+                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got 'recurrent'")
             agent = learn(
                 task,
                 self.information,
@@ -150,6 +154,7 @@ class Train:
             timesteps=self.timesteps,
             seed=self.seed,
             observer=self.observer,
+            observer_steps=self.observer_steps,
         )
 
 

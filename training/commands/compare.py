@@ -59,7 +59,7 @@ class Compare:
     environments: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[ENV_ID ...]", help_behavior_hint="")
     ] = ()
-    """Any environments of Gymnasium, of which agents see a part, in place of systems: docs/any_environment.md."""
+    """Any environments of Gymnasium, of which agents see a part, in place of systems: docs/partly_observed.md."""
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
@@ -82,10 +82,12 @@ class Compare:
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
     ] = None
     """Folder of results."""
+    noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
+        0.0,
+    )
+    """Standard deviations of the noise on what is measured in environments; each level is a task of its own."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of agents in environments."""
-    environment_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]")] = (0.0,)
-    """Standard deviations of the noise on what is measured in environments; each level is a task of its own."""
 
     def run(self, console: Console) -> None:
         """Run what is missing, then report.
@@ -124,7 +126,7 @@ class Compare:
     def _in_environments(self, information: tuple[Any, ...], console: Console) -> None:
         """Compare agents in environments of others."""
         compare_environments(
-            [self.environment.task(env_id, level) for level in self.environment_noise for env_id in self.environments],
+            [self.environment.task(env_id, level) for level in self.noise for env_id in self.environments],
             self.out or Path("runs/agents/environments"),
             console,
             kinds=information,

@@ -32,8 +32,6 @@ class EnvironmentOptions:
     """An argument of the environment, once for each; values are JSON, or text."""
     aggregate: int = 0
     """How often an observer is fitted again, to the agent's own steps, while the agent learns on it."""
-    observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
-    """Steps with random actions from which an observer is learned first; they count as the agent's."""
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.
@@ -110,7 +108,7 @@ def train_in_environment(
     progress : ProgressBars
         Where bars are.
     **how
-        Algorithm, timesteps, seed and observer.
+        Algorithm, timesteps, seed, observer and observer_steps.
 
     Raises
     ------
@@ -124,7 +122,6 @@ def train_in_environment(
         task,
         information,
         folder,
-        observer_steps=options.observer_steps,
         aggregate=options.aggregate,
         progress=progress,
         **how,
