@@ -48,12 +48,18 @@ def errors(artifact: Artifact, episodes: list[tuple[np.ndarray, ...]]) -> np.nda
 
 
 def main(
-    random_steps: int = 5_000, timesteps: int = 30_000, every: int = 5_000, batches: int = 1_000, seed: int = 0
+    random_steps: int = 5_000,
+    members: int = 3,
+    timesteps: int = 30_000,
+    every: int = 5_000,
+    batches: int = 1_000,
+    seed: int = 0,
 ) -> dict[str, float]:
     """Train the agents; returns the larger error of the two hidden signals on the agent's own episodes.
 
     Args:
         random_steps: from which the first observer is learned.
+        members: networks of the first observer, which are averaged.
         timesteps: of the agents.
         every: steps from refit to refit.
         batches: of each fit.
@@ -62,11 +68,18 @@ def main(
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         first = training.learn(
-            ENV_ID, measured=MEASURED, hidden=HIDDEN, steps=random_steps, inverse_steps=batches, seed=seed, out=folder
+            ENV_ID,
+            measured=MEASURED,
+            hidden=HIDDEN,
+            steps=random_steps,
+            inverse_steps=batches,
+            members=members,
+            seed=seed,
+            out=folder,
         )
         path = Path(folder) / f"{ENV_ID}.safetensors"
         for label, refits in (
-            ("without", None),
+            ("without refits", None),
             ("with refits", training.KKLTrainingCallback(every, inverse_steps=batches, verbose=1)),
         ):
             envs = make_vec_env(partial(wrapped, path), 4, seed=seed)
@@ -76,11 +89,10 @@ def main(
             if refits is not None:
                 env.replace_observer(refits.artifact)
             episodes = own_episodes(agent, env, 20, seed + 10_000)
-            steps = np.mean([len(u) for _, u, _ in episodes])
-            each = {"the first observer": first, "the observer in use": env.observer.artifact}
-            for name, artifact in each.items():
+            print(f"{label}: {np.mean([len(u) for _, u, _ in episodes]):.0f} steps an episode")
+            for name, artifact in (("first", first), ("newest", env.observer.artifact)):
                 error = errors(artifact, episodes)
-                print(f"{label}: {steps:.0f} steps an episode; {name} {', '.join(f'{value:.2%}' for value in error)}")
+                print(f"  errors of the {name} observer: {', '.join(f'{value:.2%}' for value in error)}")
             found[label] = float(error.max())
     return found
 
