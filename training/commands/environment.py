@@ -17,6 +17,8 @@ from training.commands.record import EnvironmentArguments
 from training.progress import ProgressBars
 from training.seeds import agent_evaluation_seed
 
+TRANSIENT = 20  # steps of an episode whose estimates are not judged
+
 
 @dataclass(frozen=True)
 class EnvironmentOptions:
@@ -135,7 +137,7 @@ def train_in_environment(
 def show_returns(
     progress: ProgressBars, player: Player, episodes: int, seed: int = 0, *, trusted: str | None = None
 ) -> np.ndarray:
-    """Play episodes; print their mean return.
+    """Play episodes; print their mean return, and how good estimates were where the truth is shown.
 
     Parameters
     ----------
@@ -161,13 +163,17 @@ def show_returns(
         If number or seed make no sense, or the agent cannot be played.
     """
     first, returns = agent_evaluation_seed(seed, episodes), []
+    states, estimates = list[np.ndarray](), list[np.ndarray]()
     with player.make(env_id=trusted) as env, progress.phase(f"playing {episodes} episodes", episodes) as report:
         for episode in range(episodes):
             observation, _ = env.reset(seed=first + episode)
-            total, ended = 0.0, False
+            total, ended, steps = 0.0, False, 0
             while not ended:
-                observation, reward, terminated, truncated, _ = env.step(player.act(observation, env.action_space))
-                total, ended = total + float(reward), terminated or truncated
+                observation, reward, terminated, truncated, info = env.step(player.act(observation, env.action_space))
+                total, ended, steps = total + float(reward), terminated or truncated, steps + 1
+                if steps > TRANSIENT and {"x", "x_hat"} <= set(info):
+                    states.append(info["x"])
+                    estimates.append(info["x_hat"])
             returns.append(total)
             report(episode + 1)
     table = Table(show_header=False)
@@ -178,5 +184,11 @@ def show_returns(
         ("return", f"{np.mean(returns):.5g} ± {np.std(returns):.3g}"),
     ):
         table.add_row(label, value)
+    if states:
+        x, x_hat = np.array(states), np.array(estimates)
+        errors = np.sqrt(np.mean((x_hat - x) ** 2, axis=0)) / np.maximum(np.std(x, axis=0), 1e-300)
+        names = env.get_wrapper_attr("observer").artifact.signals["hidden"]
+        text = ", ".join(f"{name} {error:.2%}" for name, error in zip(names, errors, strict=True))
+        table.add_row(f"error of x_hat over standard deviation, after {TRANSIENT} steps", text)
     progress.console.print(table)
     return np.array(returns)

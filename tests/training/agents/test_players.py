@@ -356,7 +356,7 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
     assert tuple(artifact.signals["measured"]) == ("obs[0]", "obs[1]")
     env = player.make()
     obs, info = env.reset(seed=0)
-    assert obs.shape == (5,)
+    assert obs.shape == (3,)
     np.testing.assert_array_equal(info["x"], info["clean"])
     assert not np.allclose(info["y"], info["clean_y"])
     first = [record for record in (tmp_path / "observer").rglob("*") if record.is_file()]

@@ -1,6 +1,7 @@
 """What an agent is shown of an environment of which a part is hidden."""
 
 from collections import deque
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -28,7 +29,8 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         The environment, what is measured and how well.
     information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
         "state": the whole observation without noise. The others see what is measured, y, with its noise. "x_hat": y,
-        and what an observer that was learned from rollouts estimates. "z": y and the memory of
+        and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
+        measured too. "z": y and the memory of
         :class:`kkl_gym.KKLMemory`. "stacked": the last eight y, each with the action before it. "recurrent": y with the
         action before it, for a policy that remembers by itself. "y": y alone.
     observer : str, optional
@@ -52,16 +54,22 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     if information == "x_hat":
         if observer is None:
             raise ValueError("an agent that is shown x_hat needs an observer")
-        return KKLObservation(env, observer, measurement_noise=task.measurement_noise)
+        env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
+        return _part(env, range(len(task.measured), env.observation_space.shape[0])) if task.measurement_noise else env
     if information == "z":
         return KKLMemory(env, task.measured)
-    space: Any = env.observation_space
-    entries = list(task.measured)
-    measured = gym.spaces.Box(space.low[entries], space.high[entries], dtype=np.float32)
-    env = TransformObservation(env, partial(_taken, entries), measured)
+    env = _part(env, task.measured)
     if information == "y":
         return env
     return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
+
+
+def _part(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
+    """Shows some entries of an observation alone."""
+    space: Any = env.observation_space
+    chosen = list(entries)
+    part = gym.spaces.Box(space.low[chosen], space.high[chosen], dtype=np.float32)
+    return TransformObservation(env, partial(_taken, chosen), part)
 
 
 def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
