@@ -55,7 +55,8 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         if observer is None:
             raise ValueError("an agent that is shown x_hat needs an observer")
         env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
-        return _part(env, range(len(task.measured), env.observation_space.shape[0])) if task.measurement_noise else env
+        shown: Any = env.observation_space
+        return _part(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
         return KKLMemory(env, task.measured)
     env = _part(env, task.measured)
