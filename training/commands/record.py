@@ -3,13 +3,17 @@
 import json
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import gymnasium as gym
 import tyro
 from rich.console import Console
 from tyro.constructors import PrimitiveConstructorSpec
 
 from training.progress import progress_bars
+
+if TYPE_CHECKING:
+    from training.rollouts.policies import Policy
 
 Argument = Annotated[
     tuple[str, Any],
@@ -42,8 +46,8 @@ class RecordCommand:
     """Signals that it will estimate, likewise."""
     policy: str = "random"
     """Who acts: random; wandering (random actions, each held for a while); a function from observation to action as
-    script.py:function or module:function; or an agent of stable-baselines3 as ppo:FILE.zip, of which loading may run
-    what is in the file."""
+    script.py:function or module:function; an agent.safetensors of `kkl-gym agent train ENV_ID --information state`; or
+    an agent of stable-baselines3 as ppo:FILE.zip, of which loading may run what is in the file."""
     episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
     """Episodes to play."""
     steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
@@ -82,7 +86,7 @@ class RecordCommand:
         name = self.dataset or f"{_word(self.env_id)}/{_word(self.policy)}-v0"
         dataset_folder(name)  # an error now, not at the end
         with progress_bars(console) as progress, make(self.env_id, dict(self.env_kwargs)) as env:
-            policy = policy_of(self.policy, env)
+            policy = _player(self.policy, env) if self.policy.endswith(".safetensors") else policy_of(self.policy, env)
             with progress.phase(f"playing {self.env_id}", steps or self.episodes or 1) as report:
                 rollouts = roll_out(
                     env,
@@ -107,6 +111,20 @@ class RecordCommand:
             progress.say(f"measured {', '.join(signals.measured)}; hidden {', '.join(signals.hidden) or 'nothing'}")
             progress.say(f"wrote {folder}: kkl-gym train NAME --data minari:{name}")
         return name
+
+
+def _player(path: str, env: gym.Env[Any, Any]) -> "Policy":
+    """What an agent of this package does that is shown the whole observation."""
+    from training.agents.any_environment.player import Player
+
+    player, here = Player.read(path), env.spec.id if env.spec else ""
+    if player.information != "state" or player.task.env_id != here:
+        raise ValueError(
+            f"{path} is an agent for {player.task.env_id} that is shown {player.information}; to be recorded in {here} "
+            "it must be shown the state of that"
+        )
+    flatten: Any = gym.spaces.flatten
+    return lambda observation: player.act(flatten(env.observation_space, observation), env.action_space)
 
 
 def names_in(text: str) -> list[str]:
@@ -145,4 +163,4 @@ def read_argument(text: str) -> tuple[str, Any]:
 
 def _word(text: str) -> str:
     """A text as a part of a data set's name."""
-    return re.sub(r"\W+", "-", text.rpartition("/")[2].lower()).strip("-") or "data"
+    return re.sub(r"\W+", "-", text.rpartition("/")[2].lower().removesuffix(".safetensors")).strip("-") or "data"

@@ -5,6 +5,7 @@ import shutil
 import warnings
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
@@ -23,6 +24,8 @@ from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.commands.agent import Evaluate, Train
 from training.commands.compare import Compare
 from training.commands.environment import EnvironmentOptions
+from training.commands.record import RecordCommand
+from training.records import read_records
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
 CART = HIDDEN_VELOCITIES["CartPole-v1"]
@@ -362,3 +365,19 @@ def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, mon
     first = [record for record in (tmp_path / "observer").rglob("*") if record.is_file()]
     assert first  # of the one that the agent began with
     assert "held_out_after" in artifact.training  # as refits say it
+
+
+def test_an_agent_on_the_state_is_recorded_as_a_policy(tmp_path, small, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "sets"))
+    learn_to_play(CART, "state", tmp_path)
+    path = tmp_path / "agent.safetensors"
+    options = {"measured": "0,2", "hidden": "1,3", "policy": str(path), "steps": 30}
+    name = RecordCommand("CartPole-v1", **options).run(Console())
+    assert name == "cartpole-v1/agent-v0"
+    (record, *_) = read_records((f"minari:{name}",))
+    player, env = Player.read(path), gym.make("CartPole-v1")
+    for k in range(len(record.t) - 1):
+        obs = np.float32([record.y[k, 0], record.x[k, 0], record.y[k, 1], record.x[k, 1]])
+        assert record.u[k].argmax() == player.act(obs, env.action_space)
+    with pytest.raises(ValueError, match="shown the state of that"):
+        RecordCommand("Acrobot-v1", **{**options, "measured": "0", "hidden": "1"}).run(Console())
