@@ -96,7 +96,7 @@ def _check(hidden: Sequence[str | int], settings: Mapping[str, Any], out: Path |
     """What would be an error after all was played is one before."""
     if not np.size(hidden):
         raise ValueError("say which signals are hidden, which the observer is to estimate, as in hidden=[2]")
-    chosen_later = {"eigenvalues": (-1.0,), "dt": 1.0, "measurement_noise_max": 1.0}
+    chosen_later: dict[str, Any] = {"eigenvalues": (-1.0,), "dt": 1.0, "measurement_noise_max": 1.0}
     RecordedConfig(**chosen_later | {name: value for name, value in settings.items() if value is not None})
     if out is not None:
         refuse_checkpoints(out)
