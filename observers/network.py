@@ -19,7 +19,11 @@ def _silu(h: np.ndarray) -> np.ndarray:
     return h
 
 
-ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "silu": _silu}
+def _relu(h: np.ndarray) -> np.ndarray:
+    return np.maximum(h, 0.0, out=h)
+
+
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": _tanh, "silu": _silu, "relu": _relu}
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class MLP:
         For each layer, as torch stores them.
     biases : sequence of ndarray, shape (outputs,) each
         For each layer.
-    activation : {"tanh", "silu"}
+    activation : {"tanh", "silu", "relu"}
         After every layer but the last.
 
     Raises

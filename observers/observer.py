@@ -10,6 +10,7 @@ import numpy as np
 from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.monitor import Monitor
+from observers.replacement import check_replacement
 
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
@@ -120,6 +121,32 @@ class KKLObserver:
         levels, free = (self._measurement_noise, self._process_noise), self.artifact.free_inverse
         driven = _Decoder(self.artifact.inverse.part(outputs), *levels)
         return _Decoders(driven, None if free is None else _Decoder(free.part(outputs), *levels))
+
+    def replace(self, artifact: Artifact) -> None:
+        """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
+
+        Parameters
+        ----------
+        artifact : Artifact
+            Of the same signals, with the same A, B and dt.
+
+        Raises
+        ------
+        ArtifactError
+            If it differs in more than its maps.
+        ValueError
+            If the noise level is beyond its range, or it holds no limits and there is a monitor, which begins anew. The
+            observer is then as it was.
+        """
+        check_replacement(self.artifact, artifact)
+        other = KKLObserver(
+            artifact, self._measurement_noise, process_noise=self._process_noise, monitor=self._monitored
+        )
+        if self._z is not None:
+            other._z, other._y, other._age = self._z, self._y, self._age
+            if other._monitor is not None:
+                other._monitor.reset(self._z.shape[:-1])
+        vars(self).update(vars(other))
 
     @property
     def z(self) -> np.ndarray:

@@ -226,6 +226,29 @@ def read(
     return tensors, described
 
 
+def is_kind(path: str | os.PathLike[str], key: str) -> bool:
+    """Whether a file is of a kind, by what its header says; not whether it is whole.
+
+    Parameters
+    ----------
+    path : str or PathLike
+        The file.
+    key : str
+        The kind of file, as :func:`save` was told.
+
+    Returns
+    -------
+    bool
+        False also where there is no such file, or it is none of ours.
+    """
+    try:
+        header, _ = _parts(_content(path, ValueError))
+    except (ValueError, RecursionError):
+        return False
+    metadata = header.get("__metadata__") if isinstance(header, dict) else None
+    return isinstance(metadata, dict) and key in metadata
+
+
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
     """Compute the checksum of what a file of arrays holds, which stays the same when the file gets one.
 

@@ -44,6 +44,13 @@ def test_any_environment(capsys):
     assert "the agent sees 3 numbers" in capsys.readouterr().out
 
 
+def test_any_environment_agent(capsys):
+    small = {"random_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
+    found = example("any_environment_agent")(**small)
+    assert 0 < found["with refits"] != found["without refits"] > 0
+    assert "refitted the observer at step 1024" in capsys.readouterr().out
+
+
 def test_own_system(tmp_path):
     assert example("own_system")(inverse_steps=500, trajectories=100, out=tmp_path) < 20.0
 

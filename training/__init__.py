@@ -13,10 +13,12 @@ if TYPE_CHECKING:
     from training.pipeline import Result, train
     from training.presets import preset
     from training.rollouts import learn
+    from training.rollouts.callback import KKLTrainingCallback
 
 __all__ = [
     "Certificate",
     "Config",
+    "KKLTrainingCallback",
     "Result",
     "adapt",
     "calibrate",
@@ -34,6 +36,7 @@ __all__ = [
 _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
+    "KKLTrainingCallback": "rollouts.callback",
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "evaluation.calibration",
@@ -56,6 +59,7 @@ def __getattr__(name: str) -> Any:
     try:
         return getattr(import_module(f"training.{_MODULES[name]}"), name)
     except ModuleNotFoundError as error:
+        extra = "agents" if (error.name or "").startswith("stable_baselines3") else "train"
         raise ModuleNotFoundError(
-            f'{error}: training.{name} needs pip install "kkl-gym[train]"', name=error.name
+            f'{error}: training.{name} needs pip install "kkl-gym[{extra}]"', name=error.name
         ) from None

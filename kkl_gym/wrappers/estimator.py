@@ -164,6 +164,26 @@ class KKLEstimator:
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
 
+    def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
+        """Take other maps for the same filter, which goes on.
+
+        Parameters
+        ----------
+        observer : str or path or Artifact
+            A shipped name, a path if it ends in ``.safetensors``, or what is behind one.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`observers.KKLObserver.replace`.
+        observers.ArtifactError
+            If it differs in more than its maps, or holds no forward map and starts are known.
+        """
+        artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
+        if self._known_start:
+            artifact.require_forward()
+        self.observer.replace(artifact)
+
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it.
 

@@ -126,6 +126,10 @@ class Samples:
     ----------
     outputs, inputs : callable
         What reads them.
+    hidden : callable or None
+        What reads the hidden signals; None where observations do not show them.
+    nx : int
+        Number of hidden signals.
     count : int
         Samples since the reset.
 
@@ -142,17 +146,57 @@ class Samples:
         names = resolved(signals["measured"], observation_space, role="measured", source=source)
         self.outputs = Reader(observation_space, names, source=source)
         self.inputs = InputReader(action_space, signals["inputs"], source=source)
-        self._nothing = np.full(artifact.nx, np.nan)
+        self.hidden = _reader_of_hidden(observation_space, signals["hidden"], source)
+        self.nx, self._nothing = artifact.nx, np.full(artifact.nx, np.nan)
         self.count = 0
 
-    def first(self, observation: Any, info: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a reset, and states, which nobody knows."""
+    def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a reset, and states, which no such observer is told; ``info`` gains what ours says."""
         self.count = 0
-        return self.outputs(observation, info), self._nothing
+        y, x = self.outputs(observation, info), self.states(observation, info)
+        info.pop("x", None)  # whatever else the environment calls so
+        info |= x | {"sample": np.array(0)}
+        return y, self._nothing
 
-    def next(self, observation: Any, info: Mapping[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a step, and the inputs that led to them."""
-        return self.outputs(observation, info), self.inputs(action)
+    def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs after a step, and the inputs that led to them; ``info`` gains what ours says."""
+        y, u = self.outputs(observation, info), self.inputs(action)
+        x = self.states(observation, info)
+        info.pop("x", None)
+        info |= x | {"u": u, "sample": np.array(self.count + 1)}
+        return y, u
+
+    def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
+        """True hidden signals.
+
+        Parameters
+        ----------
+        observation : object
+            Of the environment inside, or as many as ``batch`` says.
+        info : mapping
+            What came with it.
+        batch : tuple of int
+            Leading shape of both.
+
+        Returns
+        -------
+        dict of str to ndarray
+            ``x``, shape (*batch, nx); nothing where they are not shown.
+        """
+        if self.hidden is None:
+            return {}
+        try:
+            return {"x": self.hidden(observation, info, batch)}
+        except ValueError:  # a wrapper inside has blanked them, or info does not hold them at this step
+            return {}
+
+
+def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) -> Reader | None:
+    """What reads the hidden signals, which observations need not show."""
+    try:
+        return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
+    except ValueError:
+        return None
 
 
 def _check_actions(env: Any, space: gym.Space[Any]) -> None:

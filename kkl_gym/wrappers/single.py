@@ -55,7 +55,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or
     ``training.learn``). That one sees the signals of the observation that its file names, and the actions. The
     observation is then [y, x_hat] or [y, z]: what is measured, and beside it what is estimated. ``info`` gains ``y``
-    as well.
+    as well, ``u``, the inputs that led to it, and the number of the ``sample`` since the reset. It also gains ``x``,
+    shape (nx,), the true hidden signals, where the environment inside shows them. That is privileged: it is for
+    evaluation and for ``training.KKLTrainingCallback``.
 
     Parameters
     ----------
@@ -226,6 +228,26 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self._estimator.advance(*self._samples.next(obs, info, action))
         self._samples.count += 1
         return self._show(info), float(reward), terminated, truncated, info
+
+    def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
+        """Take the maps of another observer with the same filter, at once: the filter's state stays.
+
+        The specification ``env.spec`` still names the observer that the wrapper was made with. Vectors of
+        stable-baselines3 take it by ``env_method("replace_observer", artifact)``.
+
+        Parameters
+        ----------
+        observer : str or path or Artifact
+            A shipped name, a path if it ends in ``.safetensors``, or what is behind one.
+
+        Raises
+        ------
+        ValueError
+            If the noise level is beyond its range, or it holds no limits and there is a monitor.
+        observers.ArtifactError
+            If it differs in more than its maps (A, B, dt, signals), or the file is missing or damaged.
+        """
+        self._estimator.replace(observer)
 
     def render(self) -> np.ndarray | None:
         """Draw the phase portrait with states and estimates so far; other environments draw what they draw.

@@ -211,6 +211,7 @@ class _Telling(VectorWrapper):
                 f"the observer measures info[{samples.outputs.keys[0]}], which vectors do not say at each step: put "
                 "KKLObservation into each environment"
             )
+        self._asked = () if samples.hidden is None else samples.hidden.keys
         self._ended, self._count = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64)
 
     def reset(
@@ -219,7 +220,9 @@ class _Telling(VectorWrapper):
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
-        return obs, info | {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
+        told = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
+        told |= self._states(obs, info)
+        return obs, info | told
 
     def step(self, actions: Any) -> Step:
         batch = (self.num_envs,)
@@ -230,16 +233,35 @@ class _Telling(VectorWrapper):
         if self._mode is AutoresetMode.SAME_STEP:
             if ended.any():
                 last, final = y.copy(), np.full(self.num_envs, None, dtype=object)
+                reported = info.get("final_info", {})
+                asked = [key for key in self._asked if key in reported]
+                x, known = np.full((self.num_envs, self._read.nx), np.nan), np.zeros(self.num_envs, dtype=bool)
                 for row in np.flatnonzero(ended):
                     final[row] = info["final_obs"][row]
                     last[row] = self._read.outputs(final[row], {})
-                told = {"y": last, "u": u, "sample": count}
-                info = info | {"final_obs": final, "final_info": {**info.get("final_info", {}), **told}}
+                    there = {key: reported[key][row] for key in asked if reported.get(f"_{key}", ended)[row]}
+                    shown = self._read.states(final[row], there)
+                    x[row], known[row] = shown.get("x", np.nan), bool(shown)
+                told = {"y": last, "u": u, "sample": count, "x": x, "_x": known}
+                info = info | {"final_obs": final, "final_info": {**reported, **told}}
             self._count = np.where(ended, 0, count)
         else:
             waits = self._count if self._mode is AutoresetMode.DISABLED else 0
             self._ended, self._count = ended, np.where(before, waits, count)
-        return obs, reward, terminated, truncated, info | {"y": y, "u": u, "sample": self._count.copy()}
+        told = {"y": y, "u": u, "sample": self._count.copy()} | self._states(obs, info)
+        return obs, reward, terminated, truncated, info | told
+
+    def _states(self, obs: Any, info: Infos) -> dict[str, np.ndarray]:
+        """True hidden signals and of which rows they are, where they are shown."""
+        found = self._read.states(obs, info, (self.num_envs,))
+        if found:
+            known = np.ones(self.num_envs, dtype=bool)
+            for key in self._asked:
+                known &= info.get(f"_{key}", True)
+            found = {"x": np.where(known[:, None], found["x"], np.nan), "_x": known}
+        for key in ("x", "_x"):  # whatever else the environment calls so
+            info.pop(key, None)
+        return found
 
 
 def _states(info: Infos, rows: np.ndarray) -> np.ndarray:
@@ -255,7 +277,8 @@ class KKLVectorObservation(VectorEstimate):
     what is measured beside the estimates, as :class:`kkl_gym.KKLObservation` does.
 
     ``info`` gains ``z``, with ``estimate="x"`` ``x_hat``, and with ``monitor`` ``score``, a row for each environment;
-    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates.
+    so does ``info["final_info"]``, and ``info["final_obs"]`` holds the last estimates. Around another environment it
+    gains ``y``, ``u``, ``sample`` and ``x`` as well, as there.
 
     Parameters
     ----------
@@ -340,8 +363,26 @@ class KKLVectorObservation(VectorEstimate):
             if estimator.observer.artifact.process_noise_max is not None:
                 plant_of(env, "process_noise")
         super().__init__(env, estimator)
+        self._estimator: KKLEstimator = estimator
         self.observer = estimator.observer
         self.estimate = estimate
+
+    def replace_observer(self, observer: str | os.PathLike[str] | Artifact) -> None:
+        """Take the maps of another observer with the same filter, in all rows at once: the filters' states stay.
+
+        Parameters
+        ----------
+        observer : str or path or Artifact
+            As for :meth:`kkl_gym.KKLObservation.replace_observer`.
+
+        Raises
+        ------
+        ValueError
+            As there.
+        observers.ArtifactError
+            As there.
+        """
+        self._estimator.replace(observer)
 
 
 class VectorActionRepeat(VectorWrapper):

@@ -1,5 +1,6 @@
 """Observers from rollouts around the environments that these are of."""
 
+from dataclasses import replace
 from functools import partial
 
 import gymnasium as gym
@@ -46,6 +47,8 @@ def test_shows_what_is_measured_and_what_the_observer_says_of_it(saved, estimate
         shown = x_hat if estimate == "x" else expected.z
         np.testing.assert_allclose(info["x_hat" if estimate == "x" else "z"], shown)
         np.testing.assert_array_equal(info["y"], raw[:2])
+        np.testing.assert_allclose(info["x"], [raw[2], np.cos(raw[2])])
+        np.testing.assert_allclose(info["u"], action / 2.0)
         clipped = np.clip(np.concatenate([raw[:2], shown]), env.observation_space.low, env.observation_space.high)
         np.testing.assert_allclose(obs, clipped, rtol=1e-6)
         assert estimate == "x" or (abs(shown) <= env.observation_space.high[2:]).all()
@@ -155,6 +158,124 @@ def test_rows_of_a_vector_are_single_environments(saved, mode):
         np.testing.assert_allclose(info["y"], expected[:, :2], rtol=1e-6)
         ended = terminated | truncated
     assert finals > 3 or mode is not gym.vector.AutoresetMode.SAME_STEP
+
+
+class Told(gym.Env):
+    """A counter that shows itself. ``info`` says its square, not at resets, and what is to be hidden in silence."""
+
+    observation_space = gym.spaces.Box(-99.0, 99.0, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, silent=False):
+        self.silent = silent
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.float32([0, 10]), {"x": "what the environment calls x"}
+
+    def step(self, action):
+        self.count += 1
+        info = {} if self.silent else {"square": self.count**2}
+        return np.float32([self.count, 10 + self.count]), 0.0, self.count == 5, False, info
+
+
+@pytest.fixture
+def told():
+    gym.register("Told-v0", entry_point=Told, disable_env_checker=True)
+    yield partial(gym.make, "Told-v0")
+    gym.registry.pop("Told-v0")
+
+
+def test_hidden_signals_that_info_says_at_steps_alone(saved, told):
+    env = KKLObservation(told(), saved(observer_of("Told-v0", ["obs[0]"], ["obs[1]", "info[square]"], [])))
+    _, info = env.reset(seed=0)
+    assert "x" not in info
+    assert info["sample"] == 0
+    for k in (1, 2, 3):
+        *_, info = env.step(0)
+        assert info["x"].tolist() == [10.0 + k, k**2]
+        assert info["u"].shape == (0,)
+        assert info["sample"] == k
+
+
+@pytest.mark.parametrize("mode", [gym.vector.AutoresetMode.NEXT_STEP, gym.vector.AutoresetMode.SAME_STEP])
+def test_hidden_signals_of_vectors(saved, told, mode):
+    path = saved(observer_of("Told-v0", ["obs[0]"], ["obs[1]", "info[square]"], ["action[1]"]))
+    envs = KKLVectorObservation(gym.vector.SyncVectorEnv([told] * 2, autoreset_mode=mode), path)
+    envs.reset(seed=0)
+    for k in range(1, 12):
+        *_, info = envs.step(np.array([0, 1]))
+        over = mode is gym.vector.AutoresetMode.SAME_STEP and k % 5 == 0
+        seen = info["final_info"] if over else info
+        count = (k - 1) % 5 + 1 if mode is gym.vector.AutoresetMode.SAME_STEP else k % 6
+        if count:
+            np.testing.assert_array_equal(seen["x"], [[10.0 + count, count**2]] * 2)
+            assert seen["_x"].all()
+            np.testing.assert_array_equal(seen["u"], [[0.0], [1.0]])
+        if over or not count:
+            assert not info.get("_x", np.zeros(2)).any()  # of the reset, that says no square
+
+
+def test_hidden_signals_that_are_not_shown(saved, told):
+    path = saved(PENDULUM())
+    for blanked in (
+        gym.wrappers.TransformObservation(gym.make("Pendulum-v1"), lambda obs: obs * [1, 1, np.nan], None),
+        gym.wrappers.TransformObservation(
+            gym.make("Pendulum-v1"), lambda obs: obs[:2], gym.spaces.Box(-1.0, 1.0, (2,))
+        ),
+    ):
+        env = KKLObservation(blanked, path)
+        _, first = env.reset(seed=0)
+        *_, info = env.step(np.zeros(1, np.float32))
+        assert "x" not in {**first, **info}
+    silent = saved(observer_of("Told-v0", ["obs[0]"], ["info[square]"], [], kwargs={"silent": True}))
+    envs = KKLVectorObservation(gym.vector.SyncVectorEnv([partial(told, silent=True)] * 2), silent)
+    envs.reset(seed=0)
+    *_, info = envs.step(np.array([0, 1]))
+    assert "x" not in info
+
+
+def other_maps(artifact):
+    inverse = artifact.inverse
+    return replace(artifact, inverse=replace(inverse, x_offset=inverse.x_offset + 0.5))
+
+
+@pytest.mark.parametrize("as_path", [False, True])
+def test_the_observer_is_replaced_at_once(saved, tmp_path, as_path):
+    artifact, path = CART_POLE(), saved(CART_POLE())
+    other = other_maps(artifact)
+    if as_path:
+        other.save(tmp_path / "other.safetensors")
+    env, same = (KKLObservation(gym.make("CartPole-v1"), path) for _ in range(2))
+    envs = KKLVectorObservation(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), path)
+    for each in (env, same, envs):
+        each.reset(seed=1)
+        each.step(each.action_space.sample() * 0)
+    for each in (env, envs):
+        each.replace_observer(tmp_path / "other.safetensors" if as_path else other)
+    *_, info = env.step(1)
+    *_, before = same.step(1)
+    np.testing.assert_allclose(info["z"], before["z"])
+    np.testing.assert_allclose(info["x_hat"], before["x_hat"] + 0.5, rtol=1e-6)
+    *_, rows = envs.step(np.array([1, 1]))
+    np.testing.assert_allclose(rows["x_hat"][0], info["x_hat"], rtol=1e-5)
+    assert env.observer.artifact.inverse.x_offset[0] == 0.5
+
+
+def test_observers_that_do_not_replace(saved):
+    env = KKLObservation(gym.make("CartPole-v1"), saved(CART_POLE()))
+    for other, told in (
+        (PENDULUM(), "has environment"),
+        (replace(CART_POLE(), signals=CART_POLE().signals | {"hidden": ["obs[1]", "obs[3]"]}), "has signals"),
+        ("van_der_pol", "has environment"),
+        (3, "a shipped name or a path, got 3"),
+    ):
+        with pytest.raises(ArtifactError, match=told):
+            env.replace_observer(other)
+    spinn = KKLObservation(gym.make("KKLVanDerPol-v0"), "van_der_pol-spinn", known_start=True)
+    with pytest.raises(ArtifactError, match="holds no forward map"):
+        spinn.replace_observer(replace(spinn.observer.artifact, forward=None))
 
 
 def test_vectors_that_are_no_rows_of_environments(saved):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 import numpy as np
-import scipy
 
 import kkl_gym
 from kkl_gym import get_system
@@ -355,60 +354,3 @@ def collect(
                 }
             )
     return pd.DataFrame(rows)
-
-
-def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scores on a scale on which zero input has 0.
-
-    Parameters
-    ----------
-    scores : array_like
-        To be put on the scale.
-    top : array_like
-        What has 1, of a shape that goes with that of ``scores``.
-    idle : float
-        Score of zero input.
-
-    Returns
-    -------
-    ndarray
-        NaN where ``top`` is no better than zero input.
-    """
-    span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
-    return np.asarray((scores - idle) / span)
-
-
-def middle(values: np.ndarray, axis: int = -1) -> Any:
-    """Interquartile mean along an axis."""
-    return scipy.stats.trim_mean(values, 0.25, axis=axis)
-
-
-def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, float, float]:
-    """Interquartile mean of the normalised scores of agents, with a bootstrap 95 % interval.
-
-    With five agents the interval covers about nine times in ten, for which bootstrap intervals of so few are known.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Scores of these agents, one for each.
-    best : ndarray, shape (m,)
-        Scores of those that know the full state. They are resampled as well, unless they are ``values`` itself.
-    idle : float
-        Score of zero input.
-
-    Returns
-    -------
-    found, low, high : float
-        The mean and the ends of the interval, which are NaN for fewer than three agents.
-    """
-
-    def statistic(mine: np.ndarray, tops: np.ndarray = best, axis: int = -1) -> np.ndarray:
-        return normalised(middle(mine, axis), middle(tops, axis), idle)
-
-    found = float(statistic(values))
-    if min(len(values), len(best)) < 3:
-        return found, np.nan, np.nan
-    samples = (values,) if values is best else (values, best)
-    ends = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0).confidence_interval
-    return found, float(ends.low), float(ends.high)

@@ -1,7 +1,7 @@
 """``kkl-gym agent``: train and evaluate agents."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,29 +13,43 @@ from rich.console import Console
 from rich.table import Table
 
 from kkl_gym import SYSTEMS, System, get_system
+from observers.storage import is_kind
 from training.agents.agent import Agent, AgentError
-from training.agents.information import Information
+from training.agents.any_environment.player import KEY, Player
+from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.commands.compare import Compare
-from training.commands.options import NoiseLevel, SystemName
+from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
+from training.commands.options import NoiseLevel
 from training.evaluation.levels import as_name, show_level
 from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
 
+Knows = Literal["state", "x_hat", "z", "y", "stacked", "ekf", "recurrent"]
+
 
 @dataclass(frozen=True)
 class Train:
-    """Train an agent with stable-baselines3 to hold a system's target.
+    """Train an agent with stable-baselines3: to hold a system's target, or in any environment of which it sees a part.
 
-    Writes agent.safetensors (the policy, with its task and observer) and progress.csv (the learning curve) into the
-    run's folder. Hyperparameters are those of training/agents/hyperparameters.
+    Writes agent.safetensors (the policy, with its task and observer) and progress.csv or curve.csv (the learning curve)
+    into the run's folder. Hyperparameters are those of training/agents/hyperparameters, or of
+    training/agents/any_environment/hyperparameters.
     """
 
-    system: SystemName
-    information: Annotated[Information, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
-    """What the agent knows: docs/agents.md explains each."""
+    system: Annotated[
+        tyro.conf.Positional[str],
+        tyro.conf.arg(
+            metavar="SYSTEM|ENV_ID",
+            help="A shipped system, a class of yours as script.py:Class or module:Class, or an environment as gym.make "
+            "takes it, such as Pendulum-v1.",
+        ),
+    ]
+    information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
+    """What the agent knows: docs/agents.md explains each. In an environment: state, x_hat, z, stacked, recurrent or
+    y."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
@@ -48,10 +62,10 @@ class Train:
     ] = None
     """A shipped map's name or a .safetensors file, for an agent that knows x_hat or z."""
     algorithm: Annotated[
-        Literal["ppo", "sac"] | None,
-        tyro.conf.arg(help_behavior_hint="(default: the profile's; sac for reverse_duffing, else ppo)"),
+        Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
+        tyro.conf.arg(help_behavior_hint="(default: sac for reverse_duffing and where it is tuned, else ppo)"),
     ] = None
-    """What the agent is trained with."""
+    """What the agent is trained with; for systems ppo or sac, for an agent that remembers by itself ppo_lstm."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/SYSTEM-INFORMATION-SEED)")] = (
         None
     )
@@ -60,6 +74,11 @@ class Train:
     """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
     threads: int = 1
     """CPU threads of the networks."""
+    observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
+    """Steps with random actions from which the observer of an agent in an environment is learned first, where none is
+    named; they count as the agent's."""
+    environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
+    """Of an agent in an environment."""
 
     def run(self, console: Console) -> None:
         """Train, and play a hundred episodes.
@@ -81,8 +100,10 @@ class Train:
         from training.agents.learn import learn
         from training.checkpoints import SUFFIX
 
-        task = get_task(self.system, self.measurement_noise)
-        name = get_system(task.system).name
+        elsewhere = is_environment(self.system)
+        if not elsewhere:
+            task = get_task(self.system, self.measurement_noise)
+        name = self.system.replace("/", "-") if elsewhere else get_system(task.system).name
         folder = self.out or Path("runs/agents") / f"{name}-{self.information}-{self.seed}"
         if self.threads < 1:
             raise ValueError(f"threads must be at least 1, got {self.threads}")
@@ -96,6 +117,11 @@ class Train:
                     "another folder with --out"
                 )
             progress.say(f"training an agent for {name} that knows {self.information}, in {folder}")
+            if elsewhere:
+                self._in_environment(folder, progress)
+                return
+            if self.information == "recurrent":
+                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got 'recurrent'")
             agent = learn(
                 task,
                 self.information,
@@ -109,6 +135,27 @@ class Train:
             )
             show(progress, agent, 100, trusted=agent.task.system)
             progress.say(f"wrote agent.safetensors, progress.csv and {LOG} in {folder}")
+
+    def _in_environment(self, folder: Path, progress: ProgressBars) -> None:
+        """Train in an environment of others."""
+        noise = self.measurement_noise or 0.0
+        if isinstance(noise, tuple):
+            raise ValueError(f"the noise in an environment is one number for all that is measured, got {noise}")
+        if self.resume:
+            raise ValueError("the training of an agent in an environment begins anew: leave --resume out")
+        train_in_environment(
+            self.environment,
+            self.system,
+            self.information,
+            folder=folder,
+            measurement_noise=noise,
+            progress=progress,
+            algorithm=self.algorithm,
+            timesteps=self.timesteps,
+            seed=self.seed,
+            observer=self.observer,
+            observer_steps=self.observer_steps,
+        )
 
 
 @dataclass(frozen=True)
@@ -125,7 +172,8 @@ class Evaluate:
     seed: int = 0
     """Seed of the episodes; no seed gives any that training draws."""
     system: Annotated[str | None, tyro.conf.arg(metavar="CLASS", help_behavior_hint="")] = None
-    """The agent's system if it is one of your own: script.py:Class or module:Class, as the agent's file names it."""
+    """The agent's system or environment if it is one of your own: script.py:Class, module:Class or module:ID, as the
+    agent's file names it."""
     out: Path = Path("runs/agents")
     """Folder for NAME.png and NAME.gif."""
 
@@ -144,7 +192,12 @@ class Evaluate:
         """
         from training.agents.picture import animate, draw
 
-        agent = Agent.read(find(self.agent))
+        path = find(self.agent)
+        if is_kind(path, KEY):
+            with progress_bars(console) as progress:
+                show_returns(progress, Player.read(path), self.episodes, self.seed, trusted=self.system)
+            return
+        agent = Agent.read(path)
         task = agent.task
         if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")

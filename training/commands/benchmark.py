@@ -11,8 +11,9 @@ from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
 from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
+from training.commands.running import run_missing
 from training.evaluation.levels import multiple, show_level
-from training.progress import LOG, progress_bars, under_way
+from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator
 
 if TYPE_CHECKING:
@@ -74,7 +75,6 @@ class Benchmark:
         """
         from training.benchmark.jobs import run_job, time_steps  # torch takes seconds to import
         from training.benchmark.results import check_results, collect, report
-        from training.jobs import run_all
 
         name = "quick" if self.quick else self.budget
         out = self.out or Path("runs") / "benchmark" / name
@@ -82,20 +82,10 @@ class Benchmark:
             check_results(self.beside)
         clear_unfinished(out)
         with progress_bars(console, out / LOG) as progress:
-            failures = []
+            failures = list[str]()
             if not self.report:
                 jobs = self._jobs(name, out)
-                todo = [job for job in jobs if not job.done]
-                workers = min(self.jobs, max(1, len(todo)))
-                task = progress.add_task("observers", total=len(jobs), completed=len(jobs) - len(todo))
-                progress.update(task, description=under_way("observers", [job.name for job in todo[:workers]]))
-                for job, failure, running in run_all(run_job, todo, workers):
-                    if failure:
-                        failures.append(f"{job.name}: {failure}")
-                        progress.say(f"failed {failures[-1]} ({job.folder / 'failure.txt'})")
-                    else:
-                        progress.say(f"finished {job.name}")
-                    progress.update(task, advance=1, description=under_way("observers", running))
+                failures = run_missing(run_job, jobs, workers=self.jobs, what="observers", progress=progress)
                 trained = [job for job in jobs if job.done]
                 for job in progress.track(trained, description="timing steps"):
                     try:

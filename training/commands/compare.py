@@ -1,6 +1,6 @@
 """``kkl-gym agent compare``."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,23 +13,24 @@ from observers import Artifact
 from observers.artifact import resolve
 from observers.storage import replacing, write
 from training import markdown
+from training.agents.any_environment.information import SHOWN
 from training.agents.comparison import (
     COMPARED,
     Compared,
     collect,
-    interval,
     kinds,
-    middle,
     noise_levels,
-    normalised,
     planned,
     run_case,
 )
 from training.agents.information import observer_of
+from training.agents.statistics import interval, middle, normalised
 from training.agents.tasks import TASKS
+from training.commands.compare_environments import compare_environments
+from training.commands.environment import EnvironmentOptions
+from training.commands.running import run_missing
 from training.evaluation.levels import as_name
-from training.jobs import run_all
-from training.progress import LOG, progress_bars, under_way
+from training.progress import LOG, progress_bars
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,12 +53,19 @@ class Compare:
 
     Writes OUT/results.csv (a row for each agent), OUT/table.md and OUT/scores.png. Each agent is a job with a folder of
     its own; what is there is not done again, so that a run may be stopped at any time. Missing agents are said to be.
+    In environments there are also curves.csv and curves.png, the learning curves.
     """
 
+    environments: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[ENV_ID ...]", help_behavior_hint="")
+    ] = ()
+    """Any environments of Gymnasium, of which agents see a part, in place of systems: docs/partly_observed.md."""
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
-    information: Annotated[tuple[Compared, ...], tyro.conf.arg(aliases=["--knows"])] = COMPARED
-    """What agents know: docs/agents.md explains each."""
+    information: Annotated[
+        tuple[Compared, ...] | None, tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all)")
+    ] = None
+    """What agents know: docs/agents.md explains each. In environments: state, x_hat, z, stacked, recurrent, y."""
     seeds: int = 5
     """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
     episodes: int = 100
@@ -70,8 +78,16 @@ class Compare:
     """Observers for agents that know x_hat or z: a .safetensors file for each system of yours, or shipped maps."""
     jobs: int = 2
     """Number of worker processes, of one thread each."""
-    out: Path = Path("runs/agents/comparison")
+    out: Annotated[
+        Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
+    ] = None
     """Folder of results."""
+    noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
+        0.0,
+    )
+    """Standard deviations of the noise on what is measured in environments; each level is a task of its own."""
+    environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
+    """Of agents in environments."""
 
     def run(self, console: Console) -> None:
         """Run what is missing, then report.
@@ -90,46 +106,66 @@ class Compare:
             raise ValueError(
                 f"seeds, episodes and jobs must be positive, got {self.seeds}, {self.episodes} and {self.jobs}"
             )
-        for what, given in (("systems", self.systems), ("information", self.information)):
-            if not given or len(set(given)) < len(given):
+        known: tuple[Any, ...] = SHOWN if self.environments else COMPARED
+        information = known if self.information is None else self.information
+        for what, given in (
+            ("systems", self.systems),
+            ("environments", self.environments),
+            ("information", information),
+        ):
+            if len(set(given)) < len(given) or not (given or what == "environments"):
                 raise ValueError(f"give some {what}, each once; got {', '.join(given) or 'none'}")
-        observers = self._observers()
+        for what in information:
+            if what not in known:
+                raise ValueError(f"agents are compared by {', '.join(known)} here, got {what!r}")
+        if self.environments:
+            self._in_environments(information, console)
+        else:
+            self._on_systems(information, self.out or Path("runs/agents/comparison"), console)
+
+    def _in_environments(self, information: tuple[Any, ...], console: Console) -> None:
+        """Compare agents in environments of others."""
+        compare_environments(
+            [self.environment.task(env_id, level) for level in self.noise for env_id in self.environments],
+            self.out or Path("runs/agents/environments"),
+            console,
+            kinds=information,
+            seeds=self.seeds,
+            episodes=self.episodes,
+            timesteps=self.timesteps,
+            aggregate=self.environment.aggregate,
+            jobs=self.jobs,
+        )
+
+    def _on_systems(self, information: tuple[Compared, ...], out: Path, console: Console) -> None:
+        """Compare agents on systems."""
+        observers = self._observers(information)
         cases = planned(
-            self.out,
+            out,
             systems=self.systems,
-            information=self.information,
+            information=information,
             seeds=self.seeds,
             episodes=self.episodes,
             timesteps=self.timesteps,
             more_noise=self.more_noise,
             observers=observers,
         )
-        todo = [case for case in cases if not case.done]
-        failures = []
+        failures = list[str]()
         try:
-            with progress_bars(console, self.out / LOG) as progress:
-                workers = min(self.jobs, max(1, len(todo)))
-                bar = progress.add_task("agents", total=len(cases), completed=len(cases) - len(todo))
-                progress.update(bar, description=under_way("agents", [case.name for case in todo[:workers]]))
-                for case, failure, running in run_all(run_case, todo, workers):
-                    if failure:
-                        failures.append(f"{case.name}: {failure}")
-                    progress.say(f"failed {failures[-1]}" if failure else f"finished {case.name}")
-                    progress.update(bar, advance=1, description=under_way("agents", running))
+            with progress_bars(console, out / LOG) as progress:
+                failures = run_missing(run_case, cases, workers=self.jobs, what="agents", progress=progress)
         finally:  # also after an interruption
-            with progress_bars(console, self.out / LOG) as progress, progress.phase("collecting results"):
+            with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
                 own = [system for system in self.systems if system not in TASKS]
-                results = collect(
-                    self.out, episodes=self.episodes, timesteps=self.timesteps, own=own, observers=observers
-                )
+                results = collect(out, episodes=self.episodes, timesteps=self.timesteps, own=own, observers=observers)
                 if len(results):
-                    write(self.out / "results.csv", results.to_csv(index=False))
-                    report(self.out)
-                    progress.say(f"wrote results.csv, table.md and scores.png in {self.out}")
+                    write(out / "results.csv", results.to_csv(index=False))
+                    report(out)
+                    progress.say(f"wrote results.csv, table.md and scores.png in {out}")
         if failures:
             raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
 
-    def _observers(self) -> dict[str, str]:
+    def _observers(self, information: tuple[Compared, ...]) -> dict[str, str]:
         """Observers by the name of the system that they were made for."""
         found: dict[str, str] = {}
         systems = {get_system(name).name for name in self.systems}
@@ -140,7 +176,7 @@ class Compare:
                     f"the observer {name} is for {system}: name one for each of {', '.join(systems)} at most"
                 )
             found[system] = name
-        if {"x_hat", "z"} & set(self.information):
+        if {"x_hat", "z"} & set(information):
             for name in self.systems:
                 if (own := get_system(name)).name not in found:
                     observer_of(own)  # an error now, not when their turn comes

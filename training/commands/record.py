@@ -21,6 +21,9 @@ Argument = Annotated[
         str_from_instance=lambda argument: [f"{argument[0]}={json.dumps(argument[1])}"],
     ),
 ]
+EnvironmentArguments = Annotated[
+    tuple[Argument, ...], tyro.conf.UseAppendAction, tyro.conf.arg(help_behavior_hint="(default: none)")
+]
 _NAMES = tyro.conf.arg(metavar="SIGNALS", help_behavior_hint="")
 
 
@@ -38,15 +41,14 @@ class RecordCommand:
     hidden: Annotated[str, _NAMES] = ""
     """Signals that it will estimate, likewise."""
     policy: str = "random"
-    """Who acts: random, a function from observation to action as script.py:function or module:function, or an agent of
-    stable-baselines3 as ppo:FILE.zip, of which loading may run what is in the file."""
+    """Who acts: random; wandering (random actions, each held for a while); a function from observation to action as
+    script.py:function or module:function; or an agent of stable-baselines3 as ppo:FILE.zip, of which loading may run
+    what is in the file."""
     episodes: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: no limit)")] = None
     """Episodes to play."""
     steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 100,000 if no episodes are given)")] = None
     """Steps to play, at most."""
-    env_kwargs: Annotated[
-        tuple[Argument, ...], tyro.conf.UseAppendAction, tyro.conf.arg(help_behavior_hint="(default: none)")
-    ] = ()
+    env_kwargs: EnvironmentArguments = ()
     """An argument of the environment, once for each; values are JSON, or text."""
     seed: int = 0
     """Of the environment and of random actions."""

@@ -172,7 +172,7 @@ def estimate_parameters(
 
     1. A network that makes states of a filter's state, and rough parameters, are trained on nothing but outputs and
        the equations (:mod:`training.identification.consistency`). An observer that is there already takes its place.
-    2. Shooting refines parameters and states over windows of growing length
+    2. Shooting refines parameters and states over windows of growing length, from the rough ones or from those given
        (:mod:`training.identification.windows`), and says how well each is known.
     3. What the outputs do not tell goes back to what was given, as far as they allow.
 
@@ -245,7 +245,9 @@ def estimate_parameters(
         rough = np.array([system.parameters[name] for name in unknown])
         unit = np.where(rough == 0, [0.1 * (high - low) for low, high in unknown.values()], np.abs(rough))
         shooting = Shooting(system, dt, unknown, unit)
-        fit = fit_windows(shooting, rough, fitted, guess, first=first, report=progress.say)
+        fit = fit_windows(
+            shooting, [rough] if observer else [rough, given], fitted, guess, first=first, report=progress.say
+        )
         fit = _brought_back(shooting, fit, given)
         found, length = np.array(list(fit.parameters.values())), len(fit.windows.y) - 1
         predictions = predict(shooting, found, held_out, guess, first=first, length=length)

@@ -39,7 +39,7 @@ Guess = Callable[[Record, np.ndarray], np.ndarray]
 
 def fit_windows(
     shooting: Shooting,
-    theta: np.ndarray,
+    guesses: Sequence[np.ndarray],
     records: Sequence[Record],
     guess: Guess,
     *,
@@ -49,7 +49,7 @@ def fit_windows(
     """Fit parameters and starts on windows of growing length.
 
     Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
-    explain most of them, but for noise. Chaos and process noise set an end to their
+    explain most of them, but for noise, from one of the guesses. Chaos and process noise set an end to their
     growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
     scatter of windows fall no further.
 
@@ -57,8 +57,8 @@ def fit_windows(
     ----------
     shooting : Shooting
         The problem.
-    theta : ndarray, shape (p,)
-        Parameters to begin with.
+    guesses : sequence of ndarray, shape (p,) each
+        Parameters to begin with, one after the other until windows of a length can be explained from one.
     records : sequence of Record
         Without gaps, on the grid of the shooting.
     guess : callable
@@ -79,24 +79,7 @@ def fit_windows(
         If no window of any length can be explained.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
-    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
-    expected = np.maximum(
-        MORE_NOISE * noise_level(records), SMALL * np.nanstd(np.concatenate([r.y for r in records]), 0)
-    )
-    for length in lengths:
-        starts: Starts = {}
-        for index, record in enumerate(records):
-            at = np.arange(first, len(record.y) - length, length)
-            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
-        last = length == lengths[-1]
-        try:
-            best = shoot(shooting, theta, windows(records, starts, length), rounds=ROUNDS if last else FIRST_ROUNDS)
-        except UnexplainedError:
-            if last:
-                raise
-            continue
-        if best.used.mean() >= LEAST_USED and best.left <= LEFT and (best.noise <= expected).all():
-            break
+    best, starts, length = _first_fit(shooting, guesses, records, guess, first=first, longest=longest)
     report(described(best, length))
     while 2 * length <= longest:
         length *= 2
@@ -126,6 +109,41 @@ def fit_windows(
         if (gain > GAIN).all():
             break
     return best
+
+
+def _first_fit(
+    shooting: Shooting,
+    guesses: Sequence[np.ndarray],
+    records: Sequence[Record],
+    guess: Guess,
+    *,
+    first: int,
+    longest: int,
+) -> tuple[Fit, Starts, int]:
+    """A fit on the longest of the first windows that the model explains, their starts, and their length."""
+    spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
+    expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
+    lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
+    problem: Exception = UnexplainedError("no guess of the parameters")
+    for length in lengths:
+        last = length == lengths[-1]
+        starts: Starts = {}
+        for index, record in enumerate(records):
+            at = np.arange(first, len(record.y) - length, length)
+            starts |= {(index, int(k)): x for k, x in zip(at, guess(record, at), strict=True)}
+        cut, fits = windows(records, starts, length), list[Fit]()
+        for theta in guesses:
+            try:
+                fit = shoot(shooting, theta, cut, rounds=ROUNDS if last else FIRST_ROUNDS)
+            except UnexplainedError as error:
+                problem = error
+                continue
+            fits.append(fit)
+            if fit.used.mean() >= LEAST_USED and fit.left <= LEFT and (fit.noise <= expected).all():
+                return fit, starts, length
+        if last and fits:
+            return min(fits, key=lambda fit: fit.cost), starts, length
+    raise problem
 
 
 def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:

@@ -11,6 +11,8 @@ from observers.checks import shown
 
 Policy = Callable[[Any], Any]  # from an observation to an action
 RANDOM = "random"
+WANDERING = "wandering"
+LONGEST_HELD = 30  # steps, of the mean for which an action is held
 
 
 def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
@@ -19,9 +21,11 @@ def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
     Parameters
     ----------
     policy : str or callable
-        ``random``: actions drawn from their space. ``script.py:function`` or ``module:function``: a function from an
-        observation to an action. ``ppo:FILE.zip``, or another algorithm of stable-baselines3 or sb3-contrib: an agent
-        that it saved, of which loading may run what is in the file.
+        ``random``: actions drawn from their space. ``wandering``: the same, each held for a while, for one to thirty
+        steps in the mean, which changes with every hundred steps, so that what is slow is moved too.
+        ``script.py:function`` or ``module:function``: a function from an observation to an action. ``ppo:FILE.zip``, or
+        another algorithm of stable-baselines3 or sb3-contrib: an agent that it saved, of which loading may run what is
+        in the file.
     env : gymnasium.Env
         Where it acts.
 
@@ -42,9 +46,11 @@ def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
     if policy == RANDOM:
         space = env.action_space
         return lambda observation: space.sample()
+    if policy == WANDERING:
+        return _Wandering(env.action_space)
     if not isinstance(policy, str) or ":" not in policy:
         raise ValueError(
-            "a policy is random, script.py:function, module:function or an agent as in ppo:FILE.zip, "
+            "a policy is random, wandering, script.py:function, module:function or an agent as in ppo:FILE.zip, "
             f"got {shown(policy)}"
         )
     algorithm, _, file = policy.partition(":")
@@ -53,6 +59,23 @@ def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
     if Path(f"{file}.zip").is_file():  # stable-baselines3 adds the ending as well
         return _agent(algorithm, Path(f"{file}.zip"), env)
     return load_function(policy)
+
+
+class _Wandering:
+    """Random actions, each held for a random number of steps."""
+
+    def __init__(self, space: gym.Space[Any]) -> None:
+        self._space, self._calls, self._left = space, 0, 0
+
+    def __call__(self, observation: Any) -> Any:
+        rng = self._space.np_random
+        if self._calls % 100 == 0:
+            self._mean = LONGEST_HELD ** rng.random()
+        self._calls += 1
+        if self._left == 0:
+            self._action, self._left = self._space.sample(), int(rng.geometric(1 / self._mean))
+        self._left -= 1
+        return self._action
 
 
 def _agent(name: str, path: Path, env: gym.Env[Any, Any]) -> Policy:

@@ -58,6 +58,7 @@ def test_steps_equal_those_of_stable_baselines3s_own_vector(saved):
                 assert np.allclose(mine["terminal_observation"], other["terminal_observation"], atol=1e-5)
                 assert mine["TimeLimit.truncated"] is other["TimeLimit.truncated"] is True
                 assert np.allclose(mine["x_hat"], other["x_hat"], atol=1e-5)
+                assert np.allclose(ours.reset_infos[row]["y"], theirs.reset_infos[row]["y"])
             else:
                 assert mine.keys() == {"y", "u"}
             assert np.allclose(mine["y"], other["y"])

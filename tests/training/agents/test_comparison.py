@@ -14,18 +14,16 @@ from rich.console import Console
 
 import training.agents.comparison
 import training.agents.learn
-import training.commands.compare
+import training.commands.running
 from training.agents.comparison import (
     COMPARED,
     MORE_NOISE,
     OTHER,
     collect,
-    interval,
-    middle,
-    normalised,
     planned,
     run_case,
 )
+from training.agents.statistics import interval, middle, normalised
 from training.commands.compare import Compare, report
 from training.jobs import claimed_job, locked
 from training.systems import PROFILES
@@ -117,7 +115,7 @@ def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
         yield jobs[0], None, []
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.commands.compare, "run_all", interrupted)
+    monkeypatch.setattr(training.commands.running, "run_all", interrupted)
     with pytest.raises(KeyboardInterrupt):
         toy(tmp_path, information=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1

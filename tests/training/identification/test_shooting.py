@@ -93,7 +93,7 @@ def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypat
     y = x[..., :1] + 0.02 * rng.standard_normal((steps + 1, n, 1))
     records = [Record(str(i), Swing.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
     shooting = Shooting(Swing(), Swing.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
-    fit = fit_windows(shooting, np.array([4.1]), records, lambda record, at: x[at, int(record.name)], first=0)
+    fit = fit_windows(shooting, [np.array([4.1])], records, lambda record, at: x[at, int(record.name)], first=0)
     assert len(fit.windows.u) == length
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
 

@@ -1,0 +1,364 @@
+"""Agents in any environment: what they are shown, that files act as what was trained, and their comparison."""
+
+import json
+import shutil
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium.utils.env_checker import check_env
+from rich.console import Console
+
+from observers import MLP, Artifact
+from training.agents.agent import AgentError
+from training.agents.any_environment import learning
+from training.agents.any_environment.comparison import Case, collect, planned, run_case
+from training.agents.any_environment.information import SHOWN, show
+from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
+from training.agents.any_environment.player import Player
+from training.agents.any_environment.tables import cell, curves, write_table
+from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
+from training.commands.agent import Evaluate, Train
+from training.commands.compare import Compare
+from training.commands.environment import EnvironmentOptions
+
+PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
+CART = HIDDEN_VELOCITIES["CartPole-v1"]
+SMALL = {
+    "ppo": {"n_envs": 2, "n_timesteps": 64, "policy": "MlpPolicy", "n_steps": 16, "batch_size": 16, "normalize": True},
+    "a2c": {"n_envs": 2, "n_timesteps": 64, "policy": "MlpPolicy", "normalize": True},
+    "dqn": {"n_timesteps": 64, "policy": "MlpPolicy", "learning_starts": 16},
+    "sac": {"n_timesteps": 48, "policy": "MlpPolicy", "learning_starts": 32},
+    "td3": {"n_timesteps": 48, "policy": "MlpPolicy", "learning_starts": 32, "noise_type": "normal", "noise_std": 0.1},
+    "tqc": {"n_timesteps": 48, "policy": "MlpPolicy", "learning_starts": 32},
+    "ppo_lstm": {"n_envs": 2, "n_timesteps": 64, "policy": "MlpLstmPolicy", "n_steps": 16, "batch_size": 16},
+}
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Settings with which everything is learned in no time, and badly."""
+    for name in SMALL:
+        settings_of(name)
+    monkeypatch.setattr(
+        learning,
+        "settings_of",
+        lambda name: {
+            "default": {**SMALL[name], "policy_kwargs": {"net_arch": [8]}},
+            **({"Pendulum-v1": {**SMALL["sac"], "policy_kwargs": {"net_arch": [8]}}} if name == "sac" else {}),
+        },
+    )
+    monkeypatch.setattr("training.agents.any_environment.observing.SETTINGS", {"inverse_steps": 20, "members": 1})
+
+
+def test_all_settings_are_ones_of_their_algorithm():
+    for name, algorithm in learning.ALGORITHMS.items():
+        for env_id in settings_of(name):
+            found = hyperparameters(name, env_id)
+            assert found["n_timesteps"] > 0
+            known = set(algorithm.__init__.__annotations__) | set(learning._OF_THE_RUN) | {"policy"}
+            assert set(found) <= known, (name, env_id)
+
+
+def test_settings_are_given_out_as_copies():
+    hyperparameters("sac", "Pendulum-v1")["policy_kwargs"]["net_arch"] = None
+    assert hyperparameters("sac", "Pendulum-v1")["policy_kwargs"]["net_arch"] == [64, 64]
+
+
+def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
+    clean, noisy = PENDULUM.make(), replace(PENDULUM, measurement_noise=0.3).make()
+    apart = []
+    for seed in range(3):
+        for env in (clean, noisy):
+            env.reset(seed=seed)
+        for _ in range(200):
+            here, there = (env.step(np.array([0.5], dtype=np.float32))[0] for env in (clean, noisy))
+            apart.append(there - here)
+    spread = np.std(apart, axis=0)
+    np.testing.assert_allclose(spread[:2], 0.3, rtol=0.1)
+    assert spread[2] == 0
+    assert abs(np.corrcoef(np.array(apart)[:, :2].T)[0, 1]) < 0.15
+    again = [replace(PENDULUM, measurement_noise=0.3).make().reset(seed=4)[0] for _ in range(2)]
+    np.testing.assert_array_equal(*again)
+
+
+@pytest.mark.parametrize("kind", sorted(set(SHOWN) - {"x_hat"}))
+@pytest.mark.parametrize("task", [PENDULUM, replace(CART, measurement_noise=0.1)], ids=["pendulum", "cart"])
+def test_what_is_shown_passes_gymnasiums_checker(task, kind):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about bounds that are infinite, and that the environment is wrapped
+        check_env(show(task, kind), skip_render_check=True)
+
+
+def test_stacked_observations_hold_actions_and_begin_with_the_first():
+    env, plain = show(PENDULUM, "stacked"), show(PENDULUM, "y")
+    first, _ = env.reset(seed=0)
+    y0, _ = plain.reset(seed=0)
+    np.testing.assert_array_equal(first.reshape(8, 3), np.tile([*y0, 0], (8, 1)))
+    seen = [np.append(y0, 0)]
+    for k in range(10):
+        action = np.array([np.sin(k)], dtype=np.float32)
+        shown = env.step(action)[0]
+        seen.append(np.append(plain.step(action)[0], action / 2))  # of torques within ±2
+        expected = [*[seen[0]] * (8 - len(seen)), *seen[-8:]]
+        np.testing.assert_allclose(shown.reshape(8, 3), expected, rtol=1e-6)
+    np.testing.assert_array_equal(show(PENDULUM, "recurrent").reset(seed=0)[0], [*y0, 0])
+
+
+def test_the_full_state_is_without_noise():
+    noisy = replace(PENDULUM, measurement_noise=0.3)
+    np.testing.assert_array_equal(show(noisy, "state").reset(seed=1)[0], PENDULUM.make().reset(seed=1)[0])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "task", "kind"),
+    [
+        ("ppo", CART, "z"),
+        ("ppo", PENDULUM, "y"),
+        ("a2c", CART, "stacked"),
+        ("dqn", CART, "state"),
+        ("sac", PENDULUM, "z"),
+        ("td3", PENDULUM, "y"),
+        ("tqc", PENDULUM, "state"),
+    ],
+)
+def test_a_file_acts_as_the_agent_that_was_trained(tmp_path, small, algorithm, task, kind):
+    model = learn_to_play(task, kind, tmp_path, algorithm=algorithm)
+    player, scaling = Player.read(tmp_path / "agent.safetensors"), model.get_vec_normalize_env()
+    env = player.make()
+    obs, _ = env.reset(seed=3)
+    env.action_space.seed(3)
+    for _ in range(30):
+        scaled = obs if scaling is None else scaling.normalize_obs(obs)
+        expected, _ = model.predict(scaled, deterministic=True)
+        action = player.act(obs, env.action_space)
+        np.testing.assert_allclose(action, expected, atol=1e-5)
+        obs, _, terminated, _, _ = env.step(env.action_space.sample())
+        if terminated:
+            obs, _ = env.reset()
+    rows = np.stack([obs, obs])
+    np.testing.assert_allclose(player.act(rows, env.action_space)[1], player.act(obs, env.action_space), atol=1e-5)
+    assert player.training["algorithm"] == algorithm
+    curve = pd.read_csv(tmp_path / "curve.csv")
+    assert list(curve) == ["steps", "seconds", "return"]
+
+
+def test_an_agent_on_estimates_pays_for_its_observer(tmp_path, small):
+    learn_to_play(CART, "x_hat", tmp_path, timesteps=1000, observer_steps=900)
+    player = Player.read(tmp_path / "agent.safetensors")
+    assert player.observer == str(tmp_path / "observer.safetensors")
+    obs, _ = player.make().reset(seed=0)
+    assert obs.shape == (4,)  # two positions, two estimates
+    curve = pd.read_csv(tmp_path / "curve.csv")
+    assert curve.steps.min() > 900
+    shutil.copy(tmp_path / "observer.safetensors", tmp_path / "moved.safetensors")
+    assert player.make(observer=str(tmp_path / "moved.safetensors"))
+    content = bytearray((tmp_path / "moved.safetensors").read_bytes())
+    content[-1] ^= 1
+    (tmp_path / "moved.safetensors").write_bytes(content)
+    with pytest.raises(ValueError, match=r"another observer|checksum|damaged"):
+        player.make(observer=str(tmp_path / "moved.safetensors"))
+
+
+def player(**changes):
+    given = {
+        "network": MLP([np.zeros((1, 2))], [np.zeros(1)], "tanh"),
+        "head": "clip",
+        "task": PENDULUM,
+        "information": "y",
+    }
+    return Player(**{**given, **changes})
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"head": "softmax"}, "head"),
+        ({"information": "everything"}, "information"),
+        ({"observer": 3}, "observer must be a string"),
+        ({"mean": np.zeros(2)}, "belong together"),
+        ({"mean": np.zeros(2), "scale": np.array([1.0, np.nan])}, "2 numbers"),
+        ({"mean": np.zeros(3), "scale": np.ones(3)}, "2 numbers"),
+        ({"training": None}, "training must be a mapping"),
+    ],
+)
+def test_a_player_that_makes_no_sense_is_refused(changes, says):
+    with pytest.raises(AgentError, match=says):
+        player(**changes)
+
+
+def test_a_player_of_another_size_or_kind_is_refused():
+    with pytest.raises(AgentError, match="2 inputs and 1 outputs, the environment 3 and 1"):
+        player(information="state").make()
+    with pytest.raises(AgentError, match="head is argmax"):
+        player(head="argmax").make()
+
+
+def test_a_strangers_environment_is_not_made_unless_it_is_named(tmp_path):
+    path = tmp_path / "agent.safetensors"
+    player(task=HiddenTask("no_such_module:Evil-v0", (0, 1))).save(path)
+    found = Player.read(path)
+    with pytest.raises(AgentError, match="if you trust"):
+        found.make()
+    with pytest.raises(AgentError, match="if you trust"):
+        found.make(env_id="Pendulum-v1")
+    with pytest.raises(ValueError, match="no_such_module"):
+        found.make(env_id="no_such_module:Evil-v0")
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path):
+    path = tmp_path / "agent.safetensors"
+    player().save(path)
+    assert Player.read(path).task == PENDULUM
+    content = path.read_bytes()
+    path.write_bytes(content[:-3])
+    with pytest.raises(AgentError, match="damaged"):
+        Player.read(path)
+    with pytest.raises(AgentError, match="no file"):
+        Player.read(tmp_path / "none.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"measured": ()}, "measured must name"),
+        ({"measured": (0, 0)}, "each once"),
+        ({"measured": (0.5,)}, "entry of measured"),
+        ({"measured": (0,), "measurement_noise": -1.0}, "from 0 on"),
+        ({"measured": (0,), "measurement_noise": np.nan}, "from 0 on"),
+    ],
+)
+def test_a_task_that_makes_no_sense_is_refused(arguments, says):
+    with pytest.raises(ValueError, match=says):
+        HiddenTask("Pendulum-v1", **arguments)
+
+
+def test_entries_and_environments_that_are_not_there_are_named():
+    with pytest.raises(ValueError, match=r"no entry 7 .* 0 to 2"):
+        HiddenTask("Pendulum-v1", (7,)).make()
+    with pytest.raises(ValueError, match="cannot make 'Pendulam-v1'"):
+        HiddenTask("Pendulam-v1", (0,)).make()
+    with pytest.raises(ValueError, match="one of state"):
+        show(PENDULUM, "nothing")
+    with pytest.raises(ValueError, match="needs an observer"):
+        show(PENDULUM, "x_hat")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"information": "y", "observer": "a.safetensors"}, "no use for the observer"),
+        ({"information": "z", "aggregate": 2}, "no observer to fit again"),
+        ({"information": "z", "algorithm": "ppo_lstm"}, "only that"),
+        ({"information": "recurrent", "algorithm": "ppo"}, "only that"),
+        ({"information": "x_hat", "observer_steps": 10**9}, "fewer than all"),
+        ({"information": "z", "timesteps": 0}, "must be positive"),
+        ({"information": "z", "algorithm": "reinforce"}, "unknown algorithm"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(tmp_path, options, says):
+    information = options.pop("information")
+    with pytest.raises(ValueError, match=says):
+        learn_to_play(PENDULUM, information, tmp_path, **options)
+
+
+def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
+    options = {"environments": ("CartPole-v1",), "seeds": 3, "episodes": 4, "jobs": 1, "out": tmp_path}
+    Compare(**options, information=("state", "y")).run(Console())
+    results = pd.read_csv(tmp_path / "results.csv")
+    assert sorted(results.shown) == ["random", *["state"] * 3, *["y"] * 3]
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("jobs/**/result.json")}
+    shutil.rmtree(tmp_path / "jobs" / "CartPole-v1" / "y" / "1")
+    Compare(**options, information=("y",)).run(Console())  # a narrower run reports all that is there
+    again = pd.read_csv(tmp_path / "results.csv")
+    assert again.drop(columns="seconds").equals(results.drop(columns="seconds"))  # all is seeded
+    changed = [path for path in before if path.stat().st_mtime_ns != before[path]]
+    assert [path.parent.name for path in changed] == ["1"]
+    table = (tmp_path / "table.md").read_text()
+    assert "| CartPole-v1 |" in table
+    assert "Partial" not in table
+    for name in ("scores.png", "curves.png", "curves.csv"):
+        assert (tmp_path / name).stat().st_size > 100
+    with pytest.raises(ValueError, match="another comparison: episodes = 4 there, 5 here"):
+        Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
+
+
+def test_full_state_agents_are_shared_by_levels_of_noise(tmp_path):
+    tasks = [replace(PENDULUM, measurement_noise=level) for level in (0.1, 0.3)]
+    cases = planned(tasks, tmp_path, kinds=("state", "y"), seeds=2)
+    assert [case.name for case in cases if case.kind == "state"] == ["Pendulum-v1/state/0", "Pendulum-v1/state/1"]
+    assert len([case for case in cases if case.kind == "y"]) == 4
+    assert len(cases) == 7
+
+
+def test_a_table_of_known_results(tmp_path):
+    rows = [("random", 0.0, 0, 10.0), *(("state", 0.0, i, 110.0 + i) for i in range(-2, 3))]
+    rows += [("y", 0.2, i, 60.0 + 2 * i) for i in range(-2, 3)]
+    results = pd.DataFrame(
+        [("A-v0", noise, kind, seed, value, 7.0) for kind, noise, seed, value in rows],
+        columns=["environment", "noise", "shown", "seed", "return", "seconds"],
+    )
+    found = cell(results, ("A-v0", 0.2), "y")
+    assert found["middle"] == pytest.approx(60)
+    assert found["interval"][0] == pytest.approx(0.5)
+    assert 0.46 < found["interval"][1] < 0.5 < found["interval"][2] < 0.54
+    assert cell(results, ("A-v0", 0.2), "state")["interval"][0] == pytest.approx(1.0)
+    assert cell(results, ("A-v0", 0.2), "z") is None
+    write_table(tmp_path / "table.md", results, " Partial: one.")
+    table = (tmp_path / "table.md").read_text()
+    assert "A-v0, noise 0.2 | 110 (1.00, " in table
+    assert "| 60 (0.50, " in table
+    assert "Partial: one." in table
+
+
+def test_a_case_that_is_random_has_no_curve(tmp_path, small):
+    case = Case(CART, "random", 0, 3, None, 0, tmp_path)
+    run_case(case)
+    assert len(json.loads((tmp_path / "result.json").read_text())["returns"]) == 3
+    assert curves([case]).empty
+    assert collect([case])["shown"].tolist() == ["random"]
+
+
+def test_the_commands_train_and_play(tmp_path, small, capsys):
+    options = EnvironmentOptions(measured="0,2")
+    Train("CartPole-v1", "z", out=tmp_path, environment=options).run(Console(width=100))
+    Evaluate(str(tmp_path / "agent.safetensors"), episodes=3).run(Console(width=100))
+    shown = capsys.readouterr().out
+    assert "CartPole-v1" in shown
+    assert shown.count("return") == 2
+    with pytest.raises(FileExistsError, match="holds an agent already"):
+        Train("CartPole-v1", "z", out=tmp_path).run(Console())
+    with pytest.raises(ValueError, match="leave --resume out"):
+        Train("CartPole-v1", "z", out=tmp_path / "b", resume=True).run(Console())
+    with pytest.raises(ValueError, match="say what is measured of Acrobot-v1"):
+        Train("Acrobot-v1", "z", out=tmp_path / "c").run(Console())
+    with pytest.raises(ValueError, match="takes indices"):
+        Train("CartPole-v1", "z", out=tmp_path / "d", environment=EnvironmentOptions(measured="x")).run(Console())
+    with pytest.raises(ValueError, match="one number"):
+        Train("CartPole-v1", "z", out=tmp_path / "e", measurement_noise=(0.1, 0.2)).run(Console())
+    with pytest.raises(ValueError, match="a system knows"):
+        Train("lorenz", "recurrent", out=tmp_path / "f").run(Console())
+    with pytest.raises(ValueError, match="compared by state"):
+        Compare(("CartPole-v1",), information=("ekf",), out=tmp_path / "g").run(Console())
+    with pytest.raises(ValueError, match="environments, each once"):
+        Compare(("CartPole-v1", "CartPole-v1"), out=tmp_path / "g").run(Console())
+
+
+def test_an_observer_is_fitted_again_to_what_the_agent_does(tmp_path, small, monkeypatch):
+    monkeypatch.setattr("training.agents.any_environment.observing.SETTINGS", {"inverse_steps": 100, "members": 1})
+    task = replace(PENDULUM, measurement_noise=0.1)
+    learn_to_play(task, "x_hat", tmp_path, timesteps=1700, observer_steps=400, aggregate=1, algorithm="ppo")
+    player = Player.read(tmp_path / "agent.safetensors")
+    artifact = Artifact.read(player.observer)
+    assert tuple(artifact.signals["hidden"]) == ("info[clean][0]", "info[clean][1]", "info[clean][2]")
+    assert tuple(artifact.signals["measured"]) == ("obs[0]", "obs[1]")
+    env = player.make()
+    obs, info = env.reset(seed=0)
+    assert obs.shape == (3,)
+    np.testing.assert_array_equal(info["x"], info["clean"])
+    assert not np.allclose(info["y"], info["clean_y"])
+    first = [record for record in (tmp_path / "observer").rglob("*") if record.is_file()]
+    assert first  # of the one that the agent began with
+    assert "held_out_after" in artifact.training  # as refits say it

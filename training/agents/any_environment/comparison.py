@@ -1,0 +1,267 @@
+"""What a memory or an observer is worth: agents that are shown different things, several seeds each."""
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+import kkl_gym
+from observers.storage import explained, write
+from training.agents.any_environment.information import SHOWN, Shown, show
+from training.agents.any_environment.task import HiddenTask
+from training.jobs import check_identity, claimed_job
+from training.seeds import AGENT_EVALUATION_SEED
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from stable_baselines3.common.vec_env import VecEnv
+
+Kind = Literal["random", Shown]
+RANDOM: Literal["random"] = "random"  # actions: what has the score 0
+KINDS: tuple[Kind, ...] = (RANDOM, *SHOWN)
+ROWS = 10  # episodes that are played at a time
+PROTOCOL = 1  # changes where results must not be mixed with earlier ones
+OTHER = "an agent of another comparison"
+RESULT = "result.json"
+MANY = 100  # seeds, more than anyone trains
+assert get_args(Shown) == SHOWN
+
+
+@dataclass(frozen=True)
+class Case:
+    """One agent: trained, then played on the evaluation's episodes.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        Where it acts.
+    kind : {"random", "state", "x_hat", "z", "stacked", "recurrent", "y"}
+        What it is shown; of "random" nobody learns.
+    seed : int
+        The agent's.
+    episodes : int
+        Number of episodes that it is played on.
+    timesteps : int or None
+        Steps to learn from, those of an observer included; None takes what the hyperparameters say.
+    aggregate : int
+        How many times an observer is fitted again while the agent learns.
+    folder : Path
+        Receives job.json, result.json, the learning curve and the agent.
+    """
+
+    task: HiddenTask
+    kind: Kind
+    seed: int
+    episodes: int
+    timesteps: int | None
+    aggregate: int
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.task.name}/{self.kind}/{self.seed}"
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What must not differ between a result that is there and one that is asked for."""
+        described: dict[str, Any] = {
+            "protocol": PROTOCOL,
+            "episodes": self.episodes,
+            "task": asdict(self.task),
+            "version": kkl_gym.__version__,
+        }
+        if self.kind == RANDOM:
+            return described
+        from training.agents.any_environment.learning import algorithm_for, hyperparameters
+
+        with self.task.make() as env:
+            algorithm = algorithm_for(env.action_space, self.task.env_id, self.kind)
+        return described | {
+            "timesteps": self.timesteps,
+            "algorithm": algorithm,
+            "hyperparameters": hyperparameters(algorithm, self.task.env_id),
+            "aggregate": self.aggregate if self.kind == "x_hat" else 0,
+        }
+
+    @property
+    def done(self) -> bool:
+        """Whether its result is there; raises ValueError if the folder holds an agent of another comparison."""
+        if not (self.folder / RESULT).exists():
+            return False
+        check_identity(self.folder / "job.json", self.identity, OTHER)
+        return True
+
+
+def run_case(case: Case) -> None:
+    """Train and evaluate an agent, unless that is done.
+
+    Parameters
+    ----------
+    case : Case
+        The agent.
+
+    Raises
+    ------
+    ValueError
+        If another process is at work on it, or its folder holds an agent of another comparison.
+    """
+    with claimed_job(case.folder, case.identity, OTHER):
+        if not case.done:
+            write(case.folder / RESULT, json.dumps(_run(case)) + "\n")
+
+
+def _run(case: Case) -> dict[str, Any]:
+    import torch
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    from training.agents.any_environment.learning import learn_to_play
+    from training.agents.any_environment.observing import OBSERVER
+
+    torch.set_num_threads(1)
+    kind, observer = case.kind, str(case.folder / OBSERVER)
+    began = time.process_time()
+    model: Any = None
+    if kind != RANDOM:
+        model = learn_to_play(
+            case.task,
+            kind,
+            case.folder,
+            timesteps=case.timesteps,
+            seed=case.seed,
+            aggregate=case.aggregate if kind == "x_hat" else 0,
+        )
+    seconds = time.process_time() - began
+    shown = "state" if kind == RANDOM else kind
+    rows = min(ROWS, case.episodes)
+    env: Any = make_vec_env(lambda: show(case.task, shown, observer), rows, seed=AGENT_EVALUATION_SEED)
+    try:
+        policy: Any = _RandomActions(env) if model is None else model
+        returns: Any = evaluate_policy(
+            policy,
+            env if model is None else _scaled(env, model),
+            n_eval_episodes=case.episodes,
+            return_episode_rewards=True,
+            warn=False,
+        )[0]
+    finally:
+        env.close()
+    return {"returns": [round(float(value), 4) for value in returns], "seconds": round(seconds, 1)}
+
+
+def _scaled(env: "VecEnv", model: Any) -> "VecEnv":
+    """The environments as the agent saw them, its scaling as it ended."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    trained = model.get_vec_normalize_env()
+    if trained is None:
+        return env
+    scaled = VecNormalize(env, training=False, norm_reward=False)
+    scaled.obs_rms = trained.obs_rms
+    return scaled
+
+
+class _RandomActions:
+    """Acts at random, as :func:`stable_baselines3.common.evaluation.evaluate_policy` asks."""
+
+    def __init__(self, env: "VecEnv") -> None:
+        self._env = env
+        env.action_space.seed(AGENT_EVALUATION_SEED)
+
+    def predict(self, observation: np.ndarray, state: Any = None, **_: Any) -> tuple[np.ndarray, Any]:
+        """Draw an action for each row."""
+        return np.array([self._env.action_space.sample() for _ in observation]), state
+
+
+def planned(
+    tasks: Sequence[HiddenTask],
+    out: Path,
+    *,
+    kinds: Sequence[Shown] = SHOWN,
+    seeds: int = 5,
+    episodes: int = 100,
+    timesteps: int | None = None,
+    aggregate: int = 0,
+) -> list[Case]:
+    """All agents of a comparison, the first seed of each first.
+
+    Parameters
+    ----------
+    tasks : sequence of HiddenTask
+        Where they act.
+    out : Path
+        Folder of the comparison, under which each agent has one.
+    kinds : sequence of str
+        What agents are shown.
+    seeds : int
+        Agents of each kind.
+    episodes : int
+        Number of episodes that each is played on.
+    timesteps : int, optional
+        Steps to learn from; by default what the hyperparameters say.
+    aggregate : int
+        As for :class:`Case`.
+
+    Returns
+    -------
+    list of Case
+        What is to be done. The full state is without noise, so that tasks that differ in noise alone share its agents.
+    """
+    found: dict[Path, Case] = {}
+    for seed in range(seeds):
+        for task in tasks:
+            for kind in (*((RANDOM,) if seed == 0 else ()), *kinds):
+                of = (
+                    task
+                    if kind not in ("state", RANDOM)
+                    else HiddenTask(task.env_id, task.measured, hidden=task.hidden, env_kwargs=task.env_kwargs)
+                )
+                folder = out / "jobs" / of.name / kind / str(seed)
+                found.setdefault(folder, Case(of, kind, seed, episodes, timesteps, aggregate, folder))
+    return list(found.values())
+
+
+def collect(cases: Sequence[Case]) -> "pd.DataFrame":
+    """Results of the agents that are done.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        Those of the comparison.
+
+    Returns
+    -------
+    DataFrame
+        One row for each agent: environment, noise, shown, seed, return (the mean of its episodes), seconds, steps.
+
+    Raises
+    ------
+    ValueError
+        If some agents are of another comparison, or a result is damaged.
+    """
+    import pandas as pd
+
+    rows = []
+    for case in cases:
+        if case.done:
+            with explained(case.folder / RESULT, ValueError):
+                result = json.loads((case.folder / RESULT).read_text())
+                rows.append(
+                    {
+                        "environment": case.task.env_id,
+                        "noise": case.task.measurement_noise,
+                        "shown": case.kind,
+                        "seed": case.seed,
+                        "return": round(float(np.mean(result["returns"])), 4),
+                        "seconds": result["seconds"],
+                    }
+                )
+    return pd.DataFrame(rows)
+
+
+__all__ = ["KINDS", "RANDOM", "Case", "Kind", "collect", "planned", "run_case"]

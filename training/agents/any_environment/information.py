@@ -1,0 +1,124 @@
+"""What an agent is shown of an environment of which a part is hidden."""
+
+from collections import deque
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import RecordConstructorArgs
+from gymnasium.wrappers import TransformObservation
+
+from kkl_gym import KKLMemory, KKLObservation
+from kkl_gym.identity import source_of
+from kkl_gym.signals import Inputs
+from training.agents.any_environment.task import HiddenTask
+from training.agents.information import STACKED
+
+Shown = Literal["state", "x_hat", "z", "stacked", "recurrent", "y"]
+SHOWN: tuple[Shown, ...] = get_args(Shown)
+
+
+def show(task: HiddenTask, information: Shown, observer: str | None = None) -> gym.Env[np.ndarray, Any]:
+    """Make a task's environment in which an agent sees what ``information`` says.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        The environment, what is measured and how well.
+    information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
+        "state": the whole observation without noise. The others see what is measured, y, with its noise. "x_hat": y,
+        and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
+        measured too. "z": y and the memory of
+        :class:`kkl_gym.KKLMemory`. "stacked": the last eight y, each with the action before it. "recurrent": y with the
+        action before it, for a policy that remembers by itself. "y": y alone.
+    observer : str, optional
+        File of the observer, for "x_hat".
+
+    Returns
+    -------
+    gymnasium.Env
+        The environment.
+
+    Raises
+    ------
+    ValueError
+        If the task makes no sense, the information is unknown or the observer is missing or another environment's.
+    """
+    if information not in SHOWN:
+        raise ValueError(f"an agent is shown one of {', '.join(SHOWN)}, got {information!r}")
+    if information == "state":
+        return HiddenTask(task.env_id, task.measured, env_kwargs=task.env_kwargs).make()
+    env = task.make()
+    if information == "x_hat":
+        if observer is None:
+            raise ValueError("an agent that is shown x_hat needs an observer")
+        env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
+        shown: Any = env.observation_space
+        return _part(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
+    if information == "z":
+        return KKLMemory(env, task.measured)
+    env = _part(env, task.measured)
+    if information == "y":
+        return env
+    return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
+
+
+def _part(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
+    """Shows some entries of an observation alone."""
+    space: Any = env.observation_space
+    chosen = list(entries)
+    part = gym.spaces.Box(space.low[chosen], space.high[chosen], dtype=np.float32)
+    return TransformObservation(env, partial(_taken, chosen), part)
+
+
+def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
+    return observation[entries].astype(np.float32)
+
+
+class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+    """Shows the last observations, each with the action before it, the latest last.
+
+    Before an episode's first step there were its first observation and no action.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With rows of numbers as observations.
+    count : int
+        Observations shown.
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, Any], count: int = STACKED) -> None:
+        RecordConstructorArgs.__init__(self, count=count)
+        gym.Wrapper.__init__(self, env)
+        self._inputs = Inputs(env.action_space, source=source_of(env))
+        self._rows: deque[np.ndarray] = deque(maxlen=count)
+        of: Any = env.observation_space
+        low, high = np.append(of.low, self._inputs.low), np.append(of.high, self._inputs.high)
+        low[of.shape[0] :], high[of.shape[0] :] = np.minimum(self._inputs.low, 0.0), np.maximum(self._inputs.high, 0.0)
+        self.observation_space = gym.spaces.Box(
+            np.tile(low, count).astype(np.float32), np.tile(high, count).astype(np.float32), dtype=np.float32
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Reset the environment, and forget what was before."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        first = np.append(observation, np.zeros(len(self._inputs.low)))
+        self._rows.extend([first] * (self._rows.maxlen or 1))
+        return self._shown(), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Step the environment."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._rows.append(np.append(observation, self._inputs(action)))
+        return self._shown(), float(reward), terminated, truncated, info
+
+    def _shown(self) -> np.ndarray:
+        return np.concatenate(self._rows, dtype=np.float32)
+
+
+__all__ = ["SHOWN", "Shown", "StackedWithActions", "show"]

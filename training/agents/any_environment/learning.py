@@ -1,0 +1,384 @@
+"""Agents of stable-baselines3 learn in any environment of which they see a part."""
+
+import csv
+import time
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+import yaml
+from gymnasium import spaces
+from sb3_contrib import TQC, RecurrentPPO
+from stable_baselines3 import A2C, DQN, PPO, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecNormalize
+from torch import nn
+
+from observers import MLP
+from observers.storage import replacing
+from training.agents.agent import fingerprint
+from training.agents.any_environment.information import Shown, show
+from training.agents.any_environment.observing import OBSERVER, learn_observer, refitting
+from training.agents.any_environment.player import Head, Player
+from training.agents.any_environment.task import HiddenTask
+from training.progress import ProgressBars, progress_bars
+from training.seeds import agent_training_seed
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "ppo": PPO,
+    "a2c": A2C,
+    "dqn": DQN,
+    "sac": SAC,
+    "td3": TD3,
+    "tqc": TQC,
+    "ppo_lstm": RecurrentPPO,
+}
+RECURRENT = "ppo_lstm"
+OBSERVER_STEPS = 0.1  # of the steps of a training, in which actions are random and an observer is learned
+CURVE = "curve.csv"
+_OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
+_ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
+
+
+def algorithm_for(action_space: gym.Space[Any], env_id: str, information: Shown) -> str:
+    """Choose who learns: recurrent PPO where that is what is shown, SAC where it has settings, else PPO.
+
+    Parameters
+    ----------
+    action_space : gymnasium.Space
+        Of the environment.
+    env_id : str
+        The environment.
+    information : str
+        What the agent is shown.
+
+    Returns
+    -------
+    str
+        A key of ``ALGORITHMS``.
+    """
+    if information == "recurrent":
+        return RECURRENT
+    return "sac" if isinstance(action_space, spaces.Box) and env_id in settings_of("sac") else "ppo"
+
+
+@cache
+def settings_of(algorithm: str) -> dict[str, dict[str, Any]]:
+    """What hyperparameters/ALGORITHM.yml says, by environment; rl-zoo3 reads these files too.
+
+    Parameters
+    ----------
+    algorithm : str
+        A key of ``ALGORITHMS``.
+
+    Returns
+    -------
+    dict of str to dict
+        Settings.
+
+    Raises
+    ------
+    ValueError
+        If there is no such algorithm.
+    """
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"unknown algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
+    folder = files("training.agents.any_environment").joinpath("hyperparameters")
+    return dict(yaml.safe_load(folder.joinpath(f"{algorithm}.yml").read_text()))
+
+
+def hyperparameters(algorithm: str, env_id: str, timesteps: int | None = None) -> dict[str, Any]:
+    """Find the settings of an algorithm for an environment.
+
+    Parameters
+    ----------
+    algorithm : str
+        A key of ``ALGORITHMS``.
+    env_id : str
+        The environment; one that the file does not name gets its default.
+    timesteps : int, optional
+        Steps in place of what the file says.
+
+    Returns
+    -------
+    dict
+        What hyperparameters/ALGORITHM.yml says.
+
+    Raises
+    ------
+    ValueError
+        If there is no such algorithm, or the number of steps is not positive.
+    """
+    known = settings_of(algorithm)
+    found = deepcopy(known.get(env_id, known["default"]))
+    if timesteps is not None:
+        if timesteps < 1:
+            raise ValueError(f"timesteps must be positive, got {timesteps}")
+        found["n_timesteps"] = timesteps
+    return found
+
+
+def learn_to_play(
+    task: HiddenTask,
+    information: Shown,
+    folder: Path,
+    *,
+    algorithm: str | None = None,
+    timesteps: int | None = None,
+    seed: int = 0,
+    observer: str | None = None,
+    observer_steps: int | None = None,
+    aggregate: int = 0,
+    progress: ProgressBars | None = None,
+) -> BaseAlgorithm:
+    """Train one agent.
+
+    Every step of the environment counts: where an observer has to be learned first, its steps are the agent's first
+    ones, with random actions.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        Where it acts.
+    information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
+        What it is shown, as :func:`training.agents.any_environment.information.show`.
+    folder : Path
+        Receives the learning curve, curve.csv, an observer's file if one is learned, and, where the policy is a
+        perceptron, agent.safetensors.
+    algorithm : str, optional
+        As :func:`algorithm_for` chooses by default.
+    timesteps : int, optional
+        Steps of the environment, all together; by default what the hyperparameters say.
+    seed : int
+        Of networks, exploration and episodes.
+    observer : str, optional
+        File of an observer, for x_hat; by default one is learned.
+    observer_steps : int, optional
+        Steps from which it is learned; by default a tenth of all.
+    aggregate : int
+        How many times it is fitted again while the agent learns, on the agent's own steps.
+    progress : ProgressBars, optional
+        Where bars are shown.
+
+    Returns
+    -------
+    stable_baselines3 algorithm
+        The agent, whose ``get_vec_normalize_env()`` says how what it is shown is scaled.
+
+    Raises
+    ------
+    ValueError
+        If something makes no sense or does not fit the environment.
+    """
+    with show(task, "state") as env:
+        actions = env.action_space
+    name = algorithm or algorithm_for(actions, task.env_id, information)
+    if (name == RECURRENT) != (information == "recurrent"):
+        raise ValueError(f"{RECURRENT} is for information 'recurrent', and only that; got {name} and {information!r}")
+    settings = hyperparameters(name, task.env_id, timesteps)
+    steps, began = settings["n_timesteps"], time.process_time()
+    if observer is not None and information != "x_hat":
+        raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
+    if aggregate and information != "x_hat":
+        raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
+    with progress_bars(progress) as bars:
+        spent = 0
+        if information == "x_hat" and observer is None:
+            spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
+            if not 0 < spent < steps:
+                raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
+            observer = str(learn_observer(task, folder, steps=spent, seed=seed, progress=bars))
+        callbacks: list[BaseCallback] = [Curve(folder / CURVE, spent=spent, began=began)]
+        newest = folder / OBSERVER
+        if aggregate:
+            callbacks.append(refitting(task, aggregate, steps - spent, newest))
+        model = _fit(
+            ALGORITHMS[name],
+            deepcopy(settings),  # to which stable-baselines3 adds
+            lambda: show(task, information, observer),
+            seed=seed,
+            steps=steps - spent,
+            callbacks=callbacks,
+            progress=bars,
+            description=f"{task.name} {information} {seed}",
+        )
+    if name != RECURRENT:
+        if newest.exists():  # which is what the agent has seen last
+            observer = str(newest)
+        how = {"algorithm": name, **settings, "seed": seed, "observer_steps": spent, "aggregate": aggregate}
+        player_of(model, task, information, observer=observer, training=how).save(folder / "agent.safetensors")
+    return model
+
+
+def _fit(
+    algorithm: type[BaseAlgorithm],
+    settings: Mapping[str, Any],
+    make: Callable[[], gym.Env[Any, Any]],
+    *,
+    seed: int,
+    steps: int,
+    callbacks: list[BaseCallback],
+    progress: ProgressBars,
+    description: str,
+) -> BaseAlgorithm:
+    """Learn from some steps; what is given of rl-zoo3's settings means what it means there."""
+    given = {key: value for key, value in settings.items() if key not in _OF_THE_RUN}
+    first = agent_training_seed(seed)
+    vec_env = make_vec_env(make, n_envs=settings.get("n_envs", 1), seed=first)
+    for key in ("learning_rate", "clip_range"):
+        if isinstance(given.get(key), str):
+            given[key] = linear(float(given[key].removeprefix("lin_")))
+    if settings.get("noise_type") == "normal":
+        size = np.full(vec_env.action_space.shape or (), settings["noise_std"])
+        given["action_noise"] = NormalActionNoise(np.zeros_like(size), size)
+    if settings.get("normalize"):
+        vec_env = VecNormalize(vec_env, gamma=given.get("gamma", 0.99))
+    model = algorithm(env=vec_env, seed=seed, device="cpu", **given)
+    vec_env.seed(first)  # the model has seeded it with ``seed``
+    try:
+        with progress.phase(description, steps) as report:
+            model.learn(steps, callback=[Bar(report), *callbacks])
+    finally:
+        vec_env.close()
+    return model
+
+
+def linear(start: float) -> Callable[[float], float]:
+    """Make a schedule that ends at zero.
+
+    Parameters
+    ----------
+    start : float
+        Its first value.
+
+    Returns
+    -------
+    callable
+        Of the share of the training that is left.
+    """
+    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
+
+
+class Bar(BaseCallback):
+    """Tells how many steps are done.
+
+    Parameters
+    ----------
+    report : callable
+        Whom.
+    """
+
+    def __init__(self, report: Callable[[float], object]) -> None:
+        super().__init__()
+        self._report = report
+
+    def _on_step(self) -> bool:
+        self._report(self.num_timesteps)
+        return True
+
+
+class Curve(BaseCallback):
+    """Writes the learning curve: steps, CPU seconds and return, at the end of each episode.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    spent : int
+        Steps that were spent before.
+    began : float
+        When the training began, as :func:`time.process_time` says it.
+    """
+
+    def __init__(self, path: Path, *, spent: int, began: float) -> None:
+        super().__init__()
+        self._path, self._spent, self._began = path, spent, began
+        self._rows = list[tuple[int, float, float]]()
+
+    def _on_step(self) -> bool:
+        for info in self.locals["infos"]:
+            if "episode" in info:  # of the monitor that make_vec_env puts around
+                seconds = round(time.process_time() - self._began, 2)
+                self._rows.append((self.num_timesteps + self._spent, seconds, round(float(info["episode"]["r"]), 4)))
+        return True
+
+    def _on_training_end(self) -> None:
+        with replacing(self._path) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.writer(file)
+            writer.writerow(("steps", "seconds", "return"))
+            writer.writerows(self._rows)
+
+
+def player_of(
+    model: BaseAlgorithm,
+    task: HiddenTask,
+    information: Shown,
+    *,
+    observer: str | None = None,
+    training: Mapping[str, Any] | None = None,
+) -> Player:
+    """Take the deterministic policy out of a trained agent.
+
+    Parameters
+    ----------
+    model : stable_baselines3 algorithm
+        Whose policy is a perceptron.
+    task : HiddenTask
+        Where it acts.
+    information : str
+        What it is shown.
+    observer : str, optional
+        File of its observer.
+    training : mapping, optional
+        How it was trained.
+
+    Returns
+    -------
+    Player
+        The policy, with the scaling of what it is shown.
+    """
+    policy: Any = model.policy
+    head: Head = "argmax" if isinstance(model.action_space, spaces.Discrete) else "clip"
+    if isinstance(model, SAC | TQC):
+        body, head = [*model.actor.latent_pi, model.actor.mu], "tanh"
+    elif isinstance(model, TD3):
+        body, head = list(model.actor.mu), "tanh"
+    elif isinstance(model, DQN):
+        body = list(policy.q_net.q_net)
+    else:
+        body = [*policy.mlp_extractor.policy_net, policy.action_net]
+    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
+    activation = next((_ACTIVATIONS[type(layer)] for layer in body if type(layer) in _ACTIVATIONS), "tanh")
+    with torch.no_grad():
+        network = MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
+    normal = model.get_vec_normalize_env()
+    scaling: dict[str, Any] = {}
+    if normal is not None:
+        moments: Any = normal.obs_rms
+        scaling = {"mean": moments.mean.copy(), "scale": np.sqrt(moments.var + normal.epsilon)}
+    return Player(
+        network,
+        head,
+        task,
+        information,
+        **scaling,
+        observer=observer,
+        fingerprint=None if observer is None else fingerprint(observer),
+        training=training or {},
+    )
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()
+
+
+__all__ = ["ALGORITHMS", "algorithm_for", "hyperparameters", "learn_to_play", "player_of"]

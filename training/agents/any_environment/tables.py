@@ -1,0 +1,230 @@
+"""The table and the figures of a comparison in any environments."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from observers.storage import replacing, write
+from training import markdown
+from training.agents.any_environment.comparison import RANDOM, Case
+from training.agents.any_environment.information import SHOWN
+from training.agents.statistics import interval, middle, normalised
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LABELS = {
+    "state": "full state",
+    "x_hat": "y and x̂",
+    "z": "y and z",
+    "stacked": "8 y and actions",
+    "recurrent": "y, recurrent agent",
+    "y": "y",
+}
+POINTS = 60  # of a learning curve
+WINDOW = 0.05  # of a training's steps, over which a learning curve is averaged
+Task = tuple[str, float]  # an environment and a noise
+
+
+def tasks_in(results: "pd.DataFrame") -> list[Task]:
+    """Environments and noises of results, in their order, but for those of the full state alone."""
+    of = results[~results.shown.isin(["state", RANDOM])]
+    found = of[["environment", "noise"]].drop_duplicates().itertuples(index=False, name=None)
+    return [(str(env_id), float(noise)) for env_id, noise in found]
+
+
+def cell(results: "pd.DataFrame", task: Task, shown: str) -> dict[str, Any] | None:
+    """What a table says of agents that are shown the same.
+
+    Parameters
+    ----------
+    results : DataFrame
+        As :func:`training.agents.any_environment.comparison.collect` returns them.
+    task : tuple of str and float
+        The environment and the noise.
+    shown : str
+        What the agents are shown.
+
+    Returns
+    -------
+    dict or None
+        ``returns`` of the agents, their interquartile mean ``middle``, ``seconds``, and ``interval``, the normalised
+        mean with its ends, and ``agents``, normalised, where random actions and the full state are known. None where
+        there are no agents.
+    """
+    here = results[results.environment == task[0]]
+    noise = 0.0 if shown == "state" else task[1]
+    mine = here[(here.shown == shown) & (here.noise == noise)]
+    if mine.empty:
+        return None
+    values = mine["return"].to_numpy()
+    found: dict[str, Any] = {"returns": values, "middle": float(middle(values)), "seconds": float(mine.seconds.mean())}
+    random, best = here[here.shown == RANDOM]["return"], here[here.shown == "state"]["return"].to_numpy()
+    if len(random) and len(best):
+        idle = float(random.iloc[0])
+        top = values if shown == "state" else best
+        found["interval"] = interval(values, top, idle)
+        found["agents"] = normalised(values, float(middle(top)), idle)
+    return found
+
+
+def write_table(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
+    """Write the table of a comparison.
+
+    Parameters
+    ----------
+    path : Path
+        A Markdown file.
+    results : DataFrame
+        As :func:`training.agents.any_environment.comparison.collect` returns them.
+    partial : str
+        What is missing, as a sentence.
+    """
+    tasks = tasks_in(results)
+    shown = [kind for kind in SHOWN if kind in set(results.shown)]
+    lines = [
+        "# Agents in any environment",
+        "",
+        "Return: interquartile mean over agents. In brackets the normalised return, where 0 is random actions and 1 "
+        "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. The "
+        f"steps from which an observer was learned count.{partial}",
+        "",
+    ]
+    rows, spent = [], []
+    for task in tasks:
+        row, times = [_named(task)], [_named(task)]
+        for kind in shown:
+            found = cell(results, task, kind)
+            row.append("–" if found is None else _written(found))
+            times.append("–" if found is None else f"{found['seconds']:.0f}")
+        random = results[(results.environment == task[0]) & (results.shown == RANDOM)]["return"]
+        rows.append([*row, f"{random.iloc[0]:.4g}" if len(random) else "–"])
+        spent.append(times)
+    heads = ["", *(LABELS[kind] for kind in shown)]
+    lines += markdown.table([*heads, "random"], rows)
+    lines += ["", "CPU seconds for one training:", "", *markdown.table(heads, spent)]
+    write(path, "\n".join(lines) + "\n")
+
+
+def _named(task: Task) -> str:
+    return task[0] + (f", noise {task[1]:g}" if task[1] else "")
+
+
+def _written(found: Mapping[str, Any]) -> str:
+    text = f"{found['middle']:.4g}"
+    if "interval" in found:
+        value, low, high = found["interval"]
+        spread = "" if np.isnan(low) else f", {low:.2f} to {high:.2f}"
+        text += f" ({value:.2f}{spread})"
+    return f"{text}, {len(found['returns'])}"
+
+
+def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
+    """Draw the normalised returns of all agents.
+
+    Parameters
+    ----------
+    path : Path
+        A PNG file.
+    results : DataFrame
+        As :func:`training.agents.any_environment.comparison.collect` returns them.
+    partial : str
+        What is missing, as a sentence.
+    """
+    from matplotlib.figure import Figure
+
+    tasks = tasks_in(results)
+    columns = min(4, max(1, len(tasks)))
+    rows = -(-len(tasks) // columns)
+    figure = Figure(figsize=(2.6 * columns + 1.5, 2.6 * rows + 0.6), layout="constrained")
+    axes = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
+    shown = [kind for kind in reversed(SHOWN) if kind in set(results.shown)]
+    for ax, task in zip(axes, tasks):
+        for place, kind in enumerate(shown):
+            found = cell(results, task, kind)
+            if found is not None and "interval" in found and np.isfinite(found["interval"][0]):
+                value, low, high = found["interval"]
+                ax.plot(found["agents"], np.full(len(found["agents"]), place), ".", color="0.6", markersize=4)
+                ax.plot([low, high], [place, place], color="C0", lw=2)
+                ax.plot(value, place, "o", color="C0")
+        ax.axvline(1.0, color="0.8", lw=0.8)
+        ax.set(title=_named(task), xlabel="normalised return")
+        ax.set_yticks(range(len(shown)), [LABELS[kind] for kind in shown])
+    for ax in axes[len(tasks) :]:
+        ax.set_axis_off()
+    figure.suptitle(f"What agents are shown and how well they act.{partial}", fontsize="medium")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def curves(cases: Sequence[Case]) -> "pd.DataFrame":
+    """Learning curves: returns of training episodes, averaged over a twentieth of the training, over its steps.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        Agents, those that are done among them.
+
+    Returns
+    -------
+    DataFrame
+        environment, noise, shown, steps, seconds and return, the last two interquartile means over agents.
+    """
+    import pandas as pd
+
+    groups: dict[tuple[str, float, str], list[pd.DataFrame]] = {}
+    for case in cases:
+        if case.kind != RANDOM and case.done:
+            curve = pd.read_csv(case.folder / "curve.csv")
+            if len(curve) > 1:
+                groups.setdefault((case.task.env_id, case.task.measurement_noise, case.kind), []).append(curve)
+    rows = []
+    for (env_id, noise, kind), group in groups.items():
+        last = max(float(curve.steps.iloc[-1]) for curve in group)
+        first = max(float(curve.steps.iloc[0]) for curve in group)
+        for steps in np.linspace(first, last, POINTS):
+            near = [curve[(curve.steps > steps - WINDOW * last) & (curve.steps <= steps)] for curve in group]
+            means = np.array([part["return"].mean() for part in near if len(part)])
+            if len(means):
+                seconds = [np.interp(steps, curve.steps, curve.seconds) for curve in group]
+                value, spent = float(middle(means)), float(middle(np.array(seconds)))
+                rows.append((env_id, noise, kind, round(steps), round(spent, 2), round(value, 3)))
+    return pd.DataFrame(rows, columns=["environment", "noise", "shown", "steps", "seconds", "return"])
+
+
+def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
+    """Draw learning curves against steps and against CPU seconds.
+
+    Parameters
+    ----------
+    path : Path
+        A PNG file.
+    found : DataFrame
+        As :func:`curves` returns them.
+    partial : str
+        What is missing, as a sentence.
+    """
+    from matplotlib.figure import Figure
+
+    tasks = tasks_in(found)
+    figure = Figure(figsize=(10.0, 2.7 * max(1, len(tasks)) + 0.8), layout="constrained")
+    axes = figure.subplots(max(1, len(tasks)), 2, sharey="row", squeeze=False)
+    for row, (env_id, noise) in zip(axes, tasks):
+        for i, kind in enumerate(SHOWN):
+            level = 0.0 if kind == "state" else noise
+            of = found[(found.environment == env_id) & (found.noise == level) & (found.shown == kind)]
+            for ax, over in zip(row, ("steps", "seconds")):
+                if len(of):
+                    ax.plot(of[over], of["return"], color=f"C{i}", lw=1.2, label=LABELS[kind])
+        row[0].set(ylabel="return", title=_named((env_id, noise)), xlabel="steps of the environment")
+        row[1].set(xlabel="CPU seconds")
+        row[1].set_xscale("log")
+        row[1].legend(fontsize="x-small")
+    figure.suptitle(f"Learning curves.{partial}", fontsize="medium")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+__all__ = ["LABELS", "cell", "curves", "draw_curves", "draw_scores", "tasks_in", "write_table"]

@@ -1,0 +1,180 @@
+"""Environments of others in which a part of the observation is hidden, and noise lies on the rest."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+
+from observers.checks import LARGEST, integer, is_finite, shown
+from training.rollouts.playing import make
+
+CLEAN, CLEAN_Y = "clean", "clean_y"  # of info, what was before noise was added
+
+
+@dataclass(frozen=True)
+class HiddenTask:
+    """An environment, what is measured of it, and what an observer is to estimate.
+
+    Parameters
+    ----------
+    env_id : str
+        As ``gym.make`` takes it.
+    measured : tuple of int
+        Entries of the flattened observation that an agent may see.
+    hidden : tuple of int, optional
+        Entries that an observer estimates; by default all that are not measured. Where there is noise it estimates
+        those that are measured as well.
+    measurement_noise : float
+        Standard deviation of the noise on each of them, at each step, in the observation's own units.
+    env_kwargs : mapping of str to object
+        Arguments of the environment.
+
+    Raises
+    ------
+    ValueError
+        If a number or an entry makes no sense.
+    """
+
+    env_id: str
+    measured: tuple[int, ...]
+    hidden: tuple[int, ...] | None = None
+    measurement_noise: float = 0.0
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("measured", "hidden"):
+            if (given := getattr(self, name)) is not None:
+                entries = tuple(integer(f"an entry of {name}", entry, 0) for entry in given)
+                if len(set(entries)) < len(entries) or (name == "measured" and not entries):
+                    raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
+                object.__setattr__(self, name, entries)
+        if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:
+            raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
+        object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
+
+    @property
+    def name(self) -> str:
+        """For people and folders: the environment, and the noise if there is any."""
+        noise = f" noise {self.measurement_noise:g}" if self.measurement_noise else ""
+        return f"{self.env_id.replace('/', '-')}{noise}"
+
+    def make(self, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
+        """Make the environment, with flat observations and noise on what is measured.
+
+        Parameters
+        ----------
+        noisy : bool
+            Whether the noise is there; ``info`` is the same without it.
+
+        Returns
+        -------
+        gymnasium.Env
+            All entries are in its observations.
+
+        Raises
+        ------
+        ValueError
+            If there is no such environment or entry, or its observations are not numbers.
+        """
+        env = make(self.env_id, self.env_kwargs)
+        if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
+            env = gym.wrappers.FlattenObservation(env)
+        space = env.observation_space
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1 and space.dtype != np.uint8):
+            raise ValueError(f"an observation of {self.env_id} is no row of numbers: {shown(space)}")
+        for entry in (*self.measured, *(self.hidden or ())):
+            if entry >= space.shape[0]:
+                raise ValueError(
+                    f"there is no entry {entry} in an observation of {self.env_id}: it has 0 to {space.shape[0] - 1}"
+                )
+        if not self.measurement_noise:
+            return env
+        return MeasurementNoise(env, self.measured, self.measurement_noise if noisy else 0.0)
+
+    def estimated(self, size: int) -> tuple[str, ...]:
+        """What an observer estimates of an observation of some size.
+
+        Parameters
+        ----------
+        size : int
+            Entries of a flattened observation.
+
+        Returns
+        -------
+        tuple of str
+            Signals as :func:`kkl_gym.named.resolved` takes them, in the order of the entries; under noise as they were
+            before it.
+        """
+        hidden = tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
+        if not self.measurement_noise:
+            return tuple(f"obs[{i}]" for i in hidden)
+        return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*hidden, *self.measured}))
+
+
+class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+    """Adds independent Gaussian noise to some entries of an observation.
+
+    Its generator is its own, seeded as the environment is: with noise and without, the same seed begins the same
+    episodes. ``info`` holds what was before the noise: ``clean``, the whole observation, and ``clean_y``, the entries
+    on which noise lies.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With a row of numbers as its observation.
+    entries : sequence of int
+        On which noise lies.
+    standard_deviation : float
+        Of the noise, at each step.
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:
+        RecordConstructorArgs.__init__(self, entries=list(entries), standard_deviation=standard_deviation)
+        gym.Wrapper.__init__(self, env)
+        self._entries, self._size = list(entries), standard_deviation
+        self._rng = np.random.default_rng()
+        low, high = env.observation_space.low.copy(), env.observation_space.high.copy()  # type: ignore[attr-defined]
+        low[self._entries], high[self._entries] = -np.inf, np.inf
+        self.observation_space = spaces.Box(low, high, dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Reset the environment, and with a seed the noise."""
+        if seed is not None:
+            self._rng = np.random.default_rng([seed, 1])
+        observation, info = self.env.reset(seed=seed, options=options)
+        return self._noisy(observation, info), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Step the environment, and add noise."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._noisy(observation, info), float(reward), terminated, truncated, info
+
+    def _noisy(self, observation: np.ndarray, info: dict[str, Any]) -> np.ndarray:
+        noisy = np.array(observation, dtype=np.float32)
+        info[CLEAN], info[CLEAN_Y] = noisy.astype(float), noisy[self._entries].astype(float)
+        noisy[self._entries] += self._size * self._rng.standard_normal(len(self._entries))
+        return noisy
+
+
+# Positions without velocities, as rl-zoo3's tasks hide them, and what an observer estimates where it is not all the
+# rest: of the double pendulum not the forces of its constraints.
+HIDDEN_VELOCITIES: dict[str, HiddenTask] = {
+    task.env_id: task
+    for task in (
+        HiddenTask("Pendulum-v1", (0, 1)),
+        HiddenTask("CartPole-v1", (0, 2)),
+        HiddenTask("MountainCarContinuous-v0", (0,)),
+        HiddenTask("LunarLander-v3", (0, 1, 4, 6, 7)),
+        HiddenTask("InvertedPendulum-v5", (0, 1)),
+        HiddenTask("InvertedDoublePendulum-v5", (0, 1, 2, 3, 4), hidden=(5, 6, 7)),
+        HiddenTask("Reacher-v5", (0, 1, 2, 3, 4, 5, 8, 9)),
+        HiddenTask("Hopper-v5", (0, 1, 2, 3, 4)),
+        HiddenTask("HalfCheetah-v5", (0, 1, 2, 3, 4, 5, 6, 7)),
+    )
+}

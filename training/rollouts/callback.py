@@ -1,0 +1,292 @@
+"""Observers that are refitted on an agent's own episodes while it learns, with stable-baselines3."""
+
+import math
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from kkl_gym import KKLObservation, KKLVectorObservation
+from observers import Artifact, KKLObserver
+from observers.checks import integer, shown
+from observers.replacement import check_replacement
+from training.maps.coordinates import settling_time
+from training.recorded.config import RecordedConfig
+from training.recorded.errors import RecordedErrors, recorded_errors
+from training.recorded.fit import train_recorded
+from training.records import Record
+from training.rollouts.gathering import Gathering
+
+QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings that stay
+
+
+@dataclass(frozen=True)
+class Refit:
+    """What came of a refit.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer that is in use from here on.
+    taken : bool
+        Whether it is the new one, which had to be as good as the one before.
+    before, error : float
+        Errors on held-out episodes, of the observer that was in use and of the one that is: root mean square over
+        standard deviation, of all hidden signals together. NaN where no episode that is long enough was held out.
+    steps : int
+        Environment steps so far.
+    seconds : float
+        That it took.
+    """
+
+    artifact: Artifact
+    taken: bool
+    before: float
+    error: float
+    steps: int
+    seconds: float
+
+    def __str__(self) -> str:
+        """For people, on one line."""
+        found = f"error {self.error:.3g} after {self.before:.3g}" if self.taken else f"error still {self.error:.3g}"
+        return f"refitted the observer at step {self.steps}: {found} ({self.seconds:.2g} s)"
+
+
+class KKLTrainingCallback(BaseCallback):
+    """Refits the observer in :class:`kkl_gym.KKLObservation` on the episodes of the agent that is being trained.
+
+    Estimates are good where the rollouts have been that the observer was learned from. An agent in training goes
+    elsewhere, and in a simulator its hidden signals are seen: every step serves the agent and the observer. The
+    environments keep their filters and what these hold. T_inv alone is replaced.
+
+    A refit fits T_inv anew to all episodes that are kept, but for a share that is held out for good. An observer that
+    is worse on that share than the one in use is not taken. Refits take place where an algorithm begins to collect:
+    an on-policy one never learns from a batch of two observers, and there is none after the last batch. One is left out
+    while no episode is as long as the filter remembers.
+
+    Logged are ``kkl/error``, the error on held-out episodes of the observer in use (root mean square over standard
+    deviation), ``kkl/error_before``, that of the one before, and ``kkl/refit_seconds``.
+
+    Parameters
+    ----------
+    every : int, default 5000
+        Environment steps, of all environments together, from refit to refit.
+    first : int, optional
+        Steps before the first one; by default ``every``.
+    keep : int, default 100_000
+        Steps that are kept; older ones are forgotten.
+    outputs : str, default "y"
+        What of ``info`` is recorded as outputs: by default what the observer saw, with whatever noise there was. Where
+        an environment tells them without noise, the key under which it does.
+    path : str or path, optional
+        A ``.safetensors`` file that receives the observer in use at each refit, whole or not at all.
+    on_refit : callable, optional
+        Told of each :class:`Refit`.
+    verbose : int, default 0
+        Whether refits are printed, as for other callbacks.
+    **settings : object
+        Of :class:`training.recorded.config.RecordedConfig`, where they are to differ from those that the observer was
+        learned with; by default one network and 1,000 batches. What makes the filter stays: eigenvalues, dt and inputs.
+
+    Attributes
+    ----------
+    artifact : Artifact
+        The observer in use, from the beginning of the training on.
+
+    Raises
+    ------
+    ValueError
+        If an argument makes no sense. At the beginning of the training, if an environment has no KKLObservation, an
+        observer that was not learned from rollouts, or another one than the others. At a step, if ``info`` lacks the
+        hidden signals, or a wrapper skips samples.
+
+    Notes
+    -----
+    Records hold what the observer saw. Noise that an environment adds is therefore that of the records, to which the
+    map's level 0 refers, as for :func:`training.learn`; with ``outputs`` level 0 is no noise.
+
+    Examples
+    --------
+    >>> import gymnasium as gym
+    >>> from kkl_gym import KKLObservation
+    >>> from stable_baselines3 import PPO
+    >>> from training import KKLTrainingCallback
+    >>> def learn(path):
+    ...     env = KKLObservation(gym.make("Pendulum-v1"), path)
+    ...     return PPO("MlpPolicy", env).learn(50_000, KKLTrainingCallback(every=5000, path="newer.safetensors"))
+    """
+
+    artifact: Artifact
+    _config: RecordedConfig
+    _gathering: Gathering
+
+    def __init__(
+        self,
+        every: int = 5000,
+        *,
+        first: int | None = None,
+        keep: int = 100_000,
+        outputs: str = "y",
+        path: str | os.PathLike[str] | None = None,
+        on_refit: Callable[[Refit], object] | None = None,
+        verbose: int = 0,
+        **settings: Any,
+    ) -> None:
+        super().__init__(verbose)
+        self._every = integer("every", every, 1)
+        self._next = self._every if first is None else integer("first", first, 1)
+        self._keep, self._outputs = integer("keep", keep, 1), outputs
+        if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
+            raise ValueError(f"path must end in .safetensors, got {shown(path)}")
+        self._path = None if path is None else Path(path)
+        if on_refit is not None and not callable(on_refit):
+            raise ValueError(f"on_refit must be a function of a Refit, got {shown(on_refit)}")
+        self._on_refit = on_refit
+        if fixed := [name for name in OF_THE_FILTER if name in settings]:
+            raise ValueError(
+                f"{', '.join(fixed)} cannot change: the filter in use stays; learn another observer instead"
+            )
+        if unknown := [name for name in settings if name not in _SETTINGS]:
+            raise ValueError(f"there is no setting {', '.join(unknown)}; there are {', '.join(_SETTINGS)}")
+        self._settings = settings
+
+    def _init_callback(self) -> None:
+        used = _observers(self.training_env)
+        artifact = used[0].artifact
+        config = _config(artifact, self._settings)
+        for observer in used:
+            check_replacement(artifact, observer.artifact)
+            level = observer.measurement_noise
+            if np.any(np.asarray(level) > np.asarray(config.measurement_noise_max)):
+                raise ValueError(
+                    f"measurement_noise_max = {config.measurement_noise_max} is less than the noise {level} that the "
+                    "observer in use assumes"
+                )
+        if not hasattr(self, "_gathering"):
+            self._gathering = Gathering(artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs)
+        else:
+            check_replacement(self.artifact, artifact)
+        self.artifact, self._config = artifact, config
+
+    def _on_training_start(self) -> None:
+        for row in range(self.training_env.num_envs):
+            self._begin(row, goes_on=True)
+
+    def _on_step(self) -> bool:
+        for row, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
+            self._gathering.add(row, info)
+            if done:
+                self._begin(row)
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self._gathering.steps >= self._next:
+            self._next = self._gathering.steps + self._every
+            train, held_out = self._gathering.records()
+            memory = settling_time(self.artifact.filter)
+            if any(record.duration >= memory for record in train):
+                self._refit(train, held_out)
+
+    def _begin(self, row: int, *, goes_on: bool = False) -> None:
+        """Begin an episode with what its reset said, or with its first step where that is not known."""
+        inside = self.training_env.unwrapped  # what lies around does not pass the infos of resets on
+        known = _vector_wrapper(self.training_env) is None
+        self._gathering.begin(row, inside.reset_infos[row] if known else {}, goes_on=goes_on)
+
+    def _refit(self, train: list[Record], held_out: list[Record]) -> None:
+        began, old = time.monotonic(), self.artifact
+        with (
+            torch.random.fork_rng(),
+            tempfile.TemporaryDirectory() as folder,
+        ):  # the agent's random numbers stay its own
+            config = replace(self._config, held_out=0.0)
+            new = train_recorded(train, config, Path(folder) / "refit", name=old.system).artifact
+        errors = recorded_errors(new, held_out)
+        before, after = _together(recorded_errors(old, held_out)), _together(errors)
+        taken = not after > before
+        if taken:
+            known = {name: error for name, error in errors.relative.items() if math.isfinite(error)}
+            training = {"held_out": self._config.held_out, "held_out_errors": known, "held_out_after": errors.after}
+            self.artifact = replace(new, training={**new.training, **training})
+            self._replace()
+        if self._path is not None:
+            self.artifact.save(self._path)
+        found = Refit(
+            self.artifact, taken, before, after if taken else before, self._gathering.steps, time.monotonic() - began
+        )
+        scalars = {"error": found.error, "error_before": before, "refit_seconds": found.seconds}
+        for name, value in scalars.items():
+            self.logger.record(f"kkl/{name}", value)
+        if self.verbose:
+            print(found)
+        if self._on_refit is not None:
+            self._on_refit(found)
+
+    def _replace(self) -> None:
+        vector = _vector_wrapper(self.training_env)
+        if vector is None:
+            self.training_env.env_method("replace_observer", self.artifact)
+        else:
+            vector.replace_observer(self.artifact)
+
+
+_SETTINGS = [field.name for field in fields(RecordedConfig) if field.name not in OF_THE_FILTER]
+
+
+def _config(artifact: Artifact, changes: Mapping[str, Any]) -> RecordedConfig:
+    """How an observer is refitted: as it was learned, but for a few settings."""
+    if artifact.environment is None or artifact.training.get("pipeline") != "recorded":
+        raise ValueError(
+            f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; learn "
+            "one by training.learn, or by kkl-gym record and kkl-gym train"
+        )
+    made = {
+        name: _tuples(artifact.training[name]) for name in (*_SETTINGS, *OF_THE_FILTER) if name in artifact.training
+    }
+    return RecordedConfig(**{**made, **QUICK, **changes})
+
+
+def _tuples(value: Any) -> Any:
+    """A setting as it was before a file made lists of tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _observers(env: VecEnv) -> list[KKLObserver]:
+    """The observers in use, ValueError where there are none."""
+    vector = _vector_wrapper(env)
+    if vector is not None:
+        return [vector.observer]
+    if not all(env.env_is_wrapped(KKLObservation)):
+        raise ValueError(
+            "KKLTrainingCallback refits the observers of kkl_gym.KKLObservation, and the environment has none: put "
+            'KKLObservation(gym.make(ID), "observer.safetensors") around each'
+        )
+    return env.get_attr("observer")
+
+
+def _vector_wrapper(env: VecEnv) -> KKLVectorObservation | None:
+    """The wrapper around a vector environment of Gymnasium's under one of stable-baselines3."""
+    inside = getattr(env.unwrapped, "env", None)
+    while isinstance(inside, gym.vector.VectorWrapper):
+        if isinstance(inside, KKLVectorObservation):
+            return inside
+        inside = inside.env
+    return None
+
+
+def _together(errors: RecordedErrors) -> float:
+    """Root mean square of the errors of all hidden signals."""
+    return float(np.sqrt(np.mean(np.square(list(errors.relative.values())))))
+
+
+__all__ = ["KKLTrainingCallback", "Refit"]
