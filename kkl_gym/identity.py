@@ -10,8 +10,8 @@ import gymnasium as gym
 from observers import Artifact, ArtifactError
 from observers.checks import is_finite, shown
 
-# Arguments that change nothing of the plant; vector environments add the last three.
-APPEARANCE = ("render_mode", "max_episode_steps", "num_envs", "vectorization_mode")
+# Arguments that change nothing of the plant; the last three are those of vectors.
+APPEARANCE = ("render_mode", "max_episode_steps", "num_envs", "vectorization_mode", "autoreset_mode")
 Env = gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]
 
 

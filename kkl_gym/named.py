@@ -2,7 +2,7 @@
 
 import re
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 
 from kkl_gym.signals import Inputs, Outputs
-from observers.checks import real_array
+from observers.checks import real_array, shown
 
 Space = gym.Space[Any]
 FUNCTIONS = {"cos": np.cos, "sin": np.sin}
@@ -51,12 +51,12 @@ def _size(space: Space) -> int:
         return 0
 
 
-def resolved(names: Sequence[str], space: Space, *, role: str, source: str) -> tuple[str, ...]:
+def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str) -> tuple[str, ...]:
     """Full names of signals.
 
     Parameters
     ----------
-    names : sequence of str
+    names : sequence of str or int
         Each an index in the flattened observation (``0`` or ``obs[0]``), a key of a Dict, which stands for all of its
         entries, one of those (``key[0]``), what ``info`` holds (``info[key]``, ``info[key][0]``), or ``cos(...)`` or
         ``sin(...)`` of one of these.
@@ -77,8 +77,10 @@ def resolved(names: Sequence[str], space: Space, *, role: str, source: str) -> t
     ValueError
         If there is no such entry; the message says which there are.
     """
+    if isinstance(names, str) or not isinstance(names, Iterable):
+        raise ValueError(f"{role} must be a sequence of names or indices, such as [0, 1], got {shown(names)}")
     there, found = observed(space), list[str]()
-    for name in names:
+    for name in map(str, names):
         function = _FUNCTION.fullmatch(name)
         entries = _entries(name if function is None or name in there else function[2].strip(), space, there)
         if not entries or (function and len(entries) > 1):
@@ -140,10 +142,10 @@ class Reader:
         columns = [there[i] for i in chosen]
         self._outputs = None
         low, high = np.zeros(0), np.zeros(0)
-        if chosen and isinstance(space, spaces.Dict):
-            keys = [key for key in space if any(column.partition("[")[0] == key or column == key for column in columns)]
-            self._outputs = Outputs(space, keys, (), source=source)
-            columns = list(observed(spaces.Dict({key: space[key] for key in keys})))
+        if chosen and isinstance(space, spaces.Dict):  # of the keys that are read alone: others may be images
+            owners = [key for key, part in space.items() for _ in range(_size(part))]
+            read = spaces.Dict({key: space[key] for key in dict.fromkeys(owners[i] for i in chosen)})
+            self._outputs = Outputs(read, [observed(read).index(column) for column in columns], (), source=source)
         elif chosen:
             self._outputs = Outputs(space, chosen, (), source=source)
         if self._outputs is not None:

@@ -59,8 +59,13 @@ class Outputs:
             self._parts = {key: part for key, part in self._parts.items() if key in self.measured}
         for key, part in self._parts.items():
             _check(part, self._source if key is None else f"{self._source}, {key!r},")
-        low, high = (np.concatenate(side) for side in zip(*map(_limits, self._parts.values())))
         owners = [key for key, part in self._parts.items() for _ in _limits(part)[0]]
+        if not owners:
+            raise ValueError(f"{self._source} holds no numbers: there is nothing to remember")
+        low, high = (np.concatenate(side) for side in zip(*map(_limits, self._parts.values())))
+        self._names = [  # of the entries, for messages
+            f"entry {i}" if key is None else f"entry {i - owners.index(key)} of {key!r}" for i, key in enumerate(owners)
+        ]
         taken = list(range(len(owners)))
         if self.measured and not keys:
             taken = _positions("measured", self.measured, owners)
@@ -106,10 +111,10 @@ class Outputs:
             y = y[..., self._take]
         if not all_finite(y):
             at = np.argwhere(~(np.abs(y) <= LARGEST))[0]
-            row = f" in environment {at[0]}" if batch else ""
+            row = f", row {at[0]}" if batch else ""
             raise ValueError(
-                f"{self._source} holds {y[tuple(at)]} among what is measured, in entry {self._take[at[-1]]}{row}: it "
-                "would stay in the memory, so replace it, with gymnasium.wrappers.TransformObservation for instance"
+                f"{self._source} holds {y[tuple(at)]} among what is read, in {self._names[self._take[at[-1]]]}{row}: "
+                "it would stay in the memory, so replace it, with gymnasium.wrappers.TransformObservation for instance"
             )
         if len(self._sines):
             y[..., self._cosines] = np.cos(y[..., self._cosines])
@@ -143,7 +148,8 @@ class Inputs:
         _check(space, self._source)
         self.low, self.high = _limits(space)
         boxes = [isinstance(leaf, spaces.Box) for leaf in _leaves(space) for _ in _limits(leaf)[0]]
-        scaled = np.array(boxes, dtype=bool) & np.isfinite(self.low) & np.isfinite(self.high)
+        # Bounds that no action may reach, as the largest float is, are none.
+        scaled = np.array(boxes, dtype=bool) & (abs(self.low) <= LARGEST) & (abs(self.high) <= LARGEST)
         low, high = np.where(scaled, self.low, -1.0), np.where(scaled, self.high, 1.0)
         self._middle, self._half = (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
         self._plain = not self._middle.any() and bool((self._half == 1.0).all())
@@ -254,14 +260,16 @@ def _signals(source: str, space: Space, value: Any, batch: tuple[int, ...]) -> n
         return _read(space, value, batch)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         many = f", {batch[0]} times," if batch else ""
-        raise ValueError(f"{source} must be of {space}{many} got {shown(value)}") from error
+        raise ValueError(f"{source} must be of {space}{many or ','} got {shown(value)}") from error
 
 
 def _read(space: Space, value: Any, batch: tuple[int, ...]) -> np.ndarray:
-    if isinstance(space, spaces.Box):
+    if isinstance(space, spaces.Box) and space.dtype != np.bool_:
         return real_array("it", value).reshape(*batch, space.low.size)
-    if isinstance(space, spaces.MultiBinary):
-        return real_array("it", value).reshape(*batch, spaces.flatdim(space))
+    if isinstance(space, spaces.Box | spaces.MultiBinary):  # of flags
+        array = value if isinstance(value, np.ndarray) else np.asarray(value)
+        flags = array.astype(np.int8) if array.dtype == np.bool_ else value
+        return real_array("it", flags).reshape(*batch, spaces.flatdim(space))
     if isinstance(space, spaces.Discrete):
         return _one_hot(value, int(space.n), int(space.start), batch)
     if isinstance(space, spaces.MultiDiscrete):

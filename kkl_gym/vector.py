@@ -116,7 +116,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        self.system = self.plant.system
+        self.system, self.dt = self.plant.system, self.plant.dt
         nx, ny = self.system.nx, self.system.ny
         self._low, self._high = (np.array(bound)[:, None] for bound in zip(*self.system.bounds, strict=True))
         self._u_max = np.array(self.system.u_max)

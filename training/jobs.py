@@ -240,15 +240,25 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
         If checkpoints would be spoiled, or another process is at work there.
     """
     with locked(folder):
-        if any(folder.glob("[!.]*.checkpoint.*")):
-            if not resume:
-                raise ValueError(
-                    f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, "
-                    "or take another folder (--out)"
-                )
+        if not resume:
+            refuse_checkpoints(folder)
+        elif _has_checkpoints(folder):
             check_identity(folder / "config.json", described, "a run of another configuration")
         write(folder / "config.json", json.dumps(_as_json(described), indent=2) + "\n")
         yield
+
+
+def refuse_checkpoints(folder: Path) -> None:
+    """Raise ValueError if a folder holds the checkpoints of a run."""
+    if _has_checkpoints(folder):
+        raise ValueError(
+            f"{folder} holds the checkpoints of a run: go on with it (resume=True, --resume), remove it, or take "
+            "another folder (--out)"
+        )
+
+
+def _has_checkpoints(folder: Path) -> bool:
+    return any(folder.glob("[!.]*.checkpoint.*"))
 
 
 def _as_json(described: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from kkl_gym.identity import source_of
 from kkl_gym.memory import Memory
 from kkl_gym.signals import Entries, Inputs, Outputs
 from kkl_gym.vector import Infos, with_mask
@@ -30,7 +31,7 @@ class _Remembering:
         time_constants: Sequence[float],
         input_time_constants: Sequence[float],
     ) -> None:
-        source = env.spec.id if env.spec is not None else type(env.unwrapped).__name__
+        source = source_of(env)
         self.outputs = Outputs(observation_space, measured, angles, source=source)
         self.inputs = Inputs(action_space, source=source)
         self.memory = Memory(
@@ -39,8 +40,8 @@ class _Remembering:
             time_constants=time_constants,
             input_time_constants=input_time_constants,
         )
-        low, high = self.memory.bounds(self.outputs.low, self.outputs.high, self.inputs.low, self.inputs.high)
-        with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+        with np.errstate(over="ignore"):  # what floats cannot hold is unbounded
+            low, high = self.memory.bounds(self.outputs.low, self.outputs.high, self.inputs.low, self.inputs.high)
             self.space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 

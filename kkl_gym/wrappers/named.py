@@ -8,6 +8,7 @@ import numpy as np
 
 from kkl_gym.identity import check_identity, source_of
 from kkl_gym.named import InputReader, Reader, observed, resolved
+from kkl_gym.signals import Inputs
 from kkl_gym.wrappers.estimator import KKLEstimator, reach
 from observers import Artifact, ArtifactError, KKLObserver
 from observers.checks import choice, flag
@@ -70,6 +71,7 @@ class NamedEstimator(KKLEstimator):
         self.observer = KKLObserver(artifact, measurement_noise, monitor=monitor)
         self.estimate = estimate
         try:
+            _check_actions(env, action_space)
             self.samples = Samples(artifact, observation_space, action_space, source=source_of(env))
         except ValueError as error:
             raise ArtifactError(f"the observer {artifact.system!r} does not fit: {error}") from error
@@ -77,7 +79,8 @@ class NamedEstimator(KKLEstimator):
         if estimate == "x":
             low, high = _bounds(artifact, observation_space)
         else:
-            high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
+            with np.errstate(over="ignore"):
+                high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
             low = -high
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
         with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
@@ -194,6 +197,18 @@ def _reader_of_hidden(space: gym.Space[Any], names: Sequence[str], source: str) 
         return Reader(space, resolved(names, space, role="hidden", source=source), source=source)
     except ValueError:
         return None
+
+
+def _check_actions(env: Any, space: gym.Space[Any]) -> None:
+    """Raise ValueError if a wrapper inside makes other inputs of actions, as ClipAction's are not bounded."""
+    base, source = env.unwrapped, source_of(env)
+    own = base.single_action_space if isinstance(base, gym.vector.VectorEnv) else base.action_space
+    here, there = (Inputs(one, source=source) for one in (space, own))
+    if not (np.array_equal(here.low, there.low) and np.array_equal(here.high, there.high)):
+        raise ValueError(
+            f"actions of {source} are of {own}, and a wrapper inside takes {space}: the observer would misread them; "
+            "put that wrapper outside"
+        )
 
 
 def _bounds(artifact: Artifact, space: gym.Space[Any]) -> tuple[np.ndarray, np.ndarray]:

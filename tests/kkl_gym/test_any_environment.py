@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import ClipAction, DiscretizeAction, RescaleAction
 from rollout_observers import observer_of
 
 from kkl_gym import KKLObservation, KKLVectorObservation
@@ -282,6 +283,35 @@ def test_vectors_that_are_no_rows_of_environments(saved):
     envs.reset(seed=0)
     obs, *_ = envs.step(envs.action_space.sample())
     assert obs.shape == (4, 4)
+
+
+@pytest.mark.parametrize("mode", list(gym.vector.AutoresetMode))
+def test_vectors_of_our_own_in_every_mode(saved, mode):
+    artifact = observer_of(
+        "KKLVanDerPol-v0", ["obs[0]"], ["obs[1]"], ["action[0]"], dt=0.01, kwargs={"system": "van_der_pol"}
+    )
+    make = partial(gym.make_vec, "KKLVanDerPol-v0", num_envs=3, max_episode_steps=4)
+    envs = KKLVectorObservation(make(autoreset_mode=mode), saved(artifact))
+    rows = KKLVectorObservation(
+        make(vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}), saved(artifact)
+    )
+    np.testing.assert_allclose(envs.reset(seed=2)[0], rows.reset(seed=2)[0], rtol=1e-6)
+    actions = np.full((3, 1), 0.5, np.float32)
+    for _ in range(3):
+        np.testing.assert_allclose(envs.step(actions)[0], rows.step(actions)[0], rtol=1e-4, atol=1e-5)
+
+
+def test_wrappers_that_change_what_actions_mean(saved):
+    path = saved(PENDULUM())
+    for wrap in (ClipAction, partial(DiscretizeAction, bins=3)):
+        with pytest.raises(ArtifactError, match=r"a wrapper inside takes .*: the observer would misread them; put"):
+            KKLObservation(wrap(gym.make("Pendulum-v1")), path)
+    half = np.float32([0.5])
+    plain, inside = (KKLObservation(gym.make("Pendulum-v1"), path) for _ in range(2))
+    inside = KKLObservation(RescaleAction(gym.make("Pendulum-v1"), np.float32(-1), np.float32(1)), path)
+    plain.reset(seed=0), inside.reset(seed=0)
+    np.testing.assert_allclose(inside.step(half)[0], plain.step(2 * half)[0], rtol=1e-6)
+    ClipAction(plain).step(9 * half)
 
 
 def test_vectors_that_are_refused(saved):

@@ -240,6 +240,22 @@ def test_actions_beyond_the_bounds_count_as_the_bounds_and_half_a_bound_is_none(
     assert [read.low.tolist(), read.high.tolist()] == [[-1.0, 0.0, -1.0], [1.0, np.inf, 1.0]]
 
 
+def test_bounds_that_are_the_largest_floats_are_none():
+    for dtype in (np.float32, np.float64):
+        largest = np.finfo(dtype).max
+        read = Inputs(spaces.Box(-largest, largest, (2,), dtype), source="X-v0")
+        assert read(np.array([3.0, -0.5])).tolist() == [3.0, -0.5]
+
+
+@pytest.mark.parametrize("space", [spaces.MultiBinary(2), spaces.Box(0, 1, (2,), np.bool_)], ids=str)
+def test_flags_are_numbers_where_the_space_has_them(space):
+    for flags in (np.array([True, False]), [True, False], np.array([1, 0], np.int8)):
+        assert Outputs(space, None, (), source="X-v0")(flags).tolist() == [1.0, 0.0]
+    assert Inputs(space, source="X-v0")(np.array([[True, False]] * 3), (3,)).shape == (3, 2)
+    with pytest.raises(ValueError, match=r"must be of .*, got"):
+        Outputs(space, None, (), source="X-v0")(np.ma.array([True, False], mask=[True, False]))
+
+
 def test_what_is_measured_and_angles():
     space = spaces.Box(-10.0, 10.0, (4,))
     values = np.array([0.1, 2.0, -3.0, 9.0])
@@ -282,6 +298,9 @@ MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Tex
         (MIXED, ["place"], ["camera"], "angles names 'camera', but what is observed has keys 'place'"),
         (MIXED, ["place"], [1], "angles must be keys, as measured is"),
         (spaces.Sequence(spaces.Discrete(2)), None, (), "only Box, Discrete"),
+        (spaces.Box(-1, 1, (0,)), None, (), "X-v0 holds no numbers: there is nothing to remember"),
+        (spaces.Dict(), None, (), "X-v0 holds no numbers"),
+        (spaces.Dict(a=spaces.Box(-1, 1, (0,)), b=spaces.Discrete(2)), ["a"], (), "X-v0 holds no numbers"),
     ],
 )
 def test_what_cannot_be_measured_says_what_to_do(space, measured, angles, match):
@@ -577,7 +596,7 @@ def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
     env = KKLMemory(Walk(), measured=["place"])
     env.reset(seed=0)
     env.unwrapped.poison = poison
-    with pytest.raises(ValueError, match=r"the observation of Walk holds .* in entry 1: .*TransformObservation"):
+    with pytest.raises(ValueError, match=r"the observation of Walk holds .* in entry 1 of 'place': .*TransformObserv"):
         env.step(env.action_space.sample())
     env.unwrapped.poison = None
     env.reset(seed=0)
@@ -585,7 +604,7 @@ def test_what_would_poison_the_memory_is_an_error_that_names_it(poison):
     envs = KKLVectorMemory(SyncVectorEnv([Walk] * 3), measured=["place"])
     envs.reset(seed=0)
     envs.unwrapped.envs[2].poison = poison
-    with pytest.raises(ValueError, match="in entry 1 in environment 2"):
+    with pytest.raises(ValueError, match="in entry 1 of 'place', row 2"):
         envs.step(envs.action_space.sample())
     env = KKLMemory(gym.make("Pendulum-v1"))
     before = env.reset(seed=0)[0]
@@ -598,6 +617,20 @@ def twin(before):
     env = KKLMemory(gym.make("Pendulum-v1"))
     assert np.array_equal(env.reset(seed=0)[0], before)
     return env
+
+
+def test_float64_without_bounds():
+    largest = np.finfo(float).max
+
+    class Wide(Walk):
+        observation_space = spaces.Box(-largest, largest, (2,), np.float64)
+
+        def _seen(self):
+            return self.place.astype(float)
+
+    env = KKLMemory(Wide())
+    assert np.isinf(env.observation_space.high[:10]).all()
+    assert env.reset(seed=0)[0] in env.observation_space
 
 
 def test_wrong_environments_say_what_to_do():

@@ -21,7 +21,7 @@ def names(*given, space=PLAIN):
 
 def test_entries_of_a_box_are_numbered():
     assert observed(PLAIN) == ("obs[0]", "obs[1]", "obs[2]", "obs[3]")
-    assert names("0", "obs[3]", "cos(2)", "info[speed]") == ("obs[0]", "obs[3]", "cos(obs[2])", "info[speed]")
+    assert names(0, "obs[3]", "cos(2)", "info[speed]") == ("obs[0]", "obs[3]", "cos(obs[2])", "info[speed]")
 
 
 def test_keys_of_a_dict_stand_for_all_of_their_entries():
@@ -61,6 +61,25 @@ def test_flags_in_info_are_numbers():
 def test_images_beside_what_is_read_are_not_looked_at():
     reader = Reader(KEYED, names("gap", "arm[1]", space=KEYED), source="Env-v0")
     assert reader({"arm": np.array([0.1, 0.2]), "camera": None, "gap": np.array([4.0])}, {}).tolist() == [4.0, 0.2]
+
+
+def test_entries_of_a_key_that_are_not_read_may_be_missing():
+    reader = Reader(KEYED, names("arm[1]", space=KEYED), source="Env-v0")
+    assert reader({"arm": np.array([np.nan, 0.2])}, {}).tolist() == [0.2]
+    with pytest.raises(ValueError, match=r"nan among what is read, in entry 1 of 'arm':"):
+        reader({"arm": np.array([0.1, np.nan])}, {})
+
+
+def test_keys_with_brackets():
+    space = spaces.Dict({"arm": PLAIN, "arm[x]": spaces.Box(-1.0, 1.0, (2,))})
+    reader = Reader(space, names("arm[x][1]", "arm[2]", space=space), source="Env-v0")
+    assert reader({"arm": np.arange(4.0).reshape(2, 2), "arm[x]": np.array([0.1, 0.2])}, {}).tolist() == [0.2, 2.0]
+
+
+@pytest.mark.parametrize("wrong", ["01", 0, None])
+def test_names_are_a_sequence(wrong):
+    with pytest.raises(ValueError, match=r"measured must be a sequence of names or indices, such as \[0, 1\], got"):
+        resolved(wrong, PLAIN, role="measured", source="Env-v0")
 
 
 def test_images_are_refused():

@@ -132,6 +132,8 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     if "measurement_noise_max" not in given:
         y = np.concatenate([record.y for record in records])
         levels = tuple(float(f"{NOISE_SHARE * size:.3g}") for size in np.nanstd(y, 0))
+        if still := [name for name, level in zip(records[0].signals.measured, levels) if not level]:
+            raise ValueError(f"{', '.join(still)} never changes and tells nothing: leave it out of what is measured")
         chosen["measurement_noise_max"] = levels[0] if len(levels) == 1 else levels
     return RecordedConfig(**chosen)
 

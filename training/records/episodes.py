@@ -99,27 +99,30 @@ class Rollouts:
         if not measured:
             raise ValueError(f"{self.name}: say which entries of the observation are measured (--measured 0,1)")
         signals = Signals("t", measured, wanted.inputs or acting(self.action_space), hidden)
-        read_y, read_x = (Reader(self.observation_space, names, source=source) for names in (measured, hidden))
+        readers = [Reader(self.observation_space, names, source=source) for names in (measured, hidden) if names]
         read_u = InputReader(self.action_space, signals.inputs, source=source)
         found = []
         for i, episode in enumerate(self.episodes):
             n = len(episode.rewards)
             if not n:
                 continue
-            y, x = (read(episode.observations, episode.infos, (n + 1,)) for read in (read_y, read_x))
+            try:
+                y, *x = (read(episode.observations, episode.infos, (n + 1,)) for read in readers)
+                u = read_u(episode.actions, (n,))
+            except ValueError as error:
+                raise ValueError(f"{self.name}, episode {i}: {error}") from error
             if np.isnan(y[0]).any():
                 raise ValueError(
                     f"{self.name}, episode {i}: {measured[int(np.isnan(y[0]).argmax())]} is not there after the reset, "
                     "where an observer takes its first sample; measure something else"
                 )
-            u = read_u(episode.actions, (n,))
             found.append(
                 Record(
                     f"{self.name}, episode {i}",
                     self.dt * np.arange(n + 1),
                     y,
                     np.concatenate([u, u[-1:]]) if signals.inputs else None,
-                    x if hidden else None,
+                    x[0] if hidden else None,
                     signals,
                     source=self.name,
                     environment=self.environment,

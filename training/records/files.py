@@ -46,7 +46,9 @@ def read_columns(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
     """
     readers = {".npz": _npz, ".csv": _csv, ".parquet": _parquet}
     if path.suffix.lower() not in readers:
-        raise ValueError(f"{path} is no record: its name must end in {', '.join(readers)}")
+        raise ValueError(
+            f"{path} is no record: its name must end in {', '.join(readers)}, or be minari:ID of a data set"
+        )
     if not path.is_file():  # to read a pipe may never end
         raise ValueError(f"{path} is a folder, a pipe or a device" if path.exists() else f"there is no file {path}")
 

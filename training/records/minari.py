@@ -1,5 +1,7 @@
 """Minari data sets, the format in which rollouts of environments are exchanged. Nothing in one runs."""
 
+import copy
+import errno
 import json
 import os
 import secrets
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 
 from kkl_gym.identity import APPEARANCE, sampling_interval
+from observers.checks import check_dt
 from observers.storage import UNFINISHED
 from training.records.episodes import Episode, Rollouts
 from training.records.signals import Signals
@@ -55,11 +58,13 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
         dataset = _found(str(name))
         metadata = dataset.storage.metadata
         own = metadata.get(KEY, {})
+        signals = Signals(measured=own.get("measured", ()), hidden=own.get("hidden", ()))
+        dt = check_dt(own["dt"]) if "dt" in own else None
         episodes = [
             Episode(one.observations, one.actions, one.rewards, bool(one.terminations[-1:].any()), one.infos or {})
             for one in dataset.iterate_episodes()
         ]
-    except (AssertionError, KeyError, OSError, TypeError, ValueError, NotImplementedError) as error:
+    except (AssertionError, AttributeError, KeyError, OSError, TypeError, ValueError, NotImplementedError) as error:
         raise ValueError(f"{name} cannot be read as a Minari data set: {error}") from error
     if not episodes:
         raise ValueError(f"{name} holds no episode")
@@ -68,11 +73,11 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
     return Rollouts(
         str(name).removeprefix(PREFIX),
         None if spec is None else {"id": spec.id, "kwargs": kwargs},
-        own.get("dt") or _interval(str(name), spec, kwargs, warn),
+        dt or _interval(str(name), spec, kwargs, warn),
         metadata["observation_space"],
         metadata["action_space"],
         episodes,
-        Signals(measured=tuple(own.get("measured", ())), hidden=tuple(own.get("hidden", ()))),
+        signals,
     )
 
 
@@ -117,7 +122,7 @@ def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | Non
             temporary / DATA,
             observation_space=rollouts.observation_space,
             action_space=rollouts.action_space,
-            env_spec=spec,
+            env_spec=None if spec is None else _written(spec),
             jpeg_encoding=False,
         )
         storage.update_episodes(
@@ -141,8 +146,10 @@ def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | Non
             }
         )
         os.rename(temporary, folder)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(error, OSError):
+            _refuse_existing(folder, rollouts.name)  # another process was quicker
         raise
     return folder
 
@@ -164,6 +171,8 @@ def dataset_folder(name: str) -> Path:
     ------
     ValueError
         If there is such a data set already, or the ID makes none.
+    OSError
+        If nothing can be written there.
     ModuleNotFoundError
         Without Minari.
     """
@@ -175,10 +184,28 @@ def dataset_folder(name: str) -> Path:
         parse_dataset_id(name)
     except (TypeError, ValueError):
         raise ValueError(f"a Minari data set is called as in pendulum/random-v0, got {name!r}") from None
-    folder = get_dataset_path(name)
+    folder = Path(get_dataset_path(name))
+    _refuse_existing(folder, name)
+    there = next(parent for parent in folder.parents if parent.exists())
+    if not os.access(there, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(there))
+    return folder
+
+
+def _refuse_existing(folder: Path, name: str) -> None:
     if folder.exists():
         raise ValueError(f"there is a data set {name} already; name another (--dataset), or `minari delete {name}`")
-    return Path(folder)
+
+
+def _written(spec: "gym.envs.registration.EnvSpec") -> "gym.envs.registration.EnvSpec":
+    """A specification as JSON can hold it: classes and functions by where they are written."""
+    found = copy.copy(spec)
+    for name in ("entry_point", "vector_entry_point"):
+        made_by = getattr(spec, name)
+        if callable(made_by):
+            what = getattr(made_by, "__qualname__", type(made_by).__qualname__)
+            setattr(found, name, f"{made_by.__module__}:{what}")
+    return found
 
 
 def _at_the_end(episode: Episode, value: bool) -> list[bool]:

@@ -5,11 +5,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from observers import Artifact
+from training.jobs import refuse_checkpoints
 from training.progress import ProgressBars, progress_bars
-from training.recorded.config import recorded_config
+from training.recorded.config import RecordedConfig, recorded_config
 from training.recorded.fit import train_recorded
 from training.rollouts.playing import make, roll_out
 from training.rollouts.policies import RANDOM, Policy, policy_of
@@ -36,8 +38,8 @@ def learn(
     env_id : str
         As ``gym.make`` takes it.
     measured, hidden : sequence of str or int
-        What the observer sees, and what it estimates: indices in the flattened observation, keys of a Dict, or
-        ``info[key]``, see :func:`kkl_gym.named.resolved`.
+        What the observer sees, and what it estimates, one of each at least: indices in the flattened observation,
+        keys of a Dict, or ``info[key]``, see :func:`kkl_gym.named.resolved`.
     policy : str or callable
         Who acts, see :func:`training.rollouts.policy_of`. Estimates are good where it has been.
     episodes, steps : int, optional
@@ -65,6 +67,8 @@ def learn(
     """
     if episodes is None and steps is None:
         steps = 100_000
+    settings = {"seed": seed} | settings
+    _check(hidden, settings, None if out is None else Path(out))
     with tempfile.TemporaryDirectory() as scratch, progress_bars(console) as progress:
         folder = Path(scratch) / "run" if out is None else Path(out)
         playing = progress.phase(f"playing {env_id}", steps or episodes or 1)
@@ -72,20 +76,30 @@ def learn(
             rollouts = roll_out(
                 env,
                 policy_of(policy, env),
-                measured=[str(name) for name in measured],
-                hidden=[str(name) for name in hidden],
+                measured=measured,
+                hidden=hidden,
                 episodes=episodes,
                 steps=steps,
                 seed=seed,
                 report=report,
             )
         records = rollouts.records()
-        config = recorded_config(records, {"seed": seed, **settings})
+        config = recorded_config(records, settings)
         name = (rollouts.environment or {})["id"].replace("/", "-")
         artifact = train_recorded(records, config, folder, name=name, console=progress).artifact
         if out is not None:
             artifact.save(folder / f"{name}.safetensors")
     return artifact
+
+
+def _check(hidden: Sequence[str | int], settings: Mapping[str, Any], out: Path | None) -> None:
+    """What would be an error after all was played is one before."""
+    if not np.size(hidden):
+        raise ValueError("say which signals are hidden, which the observer is to estimate, as in hidden=[2]")
+    chosen_later: dict[str, Any] = {"eigenvalues": (-1.0,), "dt": 1.0, "measurement_noise_max": 1.0}
+    RecordedConfig(**chosen_later | {name: value for name, value in settings.items() if value is not None})
+    if out is not None:
+        refuse_checkpoints(out)
 
 
 __all__ = ["learn"]

@@ -1,5 +1,6 @@
 """Playing episodes, and keeping what happened."""
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -44,8 +45,8 @@ def roll_out(
     env: gym.Env[Any, Any],
     policy: Policy,
     *,
-    measured: Sequence[str],
-    hidden: Sequence[str],
+    measured: Sequence[str | int],
+    hidden: Sequence[str | int],
     episodes: int | None = None,
     steps: int | None = None,
     seed: int = 0,
@@ -60,7 +61,7 @@ def roll_out(
         The environment, made by ``gym.make``.
     policy : callable
         From an observation to an action.
-    measured, hidden : sequence of str
+    measured, hidden : sequence of str or int
         Signals, as :func:`kkl_gym.named.resolved` takes them.
     episodes, steps : int, optional
         Where to stop, at whichever comes first; one of them is needed. An episode that ``steps`` ends counts as far as
@@ -99,21 +100,17 @@ def roll_out(
     keys = tuple(dict.fromkeys(key for reader in readers for key in reader.keys))
     env.action_space.seed(integer("seed", seed, 0))
     played, total = list[Episode](), 0
+    found = Rollouts(
+        name or source, env_identity, sampling_interval(env), env.observation_space, env.action_space, played, signals
+    )
     while (episodes is None or len(played) < episodes) and (steps is None or total < steps):
         left = None if steps is None else steps - total
         played.append(_episode(env, policy, keys, seed=None if played else seed, most=left))
         total += len(played[-1].rewards)
+        if len(played) == 1:
+            found.records()  # an error now, not after hours
         if report is not None:
             report(len(played) if steps is None else total)
-    found = Rollouts(
-        name or source,
-        env_identity,
-        sampling_interval(env),
-        env.observation_space,
-        env.action_space,
-        played,
-        signals,
-    )
     found.records()  # an error now where a signal cannot be read
     return found
 
@@ -122,17 +119,23 @@ def _episode(
     env: gym.Env[Any, Any], policy: Policy, keys: Sequence[str], *, seed: int | None, most: int | None
 ) -> Episode:
     observation, info = env.reset(seed=seed)
-    observations, actions, infos = [observation], list[Any](), [info]
+    observations, actions, infos = list[Any](), list[Any](), list[list[Any]]()
     rewards = list[float]()
+
+    def keep(to: list[Any], value: Any) -> None:
+        to.append(copy.deepcopy(value))  # environments and policies may write into the same array at each step
+
+    keep(observations, observation)
+    keep(infos, [info.get(key) for key in keys])
     terminated = truncated = False
     while not (terminated or truncated or len(rewards) == most):
         action = policy(observation)
+        keep(actions, action)
         observation, reward, terminated, truncated, info = env.step(action)
-        observations.append(observation)
-        actions.append(action)
+        keep(observations, observation)
         rewards.append(float(reward))
-        infos.append(info)
-    asked = {key: _values([each.get(key) for each in infos], key) for key in keys}
+        keep(infos, [info.get(key) for key in keys])
+    asked = {key: _values(list(values), key) for key, values in zip(keys, zip(*infos))}
     return Episode(
         _stacked(env.observation_space, observations),
         _stacked(env.action_space, actions),

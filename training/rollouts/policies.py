@@ -56,6 +56,8 @@ def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
     algorithm, _, file = policy.partition(":")
     if file.endswith(".zip"):
         return _agent(algorithm, Path(file), env)
+    if Path(f"{file}.zip").is_file():  # stable-baselines3 adds the ending as well
+        return _agent(algorithm, Path(f"{file}.zip"), env)
     return load_function(policy)
 
 

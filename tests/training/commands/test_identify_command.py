@@ -17,12 +17,12 @@ SIZES = "--trajectories 40 --samples 40 --inverse-steps 40 --width 16 --depth 1 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory):
-    """Files of outputs of a plant with mu = 3.3; the last record is short."""
+    """Files of outputs of a plant with mu = 3.3."""
     folder, plant = tmp_path_factory.mktemp("data"), VanDerPol(3.3)
-    x = simulate(plant, plant.draw_starts(np.random.default_rng(0), 5), 1000, plant.dt)
+    x = simulate(plant, plant.draw_starts(np.random.default_rng(0), 5), 400, plant.dt)
     for i in range(5):
-        y = plant.output(x[:, i]) + 0.02 * np.random.default_rng(i).standard_normal((1001, 1))
-        np.savez(folder / f"{i}.npz", t=plant.dt * np.arange(1001), y=y)
+        y = plant.output(x[:, i]) + 0.02 * np.random.default_rng(i).standard_normal((401, 1))
+        np.savez(folder / f"{i}.npz", t=plant.dt * np.arange(401), y=y)
     return sorted(map(str, folder.glob("*.npz")))
 
 

@@ -537,9 +537,9 @@ def test_command(tmp_path, capsys):
     assert re.search(r"\| rms error by state in % of its standard deviation, no noise \| 2 / 2 \|", page)
     with pytest.raises(SystemExit, match="unknown observer"):
         main(["certify", "nobody"])
-    main(["certify", "van_der_pol-spinn", "--trajectories", "2", "--measurement-noise", "0", "--process-noise", "0",
-          "--out", str(tmp_path / "quiet")])  # fmt: skip
-    assert (tmp_path / "quiet" / "van_der_pol-spinn.png").exists()
+    main(["certify", str(tmp_path / "mine.safetensors"), "--system", f"{script}:Oscillator", "--trajectories", "2",
+          "--measurement-noise", "0", "--process-noise", "0", "--out", str(tmp_path / "quiet")])  # fmt: skip
+    assert (tmp_path / "quiet" / "mine.png").exists()
     with pytest.raises(SystemExit, match="name an observer"):
         main(["certify"])
 

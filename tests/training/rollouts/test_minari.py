@@ -16,6 +16,7 @@ from training.rollouts import make, policy_of, roll_out
 
 minari = pytest.importorskip("minari")
 pytest.importorskip("h5py")
+MinariStorage = pytest.importorskip("minari.dataset.minari_storage").MinariStorage
 
 
 @pytest.fixture(autouse=True)
@@ -66,8 +67,10 @@ def test_dicts_and_infos_are_kept():
         found, spec = rollouts(env_id="Keyed-v0", measured=["a"], hidden=["b", "info[speed][1]"], steps=20)
     finally:
         gym.registry.pop("Keyed-v0")
-    spec.entry_point = None  # of a class that no file can name
-    write_dataset(found, spec, policy="random")
+    folder = write_dataset(found, spec, policy="random")
+    said = json.loads((folder / "data" / "metadata.json").read_text())["env_spec"]
+    assert json.loads(said)["entry_point"].endswith("<locals>.Keyed")
+    assert spec.entry_point is Keyed
     read = read_dataset("minari:cart/random-v0", print).records()
     assert read[0].signals.inputs == ("action[0]", "action[1]", "action[2]")
     assert [record.fingerprint for record in read] == [record.fingerprint for record in found.records()]
@@ -79,6 +82,48 @@ def test_half_a_data_set_is_none(datasets, monkeypatch):
     with pytest.raises(ZeroDivisionError):
         write_dataset(found, spec, policy="random")
     assert [path.name for path in (datasets / "cart").iterdir()] == ["namespace_metadata.json"]
+
+
+def test_two_at_once_write_one(datasets, monkeypatch):
+    found, spec = rollouts()
+    update = MinariStorage.update_metadata
+
+    def slower(storage, metadata):
+        monkeypatch.undo()
+        monkeypatch.setenv("MINARI_DATASETS_PATH", str(datasets))
+        write_dataset(found, spec, policy="random")
+        update(storage, metadata)
+
+    monkeypatch.setattr(MinariStorage, "update_metadata", slower)
+    with pytest.raises(ValueError, match="there is a data set cart/random-v0 already"):
+        write_dataset(found, spec, policy="random")
+    assert sorted(path.name for path in (datasets / "cart").iterdir()) == ["namespace_metadata.json", "random-v0"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_noticed_before_anything_is_played(monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(SystemExit, match="Permission denied"):
+        main(["record", "Pendulum-v1", "--measured", "0,1", "--hidden", "2"])
+
+
+@pytest.mark.parametrize(
+    "own", [None, 3, {"dt": "x"}, {"dt": -1}, {"measured": 3}, {"measured": "01"}, {"hidden": [3]}]
+)
+def test_metadata_of_ours_that_make_no_sense(own):
+    found, spec = rollouts()
+    path = write_dataset(found, spec, policy="random") / "data" / "metadata.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"kkl_gym": own}))
+    with pytest.raises(ValueError, match="cart/random-v0 cannot be read as a Minari data set"):
+        read_dataset("minari:cart/random-v0", print)
+
+
+def test_a_sampling_interval_can_be_added():
+    found, spec = rollouts()
+    folder = write_dataset(found, spec, policy="random")
+    path = folder / "data" / "metadata.json"
+    path.write_text(json.dumps({key: value for key, value in json.loads(path.read_text()).items() if key != "kkl_gym"}))
+    minari.load_dataset("cart/random-v0").storage.update_metadata({"kkl_gym": {"dt": 0.02}})
+    assert read_dataset("minari:cart/random-v0", pytest.fail).dt == 0.02
 
 
 def test_what_is_no_data_set(datasets):

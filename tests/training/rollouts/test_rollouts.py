@@ -99,6 +99,44 @@ def test_what_cannot_be_recorded(drift, changes, told):
         played(make(drift), **changes)
 
 
+def test_arrays_that_are_written_over_are_kept_as_they_were():
+    class Reusing(gym.Env):
+        observation_space, action_space = spaces.Box(-np.inf, np.inf, (1,)), spaces.Box(-1.0, 1.0, (1,))
+
+        def __init__(self):
+            self.seen, self.info = np.zeros(1, np.float32), {"twice": np.zeros(1)}
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.seen[:] = 0.0
+            return self.seen, self.info
+
+        def step(self, action):
+            self.seen += 1
+            self.info["twice"][:] = 2 * self.seen
+            action *= 0
+            return self.seen, 0.0, False, False, self.info
+
+    held = np.zeros(1, np.float32)
+
+    def act(observation):
+        held[:] = observation / 10
+        return held
+
+    gym.register("Reusing-v0", entry_point=Reusing, disable_env_checker=True)
+    try:
+        (record,) = roll_out(make("Reusing-v0"), act, measured=[0], hidden=["info[twice]"], steps=4).records()
+    finally:
+        gym.registry.pop("Reusing-v0")
+    assert record.y[:, 0].tolist() == [0, 1, 2, 3, 4]
+    assert record.x[:, 0].tolist() == [0, 2, 4, 6, 8]
+    np.testing.assert_allclose(record.u[:4, 0], [0, 0.1, 0.2, 0.3], rtol=1e-6)
+
+
+def test_nothing_need_be_hidden(drift):
+    assert played(make(drift), hidden=[]).records()[0].x is None
+
+
 def test_texts_are_no_signals(drift):
     with pytest.raises(ValueError, match=r"info\[speed\] holds no number"):
         played(make(drift, {"text": True}))
@@ -138,7 +176,7 @@ def test_agents_of_stable_baselines3(tmp_path):
     sb3 = pytest.importorskip("stable_baselines3")
     env, path = make("CartPole-v1"), tmp_path / "agent.zip"
     sb3.PPO("MlpPolicy", env, device="cpu", n_steps=16, batch_size=16, seed=0).save(path)
-    policy = policy_of(f"ppo:{path}", env)
+    policy = policy_of(f"ppo:{path.with_suffix('')}", env)
     assert roll_out(env, policy, measured=["0"], hidden=["1"], episodes=1).episodes[0].actions.shape[0] > 3
     with pytest.raises(ValueError, match="trained on the observation space"):
         policy_of(f"ppo:{path}", make("Pendulum-v1"))
@@ -179,6 +217,34 @@ def test_learns_an_observer_that_fits_the_environment(tmp_path):
     assert Artifact.read(path).signals["measured"] == ["obs[0]", "obs[1]"]
     env = KKLObservation(gym.make("Pendulum-v1", g=9.0), path)
     assert env.reset(seed=0)[0].shape == (3,)
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"hidden": []}, "say which signals are hidden"),
+        ({"hidden": 2}, "hidden must be a sequence of names"),
+        ({"inverse_stepz": 3}, "inverse_stepz"),
+        ({"width": -1}, "width"),
+        ({"out": "used"}, "holds the checkpoints of a run"),
+    ],
+)
+def test_what_is_wrong_is_said_before_anything_is_played(tmp_path, monkeypatch, changes, told):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "inverse-1.checkpoint.safetensors").touch()
+
+    def never(observation):
+        pytest.fail("played")
+
+    wanted = {"measured": [0, 1], "hidden": [2], "policy": never} | changes
+    with pytest.raises(ValueError, match=told):
+        training.learn("Pendulum-v1", **wanted)
+
+
+def test_a_measured_signal_that_never_changes_is_named(drift):
+    with pytest.raises(ValueError, match=r"goal\[0\], goal\[1\] never changes and tells nothing"):
+        recorded_config(played(make(drift), measured=["place", "goal"]).records())
 
 
 def test_learns_without_writing(tmp_path, monkeypatch):
