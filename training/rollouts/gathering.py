@@ -69,7 +69,7 @@ class Gathering:
         self._close(row)
         piece = self._open[row] = _Piece(goes_on=goes_on)
         if self._outputs in info:
-            piece.y, piece.x = [info[self._outputs]], [info.get("x", np.full(self._nx, np.nan))]
+            piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
 
     def add(self, row: int, info: Mapping[str, Any]) -> None:
         """Take in the sample after a step.
@@ -103,7 +103,7 @@ class Gathering:
             piece = self._open[row] = _Piece()
         if piece.y:
             piece.u.append(info["u"])
-        piece.y.append(info[self._outputs])
+        piece.y.append(np.array(info[self._outputs]))
         piece.x.append(info["x"])
         piece.sample, piece.goes_on = sample, False
         self.steps += 1
