@@ -1,0 +1,116 @@
+"""What the outputs of a system tell of its states: near each state, by its equations, and everywhere, by its motions."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers.checks import noise_levels
+from training.checking.observability import untold
+from training.checking.subject import Subject
+from training.evaluation.levels import Level
+from training.observable.found import Observability
+from training.observable.recorded import ASKING, ASKING_SHARE, OTHERS, Filtered, of_records
+from training.presets import eigenvalues
+from training.recorded.preparing import split
+from training.records import Record, Signals
+from training.spectrum import Spectrum
+from training.tuning.probe import Probe
+
+MOTIONS = 60  # that are followed
+LOCALLY, GLOBALLY = 0.1, 0.3  # errors, up to which the equations say that y tells a state, and from which motions deny it
+FAR, OFTEN = 1.0, 0.1  # standard deviations between states of like outputs, and how often they are so far apart
+
+
+def of_system(
+    system: System,
+    *,
+    dt: float | None = None,
+    duration: float | None = None,
+    measurement_noise: Sequence[Level] | None = None,
+    seed: int = 0,
+    report: Callable[[float], object] = lambda share: None,
+) -> Observability:
+    """Find what the outputs of a system tell of its states in motion without input.
+
+    Motions from X are compared as records are (:func:`training.observable.of_records`), through the filter that an
+    input-aware training takes by default. What who knows the equations could tell, and which directions y tells
+    nothing of, follows from the equations (:class:`training.tuning.Probe`).
+
+    Parameters
+    ----------
+    system : System
+        Any system.
+    dt, duration : float, optional
+        Sampling interval and length of motions in seconds; by default the system's own.
+    measurement_noise : sequence of (float or tuple of float), optional
+        Standard deviations on each sample of y, of all outputs or each, beside 0; by default the system's own.
+    seed : int, default 0
+        Of starts, of the comparison and of noise.
+    report : callable, optional
+        Told the share of the work that is done.
+
+    Returns
+    -------
+    Observability
+        What was found.
+
+    Raises
+    ------
+    ValueError
+        If an argument makes no sense, or the system's motions cannot be followed.
+    """
+    dt = system.dt if dt is None else dt
+    duration = system.duration if duration is None else duration
+    if measurement_noise is None:
+        measurement_noise = [system.measurement_noise]
+    levels = [noise_levels("measurement_noise", level, system.ny) for level in measurement_noise]
+    probe = Probe(system, dt, duration, motions=MOTIONS, seed=seed)
+    spectrum = Spectrum(eigenvalues(system, dt))
+    linear = spectrum.filter(system.ny, dt)
+    report(0.2)
+    signals = Signals("t", tuple(f"y{i + 1}" for i in range(system.ny)), (), tuple(system.state_names))
+    t = dt * np.arange(len(probe.x))
+    records = [
+        Record(f"motion {i + 1}", t, y, x=x, signals=signals)
+        for i, (y, x) in enumerate(zip(np.moveaxis(probe.y, 1, 0), np.moveaxis(probe.x, 1, 0)))
+    ]
+    found = of_records(
+        records,
+        measurement_noise=levels,
+        linear=linear,
+        seed=seed,
+        report=lambda share: report(0.2 + 0.8 * share),
+    )
+    size = probe.x.std((0, 1))
+    local = probe.error_of_states(spectrum, 0.0) / size
+    least = [np.full(system.nx, np.nan)]
+    least += [
+        probe.error_of_states(None, level) / size if np.min(level) else least[0] for level in found.noise[1:]
+    ]
+    unknown = [finding.found for finding in untold(Subject(system, dt, duration), probe).values()]
+    split_records = (Filtered(list(part), linear) for part in split(records, ASKING_SHARE, seed))
+    folded = list(_folded(found, local, *split_records))
+    return replace(found, least=np.array(least), warnings=(*folded, *unknown, *found.warnings))
+
+
+def _folded(found: Observability, local: np.ndarray, others: Filtered, asking: Filtered) -> Iterator[str]:
+    """States that y tells near each state, but not everywhere, with two states of like outputs."""
+    errors, window = found.errors[0].min(0), found.windows[-1]
+    torn = (local <= LOCALLY) & (errors >= GLOBALLY)
+    if not torn.any():
+        return
+    one, other = asking.samples(window, ASKING), others.samples(window, OTHERS)
+    near, distances = other.nearest(one.z)
+    apart = abs(other.x[near] - one.x) / one.x.std(0)
+    far = (apart > FAR)[:, torn].any(1)
+    if far.mean() < OFTEN:
+        return
+    pair = int(np.where(far, distances, np.inf).argmin())
+    names = ", ".join(name for name, here in zip(found.hidden, torn) if here)
+    states = " and ".join(f"({', '.join(f'{value:.3g}' for value in x)})" for x in (one.x[pair], other.x[near[pair]]))
+    yield (
+        f"{names}: y tells them near each state, but not which of several states it is: {states} had nearly the same y "
+        f"for {window} steps. That is so of a symmetry; measure what it changes, or estimate what it leaves as it is"
+    )
