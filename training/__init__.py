@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.identification.learning import adapt, identify
+    from training.observable import Observability, observability
     from training.pipeline import Result, train
     from training.presets import preset
     from training.rollouts import learn
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Certificate",
     "Config",
+    "Observability",
     "Result",
     "adapt",
     "calibrate",
@@ -25,6 +27,7 @@ __all__ = [
     "identify",
     "learn",
     "nrmse",
+    "observability",
     "preset",
     "smape",
     "train",
@@ -34,6 +37,7 @@ __all__ = [
 _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
+    "Observability": "observable",
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "evaluation.calibration",
@@ -42,6 +46,7 @@ _MODULES = {
     "identify": "identification.learning",
     "learn": "rollouts",
     "nrmse": "evaluation.metrics",
+    "observability": "observable",
     "preset": "presets",
     "smape": "evaluation.metrics",
     "train": "pipeline",

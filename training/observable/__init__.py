@@ -1,4 +1,4 @@
-"""Which hidden signals outputs and inputs determine, over which window and under how much noise, before any training."""
+"""What outputs and inputs tell of hidden signals, over which window and under how much noise, before any training."""
 
 from training.observable.environments import observability
 from training.observable.found import Judgement, Observability

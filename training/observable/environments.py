@@ -76,8 +76,14 @@ def observability(
                 seed=seed,
                 report=report,
             )
-        with progress.phase("comparing neighbours", 1) as report:
-            return of_records(rollouts.records(), measurement_noise=measurement_noise, seed=seed, report=report)
+        with progress.phase("comparing neighbours", 100) as report:
+            found = of_records(
+                rollouts.records(),
+                measurement_noise=measurement_noise,
+                seed=seed,
+                report=lambda share: report(100 * share),
+            )
+    return found
 
 
 __all__ = ["observability"]

@@ -38,7 +38,9 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Observability:
-    """What outputs and inputs tell of hidden signals. Errors are root mean squares in standard deviations of the signals.
+    """What outputs and inputs tell of hidden signals.
+
+    Errors are root mean squares in standard deviations of the signals.
 
     Parameters
     ----------
@@ -83,7 +85,7 @@ class Observability:
     def _judged(self, i: int) -> Judgement:
         errors = tuple(self.errors[:, :, i].min(1).tolist())
         linear, exact, least = float(self.linear[:, i].min()), self.errors[0, :, i], errors[0]
-        window = self._first(exact <= max(DETERMINED, AS_GOOD * least))
+        window: int | None = self._first(exact <= max(DETERMINED, AS_GOOD * least))
         if np.isnan(least):
             verdict, window = "never moves", None
         elif least <= DETERMINED:

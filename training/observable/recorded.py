@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from observers import LinearFilter
-from observers.checks import noise_levels
+from observers.checks import integer, noise_levels, shown
 from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance, root
 from training.maps.coordinates import coordinates, settling_time, spread
@@ -65,6 +65,7 @@ def of_records(
     ValueError
         If no states were recorded, a level is none, or there are too few samples to say anything.
     """
+    integer("seed", seed, 0)
     check_signals(records)
     signals = records[0].signals
     if any(record.x is None for record in records):
@@ -114,6 +115,8 @@ def _levels(records: Sequence[Record], given: Sequence[Level] | None) -> tuple[L
     y = np.concatenate([record.y for record in records])
     if given is None:
         given = [tuple(float(f"{share * size:.3g}") for size in np.nanstd(y, 0)) for share in NOISE_SHARES]
+    elif not isinstance(given, Sequence) or isinstance(given, str):
+        raise ValueError(f"measurement_noise must be a list of levels, as in [0.1, 0.3], got {shown(given)}")
     levels = [noise_levels("measurement_noise", level, y.shape[1]) for level in given]
     return tuple(dict.fromkeys([0.0, *levels]))
 
@@ -179,9 +182,7 @@ def _compared(
         scaled = coordinates(others.z, own if np.any(level) else covariance.sum(0))
         share = 1 / (1 + scaled.noise_gain**2) if np.any(level) else 1.0  # of signal in each coordinate
         R = root(own).T
-        z, others_z = (
-            share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others)
-        )
+        z, others_z = (share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others))
         levels.append(told(z, asking.x, others_z=others_z, others_x=others.x))
         if not np.any(level):
             moved, others_moved = ~np.isnan(asking.change).any(-1), ~np.isnan(others.change).any(-1)
@@ -196,8 +197,8 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
     """What is to be said of the data; ``halves`` (windows, nx) are the errors to who has half of them."""
     if records < FEW:
         yield (
-            f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant in "
-            "a record looks as if it were told; record more"
+            f"there are fewer than {FEW} records: samples are compared with others of the same, and what is constant "
+            "in a record looks as if it were told; record more"
         )
     if len(found.windows) < len(windows):
         yield (
@@ -209,6 +210,6 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
         best = int(exact.argmin())
         if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
             yield (
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, and {100 * halves[best, i]:.2g} % with "
-                "half of them: with more it will be less"
+                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with half of "
+                "them: with more it will be less"
             )

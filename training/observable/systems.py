@@ -1,4 +1,4 @@
-"""What the outputs of a system tell of its states: near each state, by its equations, and everywhere, by its motions."""
+"""What the outputs of a system tell of its states: near each by its equations, and everywhere by its motions."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -19,7 +19,10 @@ from training.spectrum import Spectrum
 from training.tuning.probe import Probe
 
 MOTIONS = 60  # that are followed
-LOCALLY, GLOBALLY = 0.1, 0.3  # errors, up to which the equations say that y tells a state, and from which motions deny it
+LOCALLY, GLOBALLY = (
+    0.1,
+    0.3,
+)  # errors, up to which the equations say that y tells a state, and from which motions deny it
 FAR, OFTEN = 1.0, 0.1  # standard deviations between states of like outputs, and how often they are so far apart
 
 
@@ -86,9 +89,7 @@ def of_system(
     size = probe.x.std((0, 1))
     local = probe.error_of_states(spectrum, 0.0) / size
     least = [np.full(system.nx, np.nan)]
-    least += [
-        probe.error_of_states(None, level) / size if np.min(level) else least[0] for level in found.noise[1:]
-    ]
+    least += [probe.error_of_states(None, level) / size if np.min(level) else least[0] for level in found.noise[1:]]
     unknown = [finding.found for finding in untold(Subject(system, dt, duration), probe).values()]
     split_records = (Filtered(list(part), linear) for part in split(records, ASKING_SHARE, seed))
     folded = list(_folded(found, local, *split_records))
