@@ -6,7 +6,7 @@ import numpy as np
 
 from training.evaluation.levels import Level
 
-DETERMINED, UNTOLD = 0.05, 0.9  # of a signal's standard deviation: errors up to the one, and from the other on
+DETERMINED, UNTOLD = 0.05, 0.8  # of a signal's standard deviation: errors up to the one, and from the other on
 AS_GOOD = 1.1  # times the least error, from which on a window is as good as any
 SEEN = 0.1  # of the error of a signal: that of its change at most, where it is told up to a constant
 

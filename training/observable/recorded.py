@@ -129,13 +129,16 @@ class Filtered:
         self._z = [along(linear, record) for record in records]
 
     def samples(self, window: int, most: int) -> "Samples":
-        """Filter states after so many steps and the states there, evenly spread over all that there are."""
+        """Filter states after so many steps and the states there, evenly spread over all with one then and before."""
         owner, sample = samples_as_old(self._records, window)
+        if len(owner):
+            states = [record.x for record in self._records]
+            whole = ~np.isnan(taken(states, owner, sample - window)).any(-1)
+            owner, sample = owner[whole], sample[whole]
         chosen = np.linspace(0, len(owner) - 1, min(most, len(owner))).round().astype(int)
         owner, sample = owner[chosen], sample[chosen]
         if not len(owner):
             return Samples(*np.zeros((3, 0, 0)))
-        states = [record.x for record in self._records]
         x = taken(states, owner, sample)
         z = restarted(self._linear, self._records, self._z, owner=owner, sample=sample, age=window)
         return Samples(z, x, x - taken(states, owner, sample - window))
@@ -183,13 +186,15 @@ def _compared(
         share = 1 / (1 + scaled.noise_gain**2) if np.any(level) else 1.0  # of signal in each coordinate
         R = root(own).T
         z, others_z = (share * scaled(each.z + rng.standard_normal(each.z.shape) @ R) for each in (asking, others))
-        levels.append(told(z, asking.x, others_z=others_z, others_x=others.x))
-        if not np.any(level):
-            moved, others_moved = ~np.isnan(asking.change).any(-1), ~np.isnan(others.change).any(-1)
-            change = told(
-                z[moved], asking.change[moved], others_z=others_z[others_moved], others_x=others.change[others_moved]
-            ).left
-            half = told(z, asking.x, others_z=others_z[::2], others_x=others.x[::2]).left
+        if np.any(level):
+            levels.append(told(z, asking.x, others_z=others_z, others_x=others.x))
+            continue
+        of_both = [np.hstack([each.x, each.change]) for each in (asking, others)]
+        both = told(z, of_both[0], others_z=others_z, others_x=of_both[1])
+        nx = asking.x.shape[1]
+        change = both.left[nx:]
+        levels.append(Told(both.left[:nx], both.linear[:nx]))
+        half = told(z, asking.x, others_z=others_z[::2], others_x=others.x[::2]).left
     return _Compared(levels, change, half)
 
 
@@ -210,6 +215,6 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
         best = int(exact.argmin())
         if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
             yield (
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with half of "
-                "them: with more it will be less"
+                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with half "
+                "of them: with more it will be less"
             )
