@@ -10,7 +10,7 @@ weight 1 that is the Delta test.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.distance import cdist
+from scipy.spatial import cKDTree
 
 RESOLUTION = 1e-3  # to which z is read, in standard deviations
 FEWEST = 32  # neighbours, or twice as many as z has coordinates, so that planes rest on enough of them
@@ -60,8 +60,8 @@ def told(z: np.ndarray, x: np.ndarray, *, others_z: np.ndarray, others_x: np.nda
     linear = np.sqrt((x**2).mean(0)) / deviation
     if not z.shape[1]:
         return Told(linear, linear)
-    count = min(len(others_z) - 1, max(FEWEST, 2 * (z.shape[1] + 1)))
-    near = np.argpartition(cdist(z, others_z, "sqeuclidean"), count, axis=1)[:, :count]
+    count = min(len(others_z), max(FEWEST, 2 * (z.shape[1] + 1)))
+    near = cKDTree(others_z).query(z, k=count)[1]
     weights = _weights(others_z[near] - z[:, None])
     squared = (np.einsum("nk,nkj->nj", weights, others_x[near]) - x) ** 2 / (1 + (weights**2).sum(1))[:, None]
     return Told(np.minimum(np.sqrt(squared.mean(0)) / deviation, linear), linear)

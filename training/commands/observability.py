@@ -95,7 +95,7 @@ class ObservabilityCommand:
         from training.observable.report import save, table  # pandas takes half a second to import
 
         found = self._looked(console)
-        title = self.name or ", ".join(map(str, self.records.data))
+        title = self.name or ", ".join(path.name for path in self.records.data)
         console.print(table(found, title))
         for text in found.warnings:
             console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)

@@ -215,6 +215,6 @@ def _warnings(found: Observability, halves: np.ndarray, *, records: int, windows
         best = int(exact.argmin())
         if exact[best] > DETERMINED and halves[best, i] > FALLS * exact[best]:
             yield (
-                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with half "
-                "of them: with more it will be less"
+                f"{name}: {100 * exact[best]:.2g} % are left with these samples, {100 * halves[best, i]:.2g} % with "
+                "half of them: with more it will be less"
             )

@@ -91,17 +91,17 @@ def of_system(
     least = [np.full(system.nx, np.nan)]
     least += [probe.error_of_states(None, level) / size if np.min(level) else least[0] for level in found.noise[1:]]
     unknown = [finding.found for finding in untold(Subject(system, dt, duration), probe).values()]
-    split_records = (Filtered(list(part), linear) for part in split(records, ASKING_SHARE, seed))
-    folded = list(_folded(found, local, *split_records))
+    torn = (local <= LOCALLY) & (found.errors[0].min(0) >= GLOBALLY)
+    folded = list[str]()
+    if torn.any():
+        others, asking = (Filtered(part, linear) for part in split(records, ASKING_SHARE, seed))
+        folded += _folded(found, torn, others=others, asking=asking)
     return replace(found, least=np.array(least), warnings=(*folded, *unknown, *found.warnings))
 
 
-def _folded(found: Observability, local: np.ndarray, others: Filtered, asking: Filtered) -> Iterator[str]:
-    """States that y tells near each state, but not everywhere, with two states of like outputs."""
-    errors, window = found.errors[0].min(0), found.windows[-1]
-    torn = (local <= LOCALLY) & (errors >= GLOBALLY)
-    if not torn.any():
-        return
+def _folded(found: Observability, torn: np.ndarray, *, others: Filtered, asking: Filtered) -> Iterator[str]:
+    """Of states that y tells near each state, but not everywhere: two states of like outputs, if there are."""
+    window = found.windows[-1]
     one, other = asking.samples(window, ASKING), others.samples(window, OTHERS)
     near, distances = other.nearest(one.z)
     apart = abs(other.x[near] - one.x) / one.x.std(0)

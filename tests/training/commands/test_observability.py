@@ -29,22 +29,22 @@ def test_an_environment(capsys, tmp_path):
     assert "0.05 s)" in row
     assert "noise 0.05, 0.1" in shown
     assert (tmp_path / "observability.png").stat().st_size > 10_000
-    written = pd.read_csv(tmp_path / "observability.csv")
+    written = pd.read_csv(tmp_path / "observability.csv", dtype={"measurement_noise": str})
     assert list(written) == ["signal", "measurement_noise", "steps", "seconds", "error", "linear", "change"]
-    assert set(written.measurement_noise.astype(str)) == {"0", "0.05, 0.1"}
+    assert set(written.measurement_noise) == {"0.0", "0.05, 0.1"}
     np.testing.assert_allclose(written.seconds, 0.05 * written.steps)
-    exact = written[written.measurement_noise.astype(str) == "0"].set_index("steps")
+    exact = written[written.measurement_noise == "0.0"].set_index("steps")
     assert exact.error[0] > 0.9 > 0.05 > exact.error[8]
     assert written[written.steps == 8].error.is_monotonic_increasing
 
 
 def test_recorded_data(capsys, tmp_path):
     files = [as_csv(tmp_path / f"{i}.csv", swing(i, n=200)) for i in range(6)]
-    options = "--measured position --inputs force --hidden speed --measurement-noise 0.5".split()
+    options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]
     main(["observability", "--data", *files, *options])
     shown = capsys.readouterr().out
-    assert "what position and force tell" in shown
-    assert "determined" in next(line for line in shown.splitlines() if "speed" in line)
+    assert "5.csv: what position and force tell" in shown
+    assert "determined" in next(line for line in shown.splitlines() if "│ speed" in line)
 
 
 def test_a_system(capsys):

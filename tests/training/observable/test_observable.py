@@ -83,7 +83,7 @@ def test_cart_poles_place_is_seen_up_to_a_constant_by_its_velocities():
 
 
 class Noisy(gym.Wrapper):
-    """Beside Pendulum-v1: noise, and what stays as it is in an episode, both beyond what anybody sees, and a constant."""
+    """Beside Pendulum-v1: noise, what stays as it is in an episode, which nobody sees either, and a constant."""
 
     def reset(self, *, seed=None, options=None):
         observation, info = self.env.reset(seed=seed, options=options)
@@ -197,7 +197,7 @@ def test_a_symmetry_is_told_from_what_is_hard_to_see():
 
 
 def test_what_y_tells_nothing_of_is_said_of_systems():
-    found = of_system(Blind(), duration=20.0)
+    found = of_system(Blind(), duration=10.0)
     by_name = verdicts(found)
     assert by_name[Blind().state_names[1]].verdict == "determined"
     assert by_name[Blind().state_names[2]].verdict == "not determined"
