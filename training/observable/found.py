@@ -24,7 +24,7 @@ class Judgement:
     window : int or None
         Steps back from which on that is so; None where nothing is told.
     errors : tuple of float
-        Predicted error of the best window at each level of noise, in standard deviations of the signal.
+        Predicted error at each level of noise, in standard deviations of the signal.
     linear : float
         What the best linear function leaves without noise.
     """
@@ -52,8 +52,10 @@ class Observability:
         Steps back that outputs and inputs are known; 0 is the output alone.
     noise : tuple of (float or tuple of float), length k
         Levels of measurement noise; the first is 0.
-    errors : ndarray, shape (k, m, nx)
-        That the best estimate leaves.
+    errors : ndarray, shape (k, m, nx) or (1, m, nx)
+        That the best estimate leaves after so many steps; without noise alone where equations say the rest.
+    predicted : ndarray, shape (k, nx)
+        The same of the best window; where there are equations, of a default filter's whole run, transients included.
     changes : ndarray, shape (m, nx)
         That it leaves of how much a signal has changed over the window, in standard deviations of that change, without
         noise; NaN where nothing has, and over windows of which the filter forgets where they began.
@@ -72,6 +74,7 @@ class Observability:
     windows: tuple[int, ...]
     noise: tuple[Level, ...]
     errors: np.ndarray
+    predicted: np.ndarray
     changes: np.ndarray
     linear: np.ndarray
     least: np.ndarray | None = None
@@ -83,9 +86,8 @@ class Observability:
         return tuple(map(self._judged, range(len(self.hidden))))
 
     def _judged(self, i: int) -> Judgement:
-        errors = tuple(self.errors[:, :, i].min(1).tolist())
-        linear, exact, least = float(self.linear[:, i].min()), self.errors[0, :, i], errors[0]
-        window: int | None = self._first(exact <= max(DETERMINED, AS_GOOD * least))
+        errors, exact = tuple(self.predicted[:, i].tolist()), self.errors[0, :, i]
+        least, window = errors[0], self._first(exact <= max(DETERMINED, AS_GOOD * exact.min()))
         if np.isnan(least):
             verdict, window = "never moves", None
         elif least <= DETERMINED:
@@ -96,11 +98,11 @@ class Observability:
             verdict = f"partly ({100 * least:.2g} % left)"
         else:
             verdict, window = "not determined", None
-        return Judgement(self.hidden[i], verdict, window, errors, linear)
+        return Judgement(self.hidden[i], verdict, window, errors, float(self.linear[:, i].min()))
 
     def _longest_change(self, i: int) -> float:
         known = self.changes[~np.isnan(self.changes[:, i]), i]
         return float(known[-1]) if len(known) else np.nan
 
-    def _first(self, good: np.ndarray) -> int:
+    def _first(self, good: np.ndarray) -> int | None:
         return self.windows[int(good.argmax())]

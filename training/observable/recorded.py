@@ -95,6 +95,7 @@ def of_records(
             f"{sum(len(record.t) for record in records)} samples in {len(records)} records are too few to say anything "
             f"of {', '.join(signals.hidden)}: record more"
         )
+    errors = np.stack([np.stack([one.left for one in each.levels]) for each in found], 1)
     result = Observability(
         signals.measured,
         signals.inputs if linear.nu else (),
@@ -102,7 +103,8 @@ def of_records(
         dt=linear.dt,
         windows=tuple(windows[: len(found)]),
         noise=noise,
-        errors=np.stack([np.stack([one.left for one in each.levels]) for each in found], 1),
+        errors=errors,
+        predicted=errors.min(1),
         changes=np.stack([each.change for each in found]),
         linear=np.stack([each.levels[0].linear for each in found]),
     )

@@ -37,9 +37,10 @@ def of_system(
 ) -> Observability:
     """Find what the outputs of a system tell of its states in motion without input.
 
-    Motions from X are compared as records are (:func:`training.observable.of_records`), through the filter that an
-    input-aware training takes by default. What who knows the equations could tell, and which directions y tells
-    nothing of, follows from the equations (:class:`training.tuning.Probe`).
+    Errors follow from the equations, to first order near each motion (:class:`training.tuning.Probe`), for the filter
+    that an input-aware training takes by default. Whether states that are far apart have the same outputs they do not
+    say. So motions from X are compared as records are, too (:func:`training.observable.of_records`): windows are from
+    there, and errors of states of which that is so.
 
     Parameters
     ----------
@@ -80,23 +81,27 @@ def of_system(
         for i, (y, x) in enumerate(zip(np.moveaxis(probe.y, 1, 0), np.moveaxis(probe.x, 1, 0)))
     ]
     found = of_records(
-        records,
-        measurement_noise=levels,
-        linear=linear,
-        seed=seed,
-        report=lambda share: report(0.2 + 0.8 * share),
+        records, measurement_noise=[], linear=linear, seed=seed, report=lambda share: report(0.2 + 0.8 * share)
     )
+    noise = tuple(dict.fromkeys([0.0, *levels]))
     size = probe.x.std((0, 1))
-    local = probe.error_of_states(spectrum, 0.0) / size
-    least = [np.full(system.nx, np.nan)]
-    least += [probe.error_of_states(None, level) / size if np.min(level) else least[0] for level in found.noise[1:]]
+    predicted = np.array([probe.error_of_states(spectrum, level) / size for level in noise])
+    least = [
+        probe.error_of_states(None, level) / size if np.min(level) else np.full(system.nx, np.nan) for level in noise
+    ]
     unknown = [finding.found for finding in untold(Subject(system, dt, duration), probe).values()]
-    torn = (local <= LOCALLY) & (found.errors[0].min(0) >= GLOBALLY)
+    torn = (predicted[0] <= LOCALLY) & (found.predicted[0] >= GLOBALLY)
     folded = list[str]()
     if torn.any():
         others, asking = (Filtered(part, linear) for part in split(records, ASKING_SHARE, seed))
         folded += _folded(found, torn, others=others, asking=asking)
-    return replace(found, least=np.array(least), warnings=(*folded, *unknown, *found.warnings))
+    return replace(
+        found,
+        noise=noise,
+        predicted=np.where(torn, np.maximum(predicted, found.predicted), predicted),
+        least=np.array(least),
+        warnings=(*folded, *unknown, *found.warnings),
+    )
 
 
 def _folded(found: Observability, torn: np.ndarray, *, others: Filtered, asking: Filtered) -> Iterator[str]:

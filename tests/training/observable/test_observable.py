@@ -214,9 +214,19 @@ def test_levels_of_systems_are_refused_before_any_work():
 def judged(errors, changes):
     errors, changes = np.array(errors).reshape(1, -1, 1), np.array(changes)[:, None]
     windows = tuple(range(errors.shape[1]))
-    return Observability(
-        ("y",), (), ("x",), 0.1, windows, (0.0,), errors, changes=changes, linear=errors[0]
-    ).judgements[0]
+    found = Observability(
+        ("y",),
+        (),
+        ("x",),
+        dt=0.1,
+        windows=windows,
+        noise=(0.0,),
+        errors=errors,
+        predicted=errors.min(1),
+        changes=changes,
+        linear=errors[0],
+    )
+    return found.judgements[0]
 
 
 @pytest.mark.parametrize(
