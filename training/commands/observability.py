@@ -95,7 +95,9 @@ class ObservabilityCommand:
         from training.observable.report import save, table  # pandas takes half a second to import
 
         found = self._looked(console)
-        title = self.name or ", ".join(path.name for path in self.records.data)
+        data = self.records.data
+        first = [str(path) if str(path).startswith("minari:") else path.name for path in data[:1]]
+        title = self.name or first[0] + (f" and {len(data) - 1} more" if len(data) > 1 else "")
         console.print(table(found, title))
         for text in found.warnings:
             console.print(f"note: {text}", markup=False, highlight=False, soft_wrap=True)

@@ -177,8 +177,7 @@ def _compared(
 
     ``covariance`` (ny, size, size) is that of the noise in z for a standard deviation of 1 on each output.
     """
-    few = len(asking.z) < FEWEST_ASKING or len(others.z) <= FEWEST_OTHERS * others.z.shape[1]
-    if few:
+    if len(asking.z) < FEWEST_ASKING or len(others.z) <= FEWEST_OTHERS * others.z.shape[1]:
         return None
     levels = []
     for level in noise:

@@ -38,7 +38,7 @@ def table(found: Observability, title: str) -> Table:
         Column("verdict", no_wrap=True),
         *map(_column, found.noise),
         "linear",
-        title=f"{title}: what follows from {given}",
+        title=f"{title}\nwhat follows from {given}",
         caption="rms error that is left, in standard deviations of the signal; a constant leaves 100 %; linear: what a "
         "regression on z leaves without noise",
     )

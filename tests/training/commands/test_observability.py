@@ -22,7 +22,7 @@ def test_an_environment(capsys, tmp_path):
     words = "observability Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1"
     main([*words.split(), "--out", str(tmp_path)])
     shown = capsys.readouterr().out
-    assert "Pendulum-v1: what follows from obs[0], obs[1] and action[0]" in shown
+    assert "what follows from obs[0], obs[1] and action[0]" in shown
     row = next(line for line in shown.splitlines() if "obs[2]" in line)
     assert "determined" in row
     assert "step" in row
@@ -43,7 +43,8 @@ def test_recorded_data(capsys, tmp_path):
     options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]
     main(["observability", "--data", *files, *options])
     shown = capsys.readouterr().out
-    assert "5.csv: what follows from position and force" in shown
+    assert "0.csv and 5 more" in shown
+    assert "what follows from position and force" in " ".join(shown.split())
     assert "determined" in next(line for line in shown.splitlines() if "│ speed" in line)
 
 
