@@ -19,7 +19,7 @@ from training.recorded.windows import along, restarted, samples_as_old, taken
 from training.records import Record, check_signals, pieces, resampled
 from training.seeds import Stream, generator
 
-ASKING, OTHERS = 500, 8000  # samples at most
+ASKING, OTHERS = 500, 40_000  # samples at most
 ASKING_SHARE = 0.2  # of the records, whose samples look for neighbours among those of the others
 FEWEST_ASKING = 50  # samples, for a judgement
 FEWEST_OTHERS = 5  # times the coordinates of z
