@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.identification.learning import adapt, identify
+    from training.observable import Observability, observability
     from training.pipeline import Result, train
     from training.presets import preset
     from training.rollouts import learn
@@ -19,6 +20,7 @@ __all__ = [
     "Certificate",
     "Config",
     "KKLTrainingCallback",
+    "Observability",
     "Result",
     "adapt",
     "calibrate",
@@ -27,6 +29,7 @@ __all__ = [
     "identify",
     "learn",
     "nrmse",
+    "observability",
     "preset",
     "smape",
     "train",
@@ -37,6 +40,7 @@ _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
     "KKLTrainingCallback": "rollouts.callback",
+    "Observability": "observable",
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "evaluation.calibration",
@@ -45,6 +49,7 @@ _MODULES = {
     "identify": "identification.learning",
     "learn": "rollouts",
     "nrmse": "evaluation.metrics",
+    "observability": "observable",
     "preset": "presets",
     "smape": "evaluation.metrics",
     "train": "pipeline",

@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
     "check": ("check", "Check"),
+    "observability": ("observability", "ObservabilityCommand"),
     "record": ("record", "RecordCommand"),
     "train": ("train", "Train"),
     "identify": ("identify", "Identify"),
