@@ -272,7 +272,7 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, options, says):
     [
         (CART, "sac", "take ppo, a2c or dqn"),
         (PENDULUM, "dqn", "take ppo, a2c, sac"),
-        (HiddenTask("Taxi-v3", (0,)), "td3", "take ppo"),
+        (HiddenTask("FrozenLake-v1", (0,)), "td3", "take ppo"),
     ],
 )
 def test_algorithms_that_cannot_act_there_are_refused(tmp_path, task, algorithm, says):
