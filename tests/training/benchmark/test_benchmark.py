@@ -577,7 +577,7 @@ def rows_of(page, title):
     return cells[0][1:], {first: rest for first, *rest in cells[2:]}
 
 
-@pytest.mark.parametrize("name", ["benchmark", "ablation"])
+@pytest.mark.parametrize("name", ["benchmark", pytest.param("ablation", marks=pytest.mark.slow)])
 def test_committed_results_give_the_committed_table_and_figure(name, tmp_path):
     for file in ("results.csv", "methods.csv"):
         shutil.copy(RESULTS / name / file, tmp_path)
