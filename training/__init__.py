@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.guided import GuidedKalmanFilter
     from training.identification.learning import adapt, identify
     from training.pipeline import Result, train
     from training.presets import preset
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Certificate",
     "Config",
+    "GuidedKalmanFilter",
     "KKLTrainingCallback",
     "Result",
     "adapt",
@@ -36,6 +38,7 @@ __all__ = [
 _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
+    "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
     "Result": "pipeline",
     "adapt": "identification.learning",
