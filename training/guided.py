@@ -4,13 +4,14 @@ import os
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import chdtri
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers import Artifact, KKLObserver
 from observers.artifact import resolve
-from observers.checks import bool_array, noise_level, noise_levels, real_array, shown
+from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array, shown
 from training.kalman import LEAST_VARIANCE, UnscentedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
 from training.trajectories.noise import draw_process_noise, noisy_output
@@ -21,7 +22,7 @@ FACTOR = 2.0  # of X, from which they start: states beyond X are to be found too
 SETTLED = 5.0  # s at the pace of the shipped systems, after which errors count as those of any later age
 AGES = 30  # at which they are looked at
 WINDOW = 0.5  # s at that pace, over which innovations are averaged
-LIMIT = 2.0  # on their normalised mean square, 1 where model and levels of noise hold
+CHANCE = 1e-9  # that their mean square is as large as its limit where model and levels of noise hold
 
 
 class GuidedKalmanFilter:
@@ -33,8 +34,9 @@ class GuidedKalmanFilter:
 
     - where the observer is surer: its covariance has the smaller determinant. That is so early on, if at all.
     - where the innovations say that the filter is lost: their mean square over the last half second, at the pace of the
-      shipped systems, is twice what the filter expects, or it has left the system's declared bounds. Then the observer
-      may be misled too, by what came before. Its covariance is taken to be that of one as old as the window.
+      shipped systems, is beyond chance, about twice what the filter expects, or it has left the system's declared
+      bounds. Then the observer may be misled too, by what came before. Its covariance is taken to be that of one as old
+      as the window.
 
     The covariance of the observer's errors is that of simulated runs, from starts in 2X, at each age and at the levels
     of noise told.
@@ -45,6 +47,8 @@ class GuidedKalmanFilter:
         The equations, as :func:`kkl_gym.get_system` takes them.
     artifact : Artifact, str or PathLike, optional
         A map for the system: what was trained, a file, or a shipped name; by default what ships for the system.
+    dt : float, optional
+        Sampling interval in seconds; by default the map's, and no other will do.
     measurement_noise : float or sequence of float, length ny, optional
         Standard deviation of the noise on each sample, of all outputs or each; by default what is usual for the map. A
         map that knows no such level is told the largest that it knows.
@@ -72,6 +76,7 @@ class GuidedKalmanFilter:
         system: System | type[System] | str,
         *,
         artifact: Artifact | str | os.PathLike[str] | None = None,
+        dt: float | None = None,
         measurement_noise: float | Sequence[float] | None = None,
         process_noise: float | None = None,
         Q: np.ndarray | None = None,
@@ -79,17 +84,27 @@ class GuidedKalmanFilter:
         system = get_system(system)
         if not isinstance(artifact, Artifact):
             artifact = Artifact.read(resolve(system.name if artifact is None else artifact))
-        dt = artifact.filter.dt
+        dt = artifact.filter.dt if dt is None else check_dt(dt)
         artifact.check(system.name, system.parameters, dt=dt, ny=system.ny, nu=system.nu)
         level = artifact.measurement_noise if measurement_noise is None else measurement_noise
         level = noise_levels("measurement_noise", level, system.ny)
         disturbed = system.process_noise if process_noise is None else noise_level("process_noise", process_noise)
         Q = process_intensity(system, disturbed, dt) if Q is None else _checked(Q, system.nx)
         self.system = system
+        self._batch: tuple[int, ...] | None = None
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
         self._filter = UnscentedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)
+        self._log_volumes = np.linalg.slogdet(self._covariances)[1]
         self._window, self._share = round(WINDOW * system.pace / dt), -np.expm1(-dt / (WINDOW * system.pace))
+        freedom = system.ny * (2 - self._share) / self._share  # of the weighted mean, as its variance has it
+        self._limit = chdtri(freedom, CHANCE) / freedom
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the estimate, (..., nx, nx), as the Kalman filter has it; raises RuntimeError before reset."""
+        shape = (*self._shape(), self.system.nx, self.system.nx)
+        return self._filter.P.reshape(shape).copy()
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget the past and take in the first sample.
@@ -111,8 +126,7 @@ class GuidedKalmanFilter:
         """
         y0 = real_array("y", y0)
         self._observer.reset(y0)
-        self._batch = y0.shape[:-1]
-        flat = y0.reshape(-1, y0.shape[-1])
+        self._batch, flat = y0.shape[:-1], y0.reshape(-1, self.system.ny)
         self._filter.reset(flat)
         self._age, self._mean_square = np.zeros(len(flat), dtype=int), np.ones(len(flat))
         self.restarts = np.zeros(self._batch, dtype=int)
@@ -135,11 +149,11 @@ class GuidedKalmanFilter:
         RuntimeError
             Before :meth:`reset`.
         """
-        y0 = real_array("y", y0)
+        y0, rows = real_array("y", y0), bool_array("rows", rows, self._shape())
         self._observer.restart(y0, rows)
-        rows = bool_array("rows", rows, self._batch)
-        self._filter.restart(y0, rows.ravel())
-        self._age[rows.ravel()], self._mean_square[rows.ravel()], self.restarts[rows] = 0, 1.0, 0
+        flat = rows.ravel()
+        self._filter.restart(y0, flat)
+        self._age[flat], self._mean_square[flat], self.restarts[rows] = 0, 1.0, 0
         self._supervised()
 
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
@@ -165,35 +179,42 @@ class GuidedKalmanFilter:
         RuntimeError
             Before :meth:`reset`.
         """
-        if not hasattr(self, "_batch"):
-            raise RuntimeError("call reset(y0) before step(y)")
-        ny = self.system.ny
-        y = np.full((*self._batch, ny), np.nan) if y is None else real_array("y", y)
-        missing = np.isnan(y).all(-1) if y.shape == (*self._batch, ny) else np.zeros(self._batch, dtype=bool)
+        batch, ny, nu = self._shape(), self.system.ny, self.system.nu
+        y = np.full((*batch, ny), np.nan) if y is None else real_array("y", y)
+        u = np.zeros((*batch, nu)) if u is None else real_array("u", u)
+        for name, values, width in (("y", y, ny), ("u", u, nu)):
+            if values.shape != (*batch, width):
+                raise ValueError(f"{name} must have shape {(*batch, width)}, got {values.shape}")
+        missing = np.isnan(y).all(-1)
         if missing.any():
             self._observer.advance(np.where(missing[..., None], 0.0, y), u, rows=~missing)
             self._observer.advance(None, u, rows=missing)
         else:
             self._observer.advance(y, u)
-        held = None if u is None else real_array("u", u).reshape(-1, self.system.nu)
-        self._filter.advance(y.reshape(-1, ny), held)
+        self._filter.advance(y.reshape(-1, ny), u.reshape(self._age.size, nu))
         self._age += 1
         self._mean_square += self._share * ~missing.ravel() * (self._filter.nis - self._mean_square)
         return self._supervised()
 
     def _supervised(self) -> np.ndarray:
         """Take what is lost, or less sure than the observer, from there; returns the estimates."""
-        filters, shape = self._filter, (*self._batch, self.system.nx)
-        lost = ~(self._mean_square <= LIMIT)
-        self.restarts += lost.reshape(self._batch)
+        filters, batch = self._filter, self._shape()
+        lost = ~(self._mean_square <= self._limit)
+        self.restarts += lost.reshape(batch)
         self._age[lost], self._mean_square[lost] = self._window, 1.0
-        covariances = self._covariances[np.searchsorted(self._ages, self._age, side="right") - 1]
-        taken = lost | (np.linalg.slogdet(covariances)[1] < np.linalg.slogdet(filters.P)[1])
+        of_age = np.searchsorted(self._ages, self._age, side="right") - 1
+        taken = lost | (self._log_volumes[of_age] < np.linalg.slogdet(filters.P)[1])
         if taken.any():
             filters.x, filters.P = filters.x.copy(), filters.P.copy()
-            filters.x[taken] = self._observer.decode(taken.reshape(self._batch))
-            filters.P[taken] = covariances[taken]
-        return filters.decode().reshape(shape)
+            filters.x[taken] = self._observer.decode(taken.reshape(batch))
+            filters.P[taken] = self._covariances[of_age[taken]]
+        return filters.decode().reshape(*batch, self.system.nx)
+
+    def _shape(self) -> tuple[int, ...]:
+        """That of the batch; RuntimeError before reset."""
+        if self._batch is None:
+            raise RuntimeError("call reset(y0) before the filter is used")
+        return self._batch
 
 
 def _checked(Q: np.ndarray, nx: int) -> np.ndarray:

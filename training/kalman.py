@@ -51,7 +51,7 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
 
 
 def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
-    """Intensity of white noise that spreads the state as the environments' process noise does, and no less than a little.
+    """Intensity of the white noise that a filter assumes in place of the environments' process noise, never quite 0.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class KalmanFilter(ABC):
         return inside
 
     def _innovation(self, y: np.ndarray, expected: np.ndarray) -> Gaussian:
-        """Samples less what was expected, (n, ny), and the covariance of their noise; of what is missing 0, and huge."""
+        """Samples less what was expected, (n, ny), and R; where one is missing 0, and a huge variance."""
         missing = np.isnan(y)
         if not missing.any():
             return y - expected, self._R
