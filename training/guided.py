@@ -35,8 +35,8 @@ class GuidedKalmanFilter:
     - where the observer is surer: its covariance has the smaller determinant. That is so early on, if at all.
     - where the innovations say that the filter is lost: their mean square over the last half second, at the pace of the
       shipped systems, is beyond chance, about twice what the filter expects, or it has left the system's declared
-      bounds. Then the observer may be misled too, by what came before. Its covariance is taken to be that of one as old
-      as the window.
+      bounds. Then the observer may be misled too, by what came before. Its covariance is taken to be that of one no
+      older than the window.
 
     The covariance of the observer's errors is that of simulated runs, from starts in 2X, at each age and at the levels
     of noise told.
@@ -201,7 +201,7 @@ class GuidedKalmanFilter:
         filters, batch = self._filter, self._shape()
         lost = ~(self._mean_square <= self._limit)
         self.restarts += lost.reshape(batch)
-        self._age[lost], self._mean_square[lost] = self._window, 1.0
+        self._age[lost], self._mean_square[lost] = np.minimum(self._age[lost], self._window), 1.0
         of_age = np.searchsorted(self._ages, self._age, side="right") - 1
         taken = lost | (self._log_volumes[of_age] < np.linalg.slogdet(filters.P)[1])
         if taken.any():
