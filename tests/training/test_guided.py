@@ -226,3 +226,11 @@ def test_bad_samples_are_refused_and_change_nothing():
         with pytest.raises(ValueError, match=r"y must have shape|rows must be boolean|y holds NaN"):
             ours.restart(y0, rows)
     np.testing.assert_array_equal(ours.step(y[10]), run(guided(), y[:11])[-1])
+
+
+def test_runs_that_all_escape_teach_nothing(monkeypatch):
+    monkeypatch.setattr(
+        "training.guided.simulate", lambda system, x0, steps, *_, **__: np.full((steps, *x0.shape), np.nan)
+    )
+    with pytest.raises(ValueError, match="every run from 2X left the bounds of oscillator"):
+        guided()

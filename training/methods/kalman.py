@@ -65,7 +65,7 @@ class Guided(EKF):
     """Kalman filter with the exact model and noise level, guided by the shipped map and tuned as the EKF is."""
 
     name: ClassVar[str] = "guided"
-    label: ClassVar[str] = "Kalman filter, guided by the shipped map"
+    label: ClassVar[str] = "UKF, guided by the shipped map"
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three levels of diffusion, as for the others; the least is smaller."""
