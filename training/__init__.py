@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.guided import GuidedKalmanFilter
     from training.identification.learning import adapt, identify
     from training.observable import Observability, observability
     from training.pipeline import Result, train
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Certificate",
     "Config",
+    "GuidedKalmanFilter",
     "KKLTrainingCallback",
     "Observability",
     "Result",
@@ -39,6 +41,7 @@ __all__ = [
 _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
+    "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
     "Observability": "observable",
     "Result": "pipeline",

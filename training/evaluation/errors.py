@@ -11,7 +11,7 @@ from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
-from training.kalman import ExtendedKalmanFilter, measurement_covariance
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
@@ -20,7 +20,6 @@ from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
-LEAST_PROCESS_NOISE = 0.005  # that a Kalman filter assumes: a tenth of the environments' default
 TRIES = 1000  # starts of which one at least should lie beyond X
 
 Domain = Literal["X", "1.5X", "2X"]
@@ -308,8 +307,7 @@ def kalman_errors(
     """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = _measured(system, trajectories, level, seed)
-    assumed = max(trajectories.process_noise, LEAST_PROCESS_NOISE / system.pace)
-    Q = np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)  # of a uniform w that is held over dt
+    Q = process_intensity(system, trajectories.process_noise, dt)
     kalman = ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
     x_hat = np.empty_like(trajectories.x)
     x_hat[0] = kalman.reset(y[0])
