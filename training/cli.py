@@ -30,6 +30,7 @@ COMMANDS = {
     "tune": ("tune", "Tune"),
     "faults": ("faults", "Faults"),
     "maps": ("maps", "Maps"),
+    "export": ("export", "ExportCommand"),
     "demo": ("demo", "Demo"),
     "speed": ("speed", "Speed"),
 }
@@ -54,6 +55,7 @@ EXTRAS = {
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
     "envs": {"h5py", "minari"},
+    "onnx": {"onnx", "onnxruntime"},
 }
 
 

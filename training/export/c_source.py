@@ -295,7 +295,9 @@ def _header(exported: Exported, words: dict[str, Any]) -> str:
         estimates=_comment(", ".join(exported.estimates)),
         noise="".join(texts),
         real=exported.precision,
-        age="    unsigned long age; /* samples since the first, as far as that matters */\n" if exported.last_age else "",
+        age="    unsigned long age; /* samples since the first, as far as that matters */\n"
+        if exported.last_age
+        else "",
         input_text=" and the input that was held since the last" if artifact.nu else "",
     )
 
@@ -374,7 +376,9 @@ def _constants(exported: Exported, label: str, inverse: InverseMap) -> list[str]
             for column in gains.T.tolist()
         ]
         parts.append("#ifndef SQUARE\n#define SQUARE(a) ((a) * (a))\n#endif\n")
-        parts.append(_block("double", f"{label}_gain", f"[{len(squares)}]", [f"1.0 / (1.0 + {sum})" for sum in squares]))
+        parts.append(
+            _block("double", f"{label}_gain", f"[{len(squares)}]", [f"1.0 / (1.0 + {sum})" for sum in squares])
+        )
     for i, (weight, bias) in enumerate(zip(inverse.mlp.weights, inverse.mlp.biases, strict=True)):
         parts.append(_array("float", f"{label}_weights{i}", weight.reshape(-1)))
         parts.append(_array("float", f"{label}_biases{i}", bias))

@@ -122,7 +122,9 @@ class Exported:
         rows = {inverse.noise_gain.ndim == 2 for inverse in self.maps.values()}
         if True in rows:
             return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
-        told = any("measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in self.maps.values())
+        told = any(
+            "measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in self.maps.values()
+        )
         return (float(np.max(self.measurement_noise)),) if told else ()
 
     @property

@@ -61,9 +61,7 @@ def onnx_model(exported: Exported) -> Any:
     x_hat = _estimate(graph, artifact.inverse, z, given, dt=linear.dt, real=real)
     if artifact.free_inverse is not None:
         columns = graph.constant(np.eye(linear.size)[:, : len(linear.A)])
-        free = _estimate(
-            graph, artifact.free_inverse, graph("MatMul", z, columns), given, dt=linear.dt, real=real
-        )
+        free = _estimate(graph, artifact.free_inverse, graph("MatMul", z, columns), given, dt=linear.dt, real=real)
         acted = graph.constant(np.arange(linear.size)[:, None] >= len(linear.A))
         untouched = graph("Equal", graph("MatMul", graph("Abs", z), acted), graph.constant([0.0]))
         x_hat = graph("Where", untouched, free, x_hat)
@@ -152,9 +150,7 @@ class _Graph:
         return self("Log", self("Add", self("Div", value, self.constant(np.atleast_1d(unit))), self.constant([1.0])))
 
 
-def _estimate(
-    graph: _Graph, inverse: InverseMap, z: str, given: dict[str, str], *, dt: float, real: Any
-) -> str:
+def _estimate(graph: _Graph, inverse: InverseMap, z: str, given: dict[str, str], *, dt: float, real: Any) -> str:
     """T_inv(z), in doubles; the network itself is of type ``real``."""
     modes = graph("MatMul", z, graph.constant(inverse.whiten.T))
     modes = graph("Sub", modes, graph.constant(inverse.z_offset @ inverse.whiten.T))
