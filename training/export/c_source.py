@@ -1,242 +1,17 @@
 """The step as C99: a header, a source without dependencies but math.h, and a program that shows how they are used."""
 
 from collections.abc import Iterable, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 
 import kkl_gym
 from observers.artifact import InverseMap
+from training.export import c_templates
 from training.export.exported import Exported
 
 _WIDTH = 118  # of lines of numbers
-
-_HEADER = """\
-/*
- * {NAME}: a learned KKL observer of {system}, for samples every {dt} s.
- *
- * Written by kkl-gym {version} from {source}, SHA-256
- * {checksum}
- *
- * y:     {outputs}
-{inputs} * x_hat: {estimates}
- *
- * {NAME}_reset takes in the first sample, {NAME}_step every later one. Samples and inputs must be finite: a NaN stays
- * until the next reset. Nothing is allocated, and observers share nothing but constants.
-{noise} */
-#ifndef {MACRO}_H
-#define {MACRO}_H
-
-#ifdef __cplusplus
-extern "C" {{
-#endif
-
-#define {MACRO}_NX {nx} /* estimates */
-#define {MACRO}_NY {ny} /* outputs */
-#define {MACRO}_NU {nu} /* inputs */
-#define {MACRO}_DT {dt} /* seconds from sample to sample */
-
-typedef {real} {NAME}_real;
-
-typedef struct {{
-    double z[{size}]; /* the filter's state */
-    {NAME}_real y[{ny}]; /* the last sample */
-{age}}} {NAME}_observer;
-
-/* Forget the past and take in the first sample. */
-void {NAME}_reset({NAME}_observer *observer, const {NAME}_real y[{ny}]);
-
-/* Take in the next sample{input_text}, and estimate. */
-void {NAME}_step({NAME}_observer *observer, const {NAME}_real y[{ny}]{u}, {NAME}_real x_hat[{nx}]);
-
-/* The estimate as things stand, which is what step gives too: after reset, the first. */
-void {NAME}_estimate(const {NAME}_observer *observer, {NAME}_real x_hat[{nx}]);
-
-#ifdef __cplusplus
-}}
-#endif
-
-#endif
-"""
-
-_NOISE = """\
- *
- * {MACRO}_{KIND} is {meaning}, {default} unless the compiler is told otherwise, as in
- * -D{MACRO}_{KIND}={default}; what is beyond {end} counts as that.
-"""
-
-_LAYER = """
-static void layer(const real *in, size_t inputs, const float *weights, const float *biases, real *out, size_t outputs)
-{
-    for (size_t i = 0; i < outputs; i++) {
-        real sums[4] = {biases[i]}; /* four at a time: none waits for the one before, and errors stay smaller */
-        size_t j = 0;
-        for (; j + 4 <= inputs; j += 4)
-            for (size_t k = 0; k < 4; k++)
-                sums[k] += weights[i * inputs + j + k] * in[j + k];
-        for (; j < inputs; j++)
-            sums[0] += weights[i * inputs + j] * in[j];
-        out[i] = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-    }
-}
-"""
-
-_ACTIVATIONS = {
-    "tanh": "h[i] = {tanh}(h[i]);",
-    "silu": "h[i] = {half} * h[i] + {half} * h[i] * {tanh}({half} * h[i]);",
-    "relu": "h[i] = h[i] > 0 ? h[i] : 0;",
-}
-
-_ACTIVATION = """
-static void activate_{activation}(real *h, size_t n)
-{{
-    for (size_t i = 0; i < n; i++)
-        {body}
-}}
-"""
-
-_MAP = """
-static void {map}_map(const {NAME}_observer *observer, real *x_hat)
-{{
-    real a[{width}], b[{width}];
-    for (size_t i = 0; i < {modes}; i++) {{
-        double mode = 0.0;
-        for (size_t j = 0; j < {size}; j++)
-            mode += {map}_whiten[i][j] * (observer->z[j] - {map}_z_offset[j]);
-        a[i] = (real)({gain}mode);
-    }}
-{told}{layers}    for (size_t i = 0; i < {nx}; i++)
-        x_hat[i] = (real)({map}_x_offset[i] + {map}_x_scale[i] * {last}[i]);
-}}
-"""
-
-_ESTIMATE_FREE = """
-void {NAME}_estimate(const {NAME}_observer *observer, real x_hat[{nx}])
-{{
-    for (size_t i = {nz}; i < {size}; i++) {{
-        if (observer->z[i] != 0.0) {{ /* an input has acted */
-            driven_map(observer, x_hat);
-            return;
-        }}
-    }}
-    free_map(observer, x_hat);
-}}
-"""
-
-_ESTIMATE = """
-void {NAME}_estimate(const {NAME}_observer *observer, real x_hat[{nx}])
-{{
-    driven_map(observer, x_hat);
-}}
-"""
-
-_RESET = """
-void {NAME}_reset({NAME}_observer *observer, const real y[{ny}])
-{{
-    for (size_t i = 0; i < {size}; i++)
-        observer->z[i] = 0.0;
-    for (size_t j = 0; j < {ny}; j++) {{
-        for (size_t i = 0; i < {nz}; i++)
-            observer->z[i] += equilibrium[i][j] * y[j];
-        observer->y[j] = y[j];
-    }}
-{age_zero}}}
-"""
-
-_ADVANCE = """
-/* z = transition z, of one block of the filter's state */
-static void advance(double *z)
-{{
-    double next[{nz}];
-    for (size_t i = 0; i < {nz}; i++)
-        next[i] = diagonal[i] * z[i];
-{mixing}    for (size_t i = 0; i < {nz}; i++)
-        z[i] = next[i];
-}}
-"""
-
-_MIXING = """\
-    for (size_t k = 0; k < {count}; k++)
-        next[mixing_row[k]] += mixing[k] * z[mixing_column[k]];
-"""
-
-_STEP = """
-void {NAME}_step({NAME}_observer *observer, const real y[{ny}]{u}, real x_hat[{nx}])
-{{
-    double *z = observer->z;
-    advance(z);
-    for (size_t i = 0; i < {nz}; i++)
-        for (size_t j = 0; j < {ny}; j++)
-            z[i] += early_y[i][j] * observer->y[j] + late_y[i][j] * y[j];
-{inputs}    for (size_t j = 0; j < {ny}; j++)
-        observer->y[j] = y[j];
-{age_next}    {NAME}_estimate(observer, x_hat);
-}}
-"""
-
-_INPUTS = """\
-    for (size_t j = 0; j < {nu}; j++) {{
-        z += {nz};
-        advance(z);
-        for (size_t i = 0; i < {nz}; i++)
-            z[i] += held_u[i] * u[j];
-    }}
-"""
-
-_PROGRAM = """\
-/*
- * Reads samples, writes estimates: cc -std=c99 -O2 {NAME}.c {NAME}_main.c -lm && ./a.out < steps.txt
- *
- * The first line of steps.txt holds {outputs}. Every further line holds {line}.
- */
-#include <stdio.h>
-
-#include "{NAME}.h"
-
-static int read_numbers({NAME}_real *values, int count)
-{{
-    for (int i = 0; i < count; i++) {{
-        double value;
-        int found = scanf("%lf", &value);
-        if (found != 1)
-            return found == EOF && i == 0 ? EOF : 0;
-        values[i] = ({NAME}_real)value;
-    }}
-    return 1;
-}}
-
-static void write_numbers(const {NAME}_real *values, int count)
-{{
-    for (int i = 0; i < count; i++)
-        printf("%.{digits}g%c", (double)values[i], i + 1 < count ? ' ' : '\\n');
-}}
-
-int main(void)
-{{
-    {NAME}_observer observer;
-    {NAME}_real y[{MACRO}_NY], x_hat[{MACRO}_NX];
-{declared}    int found = read_numbers(y, {MACRO}_NY);
-    if (found == 1) {{
-        {NAME}_reset(&observer, y);
-        {NAME}_estimate(&observer, x_hat);
-        write_numbers(x_hat, {MACRO}_NX);
-    }}
-    while (found == 1 && (found = read_numbers({first})) == 1) {{
-{then}        {NAME}_step(&observer, y{u}, x_hat);
-        write_numbers(x_hat, {MACRO}_NX);
-    }}
-    if (found != EOF)
-        fprintf(stderr, "there is a line without all its numbers\\n");
-    return found != EOF;
-}}
-"""
-
-_READ_Y = """\
-        if ((found = read_numbers(y, {MACRO}_NY)) != 1) {{
-            found = 0;
-            break;
-        }}
-"""
 
 
 def c_files(exported: Exported) -> dict[str, str]:
@@ -276,14 +51,18 @@ def _words(exported: Exported) -> dict[str, Any]:
 
 
 def _header(exported: Exported, words: dict[str, Any]) -> str:
-    artifact, macro = exported.artifact, words["MACRO"]
-    texts = [
-        _NOISE.format(
-            MACRO=macro, KIND=kind.removeprefix(f"{macro}_"), meaning=meaning, default=_number(level), end=_number(end)
-        )
-        for kind, meaning, level, end in _levels(exported)
+    artifact = exported.artifact
+    paragraphs = [
+        f"{exported.name}_reset takes in the first sample, {exported.name}_step every later one. Samples and inputs "
+        "must be finite: a NaN stays until the next reset. Nothing is allocated, and observers share constants alone."
     ]
-    return _HEADER.format(
+    for kind, meaning, level, end in _levels(exported):
+        beyond = f"; what is beyond {_number(end)} counts as that" if np.isfinite(end) else ""
+        paragraphs.append(
+            f"{kind} is {meaning}, {_number(level)} unless the compiler is told otherwise, as in "
+            f"-D{kind}={_number(level)}{beyond}."
+        )
+    return c_templates.HEADER.format(
         **words,
         system=_comment(artifact.system),
         dt=_number(artifact.filter.dt),
@@ -293,7 +72,7 @@ def _header(exported: Exported, words: dict[str, Any]) -> str:
         outputs=_comment(", ".join(exported.outputs)),
         inputs=f" * u:     {_comment(', '.join(exported.inputs))}\n" if artifact.nu else "",
         estimates=_comment(", ".join(exported.estimates)),
-        noise="".join(texts),
+        paragraphs="\n *\n".join(fill(text, 116, initial_indent=" * ", subsequent_indent=" * ") for text in paragraphs),
         real=exported.precision,
         age="    unsigned long age; /* samples since the first, as far as that matters */\n"
         if exported.last_age
@@ -305,8 +84,10 @@ def _header(exported: Exported, words: dict[str, Any]) -> str:
 def _levels(exported: Exported) -> list[tuple[str, str, float, float]]:
     """Macros for levels of noise: name, meaning, default and end of each."""
     macro, found = exported.name.upper(), []
-    ends = np.broadcast_to(exported.artifact.inverse.measurement_noise_max, len(exported.levels))
-    for i, (level, end) in enumerate(zip(exported.levels, ends.tolist(), strict=True), 1):
+    inverse = exported.artifact.inverse
+    end = inverse.measurement_noise_max if "measurement_noise" in inverse.features else np.inf
+    ends = np.broadcast_to(end, len(exported.levels)).tolist()
+    for i, (level, end) in enumerate(zip(exported.levels, ends, strict=True), 1):
         several = len(exported.levels) > 1
         of = f"of {_comment(exported.outputs[i - 1])}" if several else "of y"
         meaning = f"the standard deviation of the noise on each sample {of}"
@@ -320,7 +101,8 @@ def _levels(exported: Exported) -> list[tuple[str, str, float, float]]:
 def _source(exported: Exported, words: dict[str, Any]) -> str:
     linear, nz = exported.artifact.filter, words["nz"]
     parts = [
-        f'#include "{exported.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n\ntypedef {exported.name}_real real;\n'
+        f'#include "{exported.name}.h"\n\n#include <math.h>\n#include <stddef.h>\n\n',
+        f"typedef {exported.name}_real real;\n",
     ]
     for macro, _, level, end in _levels(exported):
         parts.append(f"\n#ifndef {macro}\n#define {macro} {_number(level)}\n#endif\n")
@@ -347,32 +129,35 @@ def _source(exported: Exported, words: dict[str, Any]) -> str:
         parts.append(_array("double", "held_u", linear.held_u[nz : 2 * nz, 0]))
     for label, inverse in exported.maps.items():
         parts += _constants(exported, label, inverse)
-    parts.append(_LAYER)
+    parts.append(c_templates.LAYER)
     for activation in dict.fromkeys(inverse.mlp.activation for inverse in exported.maps.values()):
-        body = _ACTIVATIONS[activation].format(tanh=_function(exported, "tanh"), half="(real)0.5")
-        parts.append(_ACTIVATION.format(activation=activation, body=body))
+        body = c_templates.ACTIVATIONS[activation].format(tanh=_function(exported, "tanh"), half="(real)0.5")
+        parts.append(c_templates.ACTIVATION.format(activation=activation, body=body))
     parts += [_map(exported, label, inverse) for label, inverse in exported.maps.items()]
     words = words | {"u": words["u"].replace(f"{exported.name}_real", "real")}
-    parts.append((_ESTIMATE_FREE if "free" in exported.maps else _ESTIMATE).format(**words))
+    parts.append((c_templates.ESTIMATE_FREE if "free" in exported.maps else c_templates.ESTIMATE).format(**words))
     last = exported.last_age
-    parts.append(_RESET.format(**words, age_zero="    observer->age = 0;\n" if last else ""))
-    parts.append(_ADVANCE.format(nz=nz, mixing=_MIXING.format(count=len(rows)) if len(rows) else ""))
+    parts.append(c_templates.RESET.format(**words, age_zero="    observer->age = 0;\n" if last else ""))
+    parts.append(
+        c_templates.ADVANCE.format(nz=nz, mixing=c_templates.MIXING.format(count=len(rows)) if len(rows) else "")
+    )
     age = f"    if (observer->age < {last}ul)\n        observer->age++;\n" if last else ""
-    parts.append(_STEP.format(**words, inputs=_INPUTS.format(**words) if linear.nu else "", age_next=age))
+    parts.append(
+        c_templates.STEP.format(**words, inputs=c_templates.INPUTS.format(**words) if linear.nu else "", age_next=age)
+    )
     return "".join(parts)
 
 
 def _constants(exported: Exported, label: str, inverse: InverseMap) -> list[str]:
     """The arrays of a map."""
     parts = [f"\n/* The map of {label} motion. */\n"]
-    for name in ("z_offset", "whiten", "x_offset", "x_scale"):
-        parts.append(_array("double", f"{label}_{name}", getattr(inverse, name)))
+    arrays = ("z_offset", "whiten", "x_offset", "x_scale")
+    parts += [_array("double", f"{label}_{name}", getattr(inverse, name)) for name in arrays]
     if inverse.noise_gain.any():
         macros = [macro for macro, *_ in _levels(exported)]
         gains = np.atleast_2d(inverse.noise_gain)
-        told = "CUT_" if "measurement_noise" in inverse.features else ""
         squares = [
-            " + ".join(f"SQUARE({told}{macro} * {_number(gain)})" for macro, gain in zip(macros, column))
+            " + ".join(f"SQUARE(CUT_{macro} * {_number(gain)})" for macro, gain in zip(macros, column))
             for column in gains.T.tolist()
         ]
         parts.append("#ifndef SQUARE\n#define SQUARE(a) ((a) * (a))\n#endif\n")
@@ -397,7 +182,7 @@ def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
             layers.append(f"    activate_{inverse.mlp.activation}({here}, {inputs});\n")
         layers.append(f"    layer({here}, {inputs}, {label}_weights{i}, {label}_biases{i}, {there}, {outputs});\n")
         here, there = there, here
-    return _MAP.format(
+    return c_templates.MAP.format(
         NAME=exported.name,
         map=label,
         width=max(max(weight.shape) for weight in inverse.mlp.weights),
@@ -429,7 +214,7 @@ def _told(exported: Exported, inverse: InverseMap) -> Iterable[tuple[str, str]]:
 def _program(exported: Exported, words: dict[str, Any]) -> str:
     outputs, inputs = (_comment(", ".join(names)) for names in (exported.outputs, exported.inputs))
     macro, nu = words["MACRO"], exported.artifact.nu
-    return _PROGRAM.format(
+    return c_templates.PROGRAM.format(
         NAME=exported.name,
         MACRO=macro,
         outputs=outputs,
@@ -437,7 +222,7 @@ def _program(exported: Exported, words: dict[str, Any]) -> str:
         digits=9 if exported.precision == "float" else 17,
         declared=f"    {exported.name}_real u[{macro}_NU];\n" if nu else "",
         first=f"u, {macro}_NU" if nu else f"y, {macro}_NY",
-        then=_READ_Y.format(MACRO=macro) if nu else "",
+        then=c_templates.READ_Y.format(MACRO=macro) if nu else "",
         u=", u" if nu else "",
     )
 

@@ -4,7 +4,6 @@ import math
 import os
 import re
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from observers.artifact import ArtifactError, InverseMap, resolve
 from observers.checks import choice
 from observers.storage import checksum
 
-# Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and the
-# whitening would make errors of a tenth of the state's scale of the last digits of floats.
+# Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
+# what distinguishes them would be lost in the last digits of floats.
 PRECISIONS = ("float", "double")
 _MOST_SAMPLES = 2**32 - 1  # that C's unsigned long can count everywhere
 
@@ -85,13 +84,12 @@ class Exported:
             If the precision is unknown, or a level of noise is out of range.
         """
         choice("precision", precision, PRECISIONS)
-        path = resolve(name_or_path)
+        text, path = os.fspath(name_or_path), resolve(name_or_path)
         artifact = Artifact.read(path)
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
-        name = os.fspath(name_or_path) if path.parent != Path(name_or_path).parent else path.stem
         exported = cls(
             artifact,
-            name=identifier(name),
+            name=identifier(path.stem if text.endswith(path.suffix) else text),
             source=path.name,
             checksum=checksum(path, ArtifactError),
             precision=precision,

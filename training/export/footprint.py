@@ -29,8 +29,8 @@ class Footprint:
 
     def __str__(self) -> str:
         return (
-            f"flash {self.flash / 1e3:.0f} kB, code and constants; RAM {self.static + self.state:,} bytes for an observer "
-            f"(cc {' '.join(FLAGS)} of this machine)"
+            f"flash {self.flash / 1e3:.0f} kB of code and constants, RAM {self.static + self.state:,} bytes for an "
+            f"observer, and stack (cc {' '.join(FLAGS)} of this machine)"
         )
 
 

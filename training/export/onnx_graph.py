@@ -86,13 +86,14 @@ def onnx_model(exported: Exported) -> Any:
         producer_name="kkl-gym",
         producer_version=kkl_gym.__version__,
     )
-    helper.set_model_props(model, {name: json.dumps(text) for name, text in _described(exported).items()})
+    helper.set_model_props(model, _described(exported))
     checker.check_model(model, full_check=True)
     return model
 
 
-def _described(exported: Exported) -> dict[str, Any]:
-    described = {
+def _described(exported: Exported) -> dict[str, str]:
+    """The metadata: texts as they are, anything else as JSON."""
+    described: dict[str, Any] = {
         "name": exported.name,
         "artifact": exported.source,
         "sha256": exported.checksum,
@@ -107,7 +108,7 @@ def _described(exported: Exported) -> dict[str, Any]:
         described["measurement_noise"] = list(exported.levels)
     if exported.told_process_noise:
         described["process_noise"] = exported.process_noise
-    return described
+    return {name: text if isinstance(text, str) else json.dumps(text) for name, text in described.items()}
 
 
 class _Graph:
