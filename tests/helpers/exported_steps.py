@@ -4,6 +4,7 @@ import numpy as np
 
 import kkl_gym
 from kkl_gym.simulate import simulate
+from observers import KKLObserver
 from training.export import Exported
 
 
@@ -15,22 +16,31 @@ def exported_of(artifact, folder, name="made", **options):
 def noise(artifact, steps, rows=()):
     """Outputs and inputs that floats hold exactly; the inputs begin after a third of the steps."""
     rng = np.random.default_rng(1)
-    y = rng.normal(size=(steps, *rows, artifact.ny)).astype(np.float32).astype(float)
+    y = rng.normal(scale=3.0, size=(steps, *rows, artifact.ny)).astype(np.float32).astype(float)
     u = rng.normal(size=(steps, *rows, artifact.nu)).astype(np.float32).astype(float)
     u[: steps // 3] = 0.0
     return y, u
 
 
-def motion(artifact, steps):
-    """The output along one motion of a shipped system, under inputs held for a second after a fifth of it."""
+def motion(artifact, steps, runs=1):
+    """The output along runs of a shipped system, end to end, under inputs that are held for a second.
+
+    No input acts in the first fifth.
+    """
     system, dt, rng = kkl_gym.get_system(artifact.system), artifact.filter.dt, np.random.default_rng(2)
-    held = round(1.0 / dt)
-    u = np.repeat(rng.uniform(-0.3, 0.3, (steps // held + 1, system.nu)), held, axis=0)[:steps] * system.u_max
-    u[: steps // 5] = 0.0
+    length, held = -(-steps // runs), round(1.0 / dt)
+    u = np.zeros((length, runs, artifact.nu))
+    if artifact.nu:
+        pieces = rng.uniform(-0.3, 0.3, (length // held + 1, runs, artifact.nu)) * system.u_max
+        u = np.repeat(pieces, held, axis=0)[:length]
+        u[:, : runs // 5] = 0.0
+        u[: length // 5] *= runs > 1
     u = u.astype(np.float32).astype(float)
-    x = simulate(system, np.mean(system.X, axis=1)[None] + 0.5, u[:, None], dt=dt)
-    y = np.stack(system.h(np.moveaxis(x, -1, 0)), axis=-1)[:steps, 0]
-    return y.astype(np.float32).astype(float), u[:, : artifact.nu]
+    x0 = rng.uniform(*np.transpose(system.X), (runs, system.nx))
+    x = simulate(system, x0, length, dt, u if artifact.nu else None)[:length]
+    y = np.moveaxis(np.asarray(system.h(np.moveaxis(x, -1, 0))), 0, -1)
+    y, u = (np.swapaxes(signal, 0, 1).reshape(length * runs, -1)[:steps] for signal in (y, u))
+    return y.astype(np.float32).astype(float), u
 
 
 def in_doubles(exported, y, u):
@@ -65,8 +75,6 @@ def in_doubles(exported, y, u):
 
 def apart(exported, x_hat, y, u):
     """The largest difference from KKLObserver (float) or :func:`in_doubles` (double), in scales of the estimates."""
-    from observers import KKLObserver
-
     if exported.precision == "double":
         expected = in_doubles(exported, y, u)
     else:

@@ -102,7 +102,7 @@ class Exported:
 
     def _check_range(self) -> None:
         largest = max(float(np.abs([*inverse.x_offset, *inverse.x_scale]).max()) for inverse in self.maps.values())
-        if largest > np.finfo(np.float32).max:
+        if largest > float(np.finfo(np.float32).max):
             raise ArtifactError(
                 f"the scale of the estimates of {self.source}, {largest:g}, is beyond the range of floats: export it "
                 "with --precision double"

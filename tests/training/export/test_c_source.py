@@ -44,7 +44,9 @@ def estimates(program, y, u):
 
 
 def activated(artifact, activation):
-    return replace(artifact, inverse=replace(artifact.inverse, mlp=replace(artifact.inverse.mlp, activation=activation)))
+    return replace(
+        artifact, inverse=replace(artifact.inverse, mlp=replace(artifact.inverse.mlp, activation=activation))
+    )
 
 
 @needs_cc
@@ -55,7 +57,8 @@ def activated(artifact, activation):
         {},
         {"inputs": False, "noise": False, "age": False},
         {"pair": True, "outputs": 2, "process": True, "free_inverse": True},
-        {"estimated": True, "process": True, "activation": "relu"},
+        {"estimated": True, "process": True},
+        {"pair": True, "activation": "relu"},
         {"system": "lorenz", "free_inverse": True, "activation": "tanh"},
     ],
 )
@@ -65,7 +68,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
     exported = exported_of(artifact, tmp_path, precision=precision)
     y, u = noise(artifact, 400)
     x_hat = estimates(compiled(exported, tmp_path), y, u)
-    assert np.ptp(x_hat, axis=0).min() > 0.1
+    assert np.ptp(x_hat, axis=0).min() > 0.03
     assert apart(exported, x_hat, y, u) < tolerance
 
 
@@ -83,7 +86,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
 )
 def test_100_000_steps_of_what_ships(name, precision, tolerance, tmp_path):
     exported = Exported.read(name, precision=precision)
-    y, u = motion(exported.artifact, 100_000)
+    y, u = motion(exported.artifact, 100_000, runs=20)
     x_hat = estimates(compiled(exported, tmp_path), y, u)
     assert len(x_hat) == 100_000
     assert apart(exported, x_hat, y, u) < tolerance
@@ -122,15 +125,15 @@ def test_a_line_without_all_its_numbers_is_an_error(make_artifact, tmp_path):
 
 
 def test_numbers_are_read_back_as_the_same(make_artifact, tmp_path):
-    artifact = make_artifact()
-    text = c_files(exported_of(artifact, tmp_path, precision="double"))["made.c"]
+    exported = exported_of(make_artifact(), tmp_path, precision="double")
+    inverse, text = exported.artifact.inverse, c_files(exported)["made.c"]
 
     def numbers(name):
         found = re.search(rf" {name}[\[\]0-9]+ = {{(.*?)}};", text, re.DOTALL)
         return [word.rstrip("f") for word in re.findall(r"[^\s,{}]+", found[1])]
 
-    assert np.array_equal(np.array(numbers("driven_whiten"), float), artifact.inverse.whiten.ravel())
-    assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), artifact.inverse.mlp.weights[0].ravel())
+    assert np.array_equal(np.array(numbers("driven_whiten"), float), inverse.whiten.ravel())
+    assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), inverse.mlp.weights[0].ravel())
     assert all({".", "e", "inf"} & set(word) for word in numbers("driven_weights0"))  # 1f is no number of C
 
 
