@@ -172,7 +172,7 @@ def _constants(exported: Exported, label: str, inverse: InverseMap) -> list[str]
 
 def _map(exported: Exported, label: str, inverse: InverseMap) -> str:
     modes, size = inverse.whiten.shape
-    told = []
+    told: list[str] = []
     for feature, terms in _told(exported, inverse):
         told.append(f"    a[{modes + len(told)}] = (real)log1p({terms}); /* {feature} */\n")
     layers, here, there = [], "a", "b"

@@ -174,8 +174,8 @@ def _estimate(graph: _Graph, inverse: InverseMap, z: str, given: dict[str, str],
         if i:
             h = _activated(graph, inverse.mlp.activation, h, real)
         # The weights are floats in Python, too.
-        weight, bias = (graph.constant(np.asarray(values, np.float32), real) for values in (weight, bias))
-        h = graph("Gemm", h, weight, bias, transB=1)
+        names = [graph.constant(np.asarray(values, np.float32), real) for values in (weight, bias)]
+        h = graph("Gemm", h, *names, transB=1)
     h = graph("Mul", graph.cast(h, np.float64), graph.constant(inverse.x_scale))
     return graph("Add", h, graph.constant(inverse.x_offset))
 
