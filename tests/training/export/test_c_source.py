@@ -89,7 +89,9 @@ def test_100_000_steps_of_what_ships(name, precision, tolerance, tmp_path):
     y, u = motion(exported.artifact, 100_000, runs=20)
     x_hat = estimates(compiled(exported, tmp_path), y, u)
     assert len(x_hat) == 100_000
-    assert apart(exported, x_hat, y, u) < tolerance
+    largest = apart(exported, x_hat, y, u)
+    print(f"{name} {precision}: {largest:.1e}, {footprint(tmp_path / f'{exported.name}.c')}")
+    assert largest < tolerance
 
 
 @needs_cc
