@@ -31,6 +31,7 @@ COMMANDS = {
     "tune": ("tune", "Tune"),
     "faults": ("faults", "Faults"),
     "maps": ("maps", "Maps"),
+    "export": ("export", "ExportCommand"),
     "demo": ("demo", "Demo"),
     "speed": ("speed", "Speed"),
 }
@@ -55,6 +56,7 @@ EXTRAS = {
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
     "envs": {"h5py", "minari"},
+    "onnx": {"onnx", "onnxruntime"},
 }
 
 
