@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
+from observers.artifact import Artifact, ArtifactError, resolve
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.decoder import Decoders, Read
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
-from observers.spread import Covariance, deviations
+from observers.spread import deviations
 
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
@@ -71,7 +72,7 @@ class KKLObserver:
         self._monitored = bool(monitor)
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
-        self._read: _Read | None  # what the networks were given for the last estimate
+        self._read: Read | None  # what the networks were given for the last estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -119,11 +120,10 @@ class KKLObserver:
         self._states = self._decoders(slice(nx))
         self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
 
-    def _decoders(self, outputs: slice) -> "_Decoders":
+    def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
-        levels, free = (self._measurement_noise, self._process_noise), self.artifact.free_inverse
-        driven = _Decoder(self.artifact.inverse.part(outputs), *levels)
-        return _Decoders(driven, None if free is None else _Decoder(free.part(outputs), *levels))
+        level, process_noise = self._measurement_noise, self._process_noise
+        return Decoders.of(self.artifact, outputs, measurement_noise=level, process_noise=process_noise)
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
@@ -445,7 +445,7 @@ class KKLObserver:
             z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
         return z, age * self.artifact.filter.dt
 
-    def _identifier(self) -> "_Decoders":
+    def _identifier(self) -> Decoders:
         if self._parameters is None:
             raise ValueError(
                 f"this observer for {self.artifact.system!r} estimates no parameters: train one that does "
@@ -636,98 +636,6 @@ class KKLObserver:
         if not all_finite(u):
             raise ValueError("u holds NaN, infinity or values beyond 1e15")
         return u
-
-
-# Which decoder is asked, in which rows (None for all), what its networks are given, and the age in seconds.
-_Read = list[tuple["_Decoder", np.ndarray | None, np.ndarray, Any]]
-
-
-class _Decoders:
-    """The map of driven motion and, where there is one, that of free motion: each is asked where it holds."""
-
-    def __init__(self, driven: "_Decoder", free: "_Decoder | None") -> None:
-        self._driven, self._free = driven, free
-
-    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        return self.mean(self.read(z, age))
-
-    def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """Of what the estimates are off by, (..., nx, nx)."""
-        return self.covariance(self.read(z, age))
-
-    def read(self, z: np.ndarray, age: Any) -> _Read:
-        """What the networks are given for filter states, (..., size), of these ages in seconds."""
-        driven, free = self._driven, self._free
-        if free is None:
-            return [(driven, None, driven.read(z, age), age)]
-        nz = free.size  # behind it lies z_u, exactly 0 until an input acts
-        if z.ndim == 1:  # a single sample: every call of numpy would be felt
-            if any(z[nz:].tolist()):
-                return [(driven, None, driven.read(z, age), age)]
-            return [(free, None, free.read(z[:nz], age), age)]
-        moved = np.asarray(z[..., nz:].any(-1))
-        if moved.all():
-            return [(driven, None, driven.read(z, age), age)]
-        if not moved.any():
-            return [(free, None, free.read(z[..., :nz], age), age)]
-        age, still = np.broadcast_to(age, moved.shape), ~moved
-        return [
-            (driven, moved, driven.read(z[moved], age[moved]), age[moved]),
-            (free, still, free.read(z[still][:, :nz], age[still]), age[still]),
-        ]
-
-    def mean(self, read: _Read) -> np.ndarray:
-        """The estimates, (..., nx)."""
-        return _in_place(read, [decoder.mean(inputs) for decoder, _, inputs, _ in read])
-
-    def covariance(self, read: _Read) -> np.ndarray:
-        """Of what they are off by, (..., nx, nx)."""
-        return _in_place(read, [decoder.covariance(inputs, age) for decoder, _, inputs, age in read])
-
-
-def _in_place(read: _Read, found: list[np.ndarray]) -> np.ndarray:
-    """What decoders say, each in its rows."""
-    if len(found) == 1:
-        return found[0]
-    rows = [np.asarray(rows) for _, rows, _, _ in read]
-    out = np.empty((*rows[0].shape, *found[0].shape[1:]))
-    for where, values in zip(rows, found):
-        out[where] = values
-    return out
-
-
-class _Decoder:
-    """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
-
-    def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
-        self._inverse, self.size = inverse, inverse.whiten.shape[1]
-        self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
-        self._offset = -inverse.z_offset @ self._whiten
-        self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
-        if inverse.spread is not None:
-            shares = inverse.shares(measurement_noise, process_noise)
-            self.covariance = Covariance(inverse.spread, shares, inverse.x_scale)
-
-    def read(self, z: np.ndarray, age: Any) -> np.ndarray:
-        """What the network is given."""
-        inverse, conditions = self._inverse, self._conditions
-        modes = z @ self._whiten
-        modes += self._offset
-        if inverse.features[-1] == "age":
-            conditions = [*conditions, inverse.age_feature(age)]
-        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
-            return np.array([*modes.tolist(), *conditions], dtype=np.float32)
-        width = modes.shape[-1]
-        inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
-        inputs[..., :width] = modes
-        for i, condition in enumerate(conditions):
-            inputs[..., width + i] = condition
-        return inputs
-
-    def mean(self, inputs: np.ndarray) -> np.ndarray:
-        """The estimate, (..., nx)."""
-        inverse = self._inverse
-        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
 
 
 def load(

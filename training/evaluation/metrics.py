@@ -36,6 +36,27 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size).mean(0))
 
 
+def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distance e^T P^-1 e: of Gaussian errors it has the chi-square distribution with nx degrees.
+
+    Parameters
+    ----------
+    error : ndarray, shape (..., nx)
+        What estimates are off by.
+    covariance : ndarray, shape (..., nx, nx)
+        What is said of it.
+
+    Returns
+    -------
+    ndarray, shape (...,)
+        The distance.
+    """
+    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
+    scaled = error / scale
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    return np.asarray((scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0]).sum(-1))
+
+
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """SMAPE with absolute values of the components in place of norms, averaged over steps and components.
 
