@@ -129,7 +129,7 @@ class TrajectorySampler:
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
         self.age_unit = AGE_UNIT * linear.dt
         if like is not None:
-            gain, whiten = self._take(like)
+            gain, whiten = self._take(like, together)
         self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self._per_age = batch // self.AGES_PER_BATCH
         self._modes = torch.empty((m, n, len(gain)), device=device)
@@ -155,9 +155,10 @@ class TrajectorySampler:
             self._process, self._process_cell = self.process_conditions(data.process_noise, device)
         self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_noise_max else 0) + 1
 
-    def _take(self, inverse: InverseMap) -> tuple[np.ndarray, np.ndarray]:
-        """Take coordinates, scales, units and ends from a map; returns the gain of the noise and the coordinates."""
-        gain, whiten = np.sqrt((np.atleast_2d(inverse.noise_gain) ** 2).sum(0)), inverse.whiten
+    def _take(self, inverse: InverseMap, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and the coordinates."""
+        whiten = inverse.whiten
+        gain = np.sqrt(np.maximum(np.einsum("ma,ab,mb->m", whiten, noise, whiten), 0.0))
         self.coordinates, self.noise_gain = Coordinates(inverse.z_offset, whiten, gain), inverse.noise_gain
         self.scale = StateScale(inverse.x_offset, inverse.x_scale, self.scale.relative, self.scale.nx)
         self.measurement_noise_unit = np.broadcast_to(inverse.measurement_noise_unit, self.measurement_noise_max.shape)
