@@ -14,7 +14,7 @@ from training.evaluation.levels import Level
 from training.evaluation.metrics import squared_distance
 
 REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
-CHUNK = 25  # trajectories at once: each sample has a matrix
+CHUNK = 200  # trajectories at once: each sample has a matrix
 INTERVAL = 0.95  # of the mean NEES of a filter that is consistent
 
 
