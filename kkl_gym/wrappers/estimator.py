@@ -176,9 +176,7 @@ class KKLEstimator:
     def _require_error_bars(self, artifact: Artifact, estimate: str) -> None:
         """Raise ValueError if standard deviations are to be shown, and cannot."""
         if self._uncertainty and estimate != "x":
-            raise ValueError(
-                f"uncertainty=True is about x_hat: it needs estimate='x', got {estimate!r}"
-            )
+            raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {estimate!r}")
         if self._uncertainty:
             artifact.require_spread()
 

@@ -32,7 +32,7 @@ LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # of measurement noise, in multi
 FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
 AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
 FEWEST = 50  # errors from which a quantile is taken
-SETTLED = 8  # samples of each run past the last age
+PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
 WIDTH, DEPTH = 64, 1
 LEARNING_RATE = 3e-3
 
@@ -91,11 +91,12 @@ def learn_error_bars(
             f"need a step at least, 100 trajectories and a seed that is not negative, got {steps}, {trajectories}, "
             f"{seed}"
         )
-    if not {"measurement_noise", "age"} <= set(artifact.inverse.features):
-        raise ValueError(
-            f"error bars need a map that is told measurement noise and age, this one is told "
-            f"{', '.join(artifact.inverse.features)}: train one with kkl-gym train"
-        )
+    for inverse in (artifact.inverse, artifact.free_inverse):
+        if inverse is not None and not {"measurement_noise", "age"} <= set(inverse.features):
+            raise ValueError(
+                f"error bars need a map that is told measurement noise and age, this one is told "
+                f"{', '.join(inverse.features)}: train one with kkl-gym train"
+            )
     config, policy = settings_of(artifact.training), policy and blind(policy, system.nx)
     plant = with_parameters(system, artifact.parameter_ranges, NOMINAL_SHARE)
     with progress_bars(console) as progress:
@@ -165,6 +166,8 @@ class _Run:
             batch=config.batch,
             device=self.device,
             measurement_noise=self.artifact.measurement_noise,
+            noise_free_share=config.noise_free_share,
+            high_noise_emphasis=config.high_noise_emphasis,
             process_noise_max=self.artifact.process_noise_max or 0.0,
             parameters=inverse.mlp.outputs - nx,
             like=inverse,
@@ -229,13 +232,20 @@ class _Run:
             process_noise=process_noise,
             kinds=DRIVEN,
         )
-        later = np.linspace(self.knots[-1], len(u), SETTLED).astype(int)
-        ages = np.unique(np.concatenate([self.knots, later]))
+        ages = np.unique(np.concatenate(self._windows(len(u))))
         u = u[..., : linear.nu]
         z = linear.run(system.output(x), u, ages)
         largest = np.broadcast_to(artifact.inverse.measurement_noise_max, (system.ny,))
         noise = linear.run(largest * rng.standard_normal((*x.shape[:2], system.ny)), np.zeros_like(u), ages)
         return x[ages][..., : artifact.nx], z, noise, ages
+
+    def _windows(self, steps: int) -> list[np.ndarray]:
+        """Ages in samples that stand for each of the knots: those about it, and all behind the last."""
+        between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
+        edges = [0.0, *between.tolist(), float(steps)]
+        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
+        return [np.unique(span.round()).astype(int) for span in spans]
 
     def _distances(
         self,
@@ -260,7 +270,7 @@ class _Run:
 
     def _factors(self, distances: list[np.ndarray], ages: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Factors (levels, knots) from the errors of a group, (ages, n)."""
-        rows = [ages == knot for knot in self.knots[:-1]] + [ages >= self.knots[-1]]
+        rows = [np.isin(ages, window) for window in self._windows(int(ages[-1]))]
         inside = chi2.ppf(COVERAGE, self.artifact.nx)
         factors = np.empty((len(LEVELS), len(rows)))
         for i, distance in enumerate(distances):

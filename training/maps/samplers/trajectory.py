@@ -156,7 +156,7 @@ class TrajectorySampler:
         self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_noise_max else 0) + 1
 
     def _take(self, inverse: InverseMap, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and the coordinates."""
+        """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and whiten."""
         whiten = inverse.whiten
         gain = np.sqrt(np.maximum(np.einsum("ma,ab,mb->m", whiten, noise, whiten), 0.0))
         self.coordinates, self.noise_gain = Coordinates(inverse.z_offset, whiten, gain), inverse.noise_gain
