@@ -2,6 +2,7 @@
 
 import math
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +14,6 @@ from observers.network import MLP
 COVERAGE = 0.9  # of the regions that the factors make true
 _LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
 _LARGEST_FACTOR = 1e12
-_FEW = 4  # states up to which a single covariance is quicker without NumPy
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,6 @@ class Covariance:
         *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
         bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
         self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
-        # The whole of L for batches, its ones and zeros too, from the last layer: to put them in place takes time.
-        rows, columns = np.tril_indices(nx, -1)
-        place = [*range(nx), *(nx + nx * rows + columns)]
-        whole, whole_bias = np.zeros((nx + nx * nx, last.shape[1])), np.concatenate([np.zeros(nx), np.eye(nx).ravel()])
-        whole[place], whole_bias[place] = last, bias
-        self._whole = MLP([*weights, whole], [*biases, whole_bias], spread.mlp.activation)
         tables, (measurement, process) = np.log(spread.factors) / 2, levels
         if tables.ndim == 3:
             share = min(process, 1.0)
@@ -118,34 +112,20 @@ class Covariance:
         ndarray, shape (..., nx, nx)
             In units of the states.
         """
-        nx = self._nx
-        if inputs.ndim == 1 and nx <= _FEW:  # a single sample: every call of numpy would be felt
-            return self._single(self._mlp(inputs).tolist(), float(age))
-        out = self._whole(inputs)
-        log, lower = out[..., :nx].astype(float), out[..., nx:]
-        np.minimum(log, _LARGEST_LOG, out=log)
-        log += np.interp(age, self._ages, self._log_factors)[..., None]
-        np.exp(log, out=log)
-        root = lower.reshape(*lower.shape[:-1], nx, nx) * log[..., None]
-        covariance: np.ndarray = root @ root.mT
-        return covariance
-
-    def _single(self, out: list[float], age: float) -> np.ndarray:
-        nx, factor = self._nx, self._log_factor(age)
-        root: list[list[float]] = []
-        covariance, first = [0.0] * (nx * nx), nx
-        for i in range(nx):
-            scale = math.exp(min(out[i], _LARGEST_LOG) + factor)
-            row = [scale * entry for entry in out[first : first + i]]
-            row.append(scale)
-            root.append(row)
-            first += i
-            for j in range(i + 1):
-                entry = 0.0
-                for a, b in zip(row, root[j]):
-                    entry += a * b
-                covariance[nx * i + j] = covariance[nx * j + i] = entry
-        return np.array(covariance).reshape(nx, nx)
+        nx, out = self._nx, self._mlp(inputs)
+        if out.ndim == 1:  # a single sample: every call of numpy would be felt
+            values, factor = out.tolist(), self._log_factor(float(age))
+            scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
+            entries = _product(scales, values[nx:])
+            return np.array(entries).reshape(nx, nx)
+        values = np.moveaxis(out, -1, 0).astype(float, order="C")
+        np.minimum(values[:nx], _LARGEST_LOG, out=values[:nx])
+        values[:nx] += np.interp(age, self._ages, self._log_factors)
+        np.exp(values[:nx], out=values[:nx])
+        covariance = np.empty((*out.shape[:-1], nx * nx))
+        for i, entry in enumerate(_product(values[:nx], values[nx:])):
+            covariance[..., i] = entry
+        return covariance.reshape(*out.shape[:-1], nx, nx)
 
     def _log_factor(self, age: float) -> float:
         """As np.interp, without its overhead."""
@@ -155,6 +135,24 @@ class Covariance:
             return values[-1]
         share = (age - ages[i - 1]) / (ages[i] - ages[i - 1])
         return values[i - 1] + share * (values[i] - values[i - 1])
+
+
+def _product(scales: Sequence[Any], lower: Sequence[Any]) -> list[Any]:
+    """D L L^T D row by row, from D and what L has below its diagonal: of numbers, or of arrays that hold a batch."""
+    nx, first = len(scales), 0
+    rows: list[Any] = []
+    covariance: list[Any] = [0.0] * (nx * nx)
+    for i, scale in enumerate(scales):
+        row = [scale * entry for entry in lower[first : first + i]]
+        row.append(scale)
+        rows.append(row)
+        first += i
+        for j in range(i + 1):
+            entry = 0.0
+            for a, b in zip(row, rows[j]):
+                entry = entry + a * b
+            covariance[nx * i + j] = covariance[nx * j + i] = entry
+    return covariance
 
 
 def deviations(covariance: np.ndarray) -> np.ndarray:

@@ -33,7 +33,7 @@ FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
 AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
 FEWEST = 50  # errors from which a quantile is taken
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
-WIDTH, DEPTH = 64, 1
+WIDTH, DEPTH = 32, 1
 LEARNING_RATE = 3e-3
 
 
