@@ -2,7 +2,6 @@
 
 import math
 from bisect import bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,20 +136,22 @@ class Covariance:
         return values[i - 1] + share * (values[i] - values[i - 1])
 
 
-def _product(scales: Sequence[Any], lower: Sequence[Any]) -> list[Any]:
+def _product(scales: Any, lower: Any) -> list[Any]:
     """D L L^T D row by row, from D and what L has below its diagonal: of numbers, or of arrays that hold a batch."""
-    nx, first = len(scales), 0
-    rows: list[Any] = []
+    nx, k = len(scales), 0
+    rows: list[list[Any]] = []
     covariance: list[Any] = [0.0] * (nx * nx)
     for i, scale in enumerate(scales):
-        row = [scale * entry for entry in lower[first : first + i]]
+        row = []
+        for _ in range(i):
+            row.append(scale * lower[k])  # noqa: PERF401, a comprehension takes longer for so few
+            k += 1
         row.append(scale)
         rows.append(row)
-        first += i
-        for j in range(i + 1):
-            entry = 0.0
-            for a, b in zip(row, rows[j]):
-                entry = entry + a * b
+        for j, other in enumerate(rows):
+            entry = row[0] * other[0]
+            for m in range(1, j + 1):
+                entry = entry + row[m] * other[m]
             covariance[nx * i + j] = covariance[nx * j + i] = entry
     return covariance
 
