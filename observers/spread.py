@@ -144,7 +144,7 @@ def _product(scales: Any, lower: Any) -> list[Any]:
     for i, scale in enumerate(scales):
         row = []
         for _ in range(i):
-            row.append(scale * lower[k])  # noqa: PERF401, a comprehension takes longer for so few
+            row.append(scale * lower[k])  # a comprehension takes longer for so few
             k += 1
         row.append(scale)
         rows.append(row)
