@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.spread import deviations
 from training.evaluation.errors import UnseenTrajectories, kalman_filter, measured
 from training.evaluation.levels import Level
-from training.evaluation.metrics import squared_distance
+from training.evaluation.metrics import chi_square, squared_distance
 
 REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
 CHUNK = 200  # trajectories at once: each sample has a matrix
@@ -165,8 +164,8 @@ def _judged(
         said.append(std**2)
     distance, ratio, square, variance = (np.concatenate(each, 1) for each in (distances, ratios, squares, said))
     nx, n = x.shape[-1], x.shape[1]
-    joint, single = chi2.ppf(REGIONS, nx), chi2.ppf(REGIONS, 1)
-    low, high = (float(chi2.ppf((1 + side * INTERVAL) / 2, n * nx) / n) for side in (-1, 1))
+    joint, single = chi_square(REGIONS, nx), chi_square(REGIONS, 1)
+    low, high = (float(chi_square((1 + side * INTERVAL) / 2, n * nx) / n) for side in (-1, 1))
     return [
         Coverage(
             np.array([(distance[span] <= edge).mean() for edge in joint]),

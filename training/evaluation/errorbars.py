@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from scipy.stats import chi2
 
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, Spread
@@ -16,7 +15,7 @@ from observers.decoder import Decoders
 from observers.spread import COVERAGE
 from training.config import Config, settings_of
 from training.evaluation.calibration import sound_trajectories
-from training.evaluation.metrics import squared_distance
+from training.evaluation.metrics import chi_square, squared_distance
 from training.maps.optimise import Stage, optimise
 from training.maps.samplers import TrajectorySampler
 from training.maps.spread import SpreadProblem
@@ -28,7 +27,8 @@ from training.trajectories.parameters import blind, with_parameters
 from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
 
-LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # of measurement noise, in multiples of the largest that the map is told
+# Of measurement noise, in multiples of the largest that the map is told; dense near 0, where errors of the map end.
+LEVELS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
 AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
 FEWEST = 50  # errors from which a quantile is taken
@@ -271,7 +271,7 @@ class _Run:
     def _factors(self, distances: list[np.ndarray], ages: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Factors (levels, knots) from the errors of a group, (ages, n)."""
         rows = [np.isin(ages, window) for window in self._windows(int(ages[-1]))]
-        inside = chi2.ppf(COVERAGE, self.artifact.nx)
+        inside = chi_square(COVERAGE, self.artifact.nx)
         factors = np.empty((len(LEVELS), len(rows)))
         for i, distance in enumerate(distances):
             for j, row in enumerate(rows):

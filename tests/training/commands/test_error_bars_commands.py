@@ -34,9 +34,9 @@ def test_a_map_with_error_bars_is_written(tmp_path, console, make_artifact):
 
 def test_calibration_is_judged(tmp_path, console, make_artifact):
     path = tmp_path / "map.safetensors"
-    with_error_bars(make_artifact("van_der_pol", dt=0.05)).save(path)
+    with_error_bars(make_artifact("van_der_pol", dt=0.1)).save(path)
     csv = tmp_path / "coverage.csv"
-    found = Evaluate((str(path),), trajectories=3, duration=6.0, calibration=True, ekf=True, csv=csv).run(console)
+    found = Evaluate((str(path),), trajectories=2, duration=5.5, calibration=True, ekf=True, csv=csv).run(console)
     assert len(found) == 3 * 6 * 2 * 2  # cases, levels, spans, and both who estimate
     assert found["90"].between(0, 100).all()
     assert set(found.observer) == {"KKL", "EKF"}

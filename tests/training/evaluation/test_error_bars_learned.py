@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 from linear_system import Oscillator, exact_observer
+from scipy.stats import chi2
 
 from observers import MLP, KKLObserver
 from training.evaluation.coverage import REGIONS, coverage, kalman_coverage
 from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import unseen_trajectories
-from training.evaluation.metrics import squared_distance
+from training.evaluation.metrics import chi_square, squared_distance
 from training.filter_noise import stationary_covariance
 
 
@@ -116,3 +117,9 @@ def test_what_cannot_be_learned():
     for wrong in ({"steps": 0}, {"trajectories": 99}, {"seed": -1}):
         with pytest.raises(ValueError, match="need a step"):
             learn_error_bars(told_observer(), system, **wrong)
+
+
+def test_quantiles_are_those_of_scipy():
+    shares = [0.1, 0.5, 0.9, 0.99]
+    for degrees in (1, 2, 7, 400):
+        np.testing.assert_allclose(chi_square(shares, degrees), chi2.ppf(shares, degrees))
