@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents speed clean help
+.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -75,6 +75,13 @@ agents: $(VENV)/ready  ## every agent in docs/agents.md, and those that ship: ho
 	cp $(addprefix runs/agents/comparison/,results.csv table.md scores.png) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
+
+HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0
+
+environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
+	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
+	mkdir -p docs/results/environments
+	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md scores.png curves.png) docs/results/environments
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed

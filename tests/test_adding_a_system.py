@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from training.systems import Profile
 
 ROOT = Path(__file__).parent.parent
@@ -34,6 +36,7 @@ def edit(text, where, line, new):
     return "".join(lines)
 
 
+@pytest.mark.slow
 def test_following_the_page_adds_a_system(tmp_path):
     """Everything is done but the commands in full. One test, so that it is done once."""
     root = tmp_path

@@ -44,6 +44,7 @@ def test_any_environment(capsys):
     assert "the agent sees 3 numbers" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_any_environment_agent(capsys):
     small = {"random_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
     found = example("any_environment_agent")(**small)

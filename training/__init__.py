@@ -9,7 +9,9 @@ if TYPE_CHECKING:
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
+    from training.guided import GuidedKalmanFilter
     from training.identification.learning import adapt, identify
+    from training.observable import Observability, observability
     from training.pipeline import Result, train
     from training.presets import preset
     from training.rollouts import learn
@@ -18,7 +20,9 @@ if TYPE_CHECKING:
 __all__ = [
     "Certificate",
     "Config",
+    "GuidedKalmanFilter",
     "KKLTrainingCallback",
+    "Observability",
     "Result",
     "adapt",
     "calibrate",
@@ -27,6 +31,7 @@ __all__ = [
     "identify",
     "learn",
     "nrmse",
+    "observability",
     "preset",
     "smape",
     "train",
@@ -36,7 +41,9 @@ __all__ = [
 _MODULES = {
     "Certificate": "evaluation.certificates",
     "Config": "config",
+    "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
+    "Observability": "observable",
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "evaluation.calibration",
@@ -45,6 +52,7 @@ _MODULES = {
     "identify": "identification.learning",
     "learn": "rollouts",
     "nrmse": "evaluation.metrics",
+    "observability": "observable",
     "preset": "presets",
     "smape": "evaluation.metrics",
     "train": "pipeline",

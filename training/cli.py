@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 # The module under training.commands and the class in it that are behind each command.
 COMMANDS = {
     "check": ("check", "Check"),
+    "observability": ("observability", "ObservabilityCommand"),
     "record": ("record", "RecordCommand"),
     "train": ("train", "Train"),
     "identify": ("identify", "Identify"),
@@ -31,6 +32,7 @@ COMMANDS = {
     "tune": ("tune", "Tune"),
     "faults": ("faults", "Faults"),
     "maps": ("maps", "Maps"),
+    "export": ("export", "ExportCommand"),
     "demo": ("demo", "Demo"),
     "speed": ("speed", "Speed"),
 }
@@ -55,6 +57,7 @@ EXTRAS = {
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
     "envs": {"h5py", "minari"},
+    "onnx": {"onnx", "onnxruntime"},
 }
 
 

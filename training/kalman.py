@@ -12,9 +12,13 @@ from training.trajectories.derivatives import evaluate, jacobian, with_sensitivi
 NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
+LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
+UNSEEN = 1e12  # variance of a missing output, in multiples of the largest of those measured
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx) of a batch, or those of one Gaussian, (nx,) and (nx, nx)."""
+Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Means, covariances and normalised innovations squared (n,) of a batch."""
 
 
 def unknown_start(system: System) -> Gaussian:
@@ -46,10 +50,32 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 
 
+def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
+    """Intensity of the white noise that a filter assumes in place of the environments' process noise, never quite 0.
+
+    Parameters
+    ----------
+    system : System
+        What moves.
+    process_noise : float
+        Level of a noise that is uniform and held over each sample, in multiples of the system's scale per second.
+    dt : float
+        Sampling interval in seconds.
+
+    Returns
+    -------
+    ndarray, shape (nx, nx)
+        Q, per second.
+    """
+    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
+    return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
+
+
 class KalmanFilter(ABC):
     """A batch of Kalman filters in NumPy, in continuous time between samples or in discrete time.
 
     A filter that loses its way, out of the system's declared bounds or to a covariance that is none, starts anew.
+    Entries of samples that are NaN are missing, and correct nothing.
 
     Parameters
     ----------
@@ -70,6 +96,9 @@ class KalmanFilter(ABC):
         Estimates.
     P : ndarray, shape (n, nx, nx)
         Their covariances.
+    nis : ndarray, shape (n,)
+        Normalised innovations squared of the last samples, per output: 1 on average where all is as assumed, 0 where
+        no output was measured, and infinite in rows that have started anew.
     """
 
     def __init__(
@@ -92,7 +121,7 @@ class KalmanFilter(ABC):
         ndarray, shape (n, nx)
             Estimates.
         """
-        self.x, self.P = self._corrected(*self._starts(len(y0)), y0)
+        self.x, self.P, self.nis = self._corrected(*self._starts(len(y0)), y0)
         return self.decode()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
@@ -105,8 +134,8 @@ class KalmanFilter(ABC):
         rows : ndarray of bool, shape (n,)
             Which rows.
         """
-        self.x, self.P = self.x.copy(), self.P.copy()
-        self.x[rows], self.P[rows] = self._corrected(*self._starts(len(y0)), y0)
+        self.x, self.P, self.nis = self.x.copy(), self.P.copy(), self.nis.copy()
+        self.x[rows], self.P[rows], self.nis[rows] = self._corrected(*self._starts(len(y0)), y0)
 
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Predict over one sample and correct.
@@ -139,10 +168,11 @@ class KalmanFilter(ABC):
             Which rows move; by default all of them.
         """
         held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
-        x, P = self._corrected(*self._predicted(held), y)
+        x, P, nis = self._corrected(*self._predicted(held), y)
         if rows is not None:
             x, P = np.where(rows[:, None], x, self.x), np.where(rows[:, None, None], P, self.P)
-        self.x, self.P = x, P
+            nis = np.where(rows, nis, self.nis)
+        self.x, self.P, self.nis = x, P, nis
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Estimates as things stand, (n, nx), or those of some rows only."""
@@ -156,13 +186,28 @@ class KalmanFilter(ABC):
         inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
         return inside
 
+    def _innovation(self, y: np.ndarray, expected: np.ndarray) -> Gaussian:
+        """Samples less what was expected, (n, ny), and R; where one is missing 0, and a huge variance."""
+        missing = np.isnan(y)
+        if not missing.any():
+            return y - expected, self._R
+        unseen = UNSEEN * self._R.max() * np.eye(y.shape[1])
+        return np.where(missing, 0.0, y - expected), self._R + missing[:, None, :] * unseen
+
     @abstractmethod
     def _predicted(self, u: np.ndarray) -> Gaussian:
         """Mean and covariance one sample later under held inputs, (nu, n)."""
 
     @abstractmethod
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
-        """Mean and covariance given the samples y, (n, ny); lost filters start anew."""
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
+        """Mean and covariance given the samples y, (n, ny), and their surprise; lost filters start anew."""
+
+
+def _normalised(innovation: np.ndarray, S: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Innovations squared (n,), in multiples of their covariance S and per output that is measured."""
+    squared = (innovation * np.linalg.solve(S, innovation[..., None])[..., 0]).sum(-1)
+    nis: np.ndarray = squared / np.maximum((~np.isnan(y)).sum(-1), 1)
+    return nis
 
 
 class ExtendedKalmanFilter(KalmanFilter):
@@ -187,17 +232,19 @@ class ExtendedKalmanFilter(KalmanFilter):
         x, Phi = joint[:nx].T, joint[nx:].T.reshape(n, nx, nx)
         return x, Phi @ self.P @ Phi.mT + self._Q * self._dt
 
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
         inside = self._inside(x, P)
         if not inside.all():
             x, P = x.copy(), P.copy()
             x[~inside], P[~inside] = self._start
         H = evaluate(self._outputs, x)
-        S = H @ P @ H.mT + self._R
+        innovation, R = self._innovation(y, self._system.output(x))
+        S = H @ P @ H.mT + R
         K = np.linalg.solve(S, H @ P).mT
-        x = x + (K @ (y - self._system.output(x))[..., None])[..., 0]
+        x = x + (K @ innovation[..., None])[..., 0]
         I_KH = np.eye(x.shape[1]) - K @ H
-        return x, I_KH @ P @ I_KH.mT + K @ self._R @ K.mT  # Joseph's form stays positive
+        P = I_KH @ P @ I_KH.mT + K @ R @ K.mT  # Joseph's form stays positive
+        return x, P, np.where(inside, _normalised(innovation, S, y), np.inf)
 
 
 class UnscentedKalmanFilter(KalmanFilter):
@@ -227,19 +274,21 @@ class UnscentedKalmanFilter(KalmanFilter):
         return x, self._covariance(spread, spread) + self._Q * self._dt
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
-        x, P = self._updated(x, P, y)
+    def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
+        x, P, nis = self._updated(x, P, y)
         lost = ~self._inside(x, P)
         if lost.any():
-            x[lost], P[lost] = self._updated(*self._starts(int(lost.sum())), y[lost])
-        return x, P
+            x[lost], P[lost], _ = self._updated(*self._starts(int(lost.sum())), y[lost])
+            nis[lost] = np.inf
+        return x, P, nis
 
-    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Gaussian:
+    def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
         points = self._sigma_points(x, P)
         expected, spread = self._moments(self._system.output(points))
-        S = self._covariance(spread, spread) + self._R
+        innovation, R = self._innovation(y, expected)
+        S = self._covariance(spread, spread) + R
         K = np.linalg.solve(S, self._covariance(spread, points - x)).mT
-        return x + (K @ (y - expected)[..., None])[..., 0], P - K @ S @ K.mT
+        return x + (K @ innovation[..., None])[..., 0], P - K @ S @ K.mT, _normalised(innovation, S, y)
 
     def _sigma_points(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         """Points (2 nx + 1, n, nx); NaN where P is not positive definite."""

@@ -414,7 +414,7 @@ def test_every_missing_metadata_key_and_tensor(file):
     lambda t, m: m.update(inputs=2),
     lambda t, m: m.update(system="van_der_pol"),
     lambda t, m: m.update(inverse=[]),
-    lambda t, m: m["inverse"].update(activation="relu"),
+    lambda t, m: m["inverse"].update(activation="gelu"),
     lambda t, m: m["inverse"].update(features=["z_u", "z_y"]),
     lambda t, m: m["inverse"].update(features=["z_y", "z_u", "measurement_noise", "time"]),
     lambda t, m: m["inverse"].update(features=["z_y", "z_u", "age"]),

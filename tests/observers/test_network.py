@@ -56,5 +56,5 @@ def test_mlp_shape_errors():
     ):
         with pytest.raises(ValueError, match=r"cannot follow|do not make|not finite|must be"):
             MLP(*wrong, "tanh")
-    with pytest.raises(ValueError, match="activation must be 'tanh' or 'silu', got 'relu'"):
-        MLP(weights, biases, "relu")
+    with pytest.raises(ValueError, match="activation must be 'tanh' or 'silu' or 'relu', got 'gelu'"):
+        MLP(weights, biases, "gelu")

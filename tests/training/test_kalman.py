@@ -5,7 +5,7 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints
 from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
-from linear_system import C, F, Oscillator
+from linear_system import C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
 from kkl_gym import get_system
@@ -139,6 +139,17 @@ def test_a_filter_that_leaves_the_bounds_starts_anew_without_the_others(filters)
     assert abs(x_hat[-1, 0, 0] - 0.5) < 0.2
 
 
+def test_a_filter_that_starts_anew_says_so(filters):
+    observer = of_van_der_pol(filters)
+    observer.reset(np.array([[1.0], [1.0]]))
+    for value in (1e9, 1e-9, 1e12):
+        observer.step(np.array([[value], [1.0]]))
+        if np.isinf(observer.nis[0]):
+            break
+    assert np.isinf(observer.nis[0])
+    assert np.isfinite(observer.nis[1])
+
+
 @pytest.mark.parametrize("P", [-np.eye(2), np.diag([1.0, -1e-3]), np.full((2, 2), np.nan), np.diag([np.inf, 1.0])])
 def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(P):
     observer, untouched = of_van_der_pol(UnscentedKalmanFilter), of_van_der_pol(UnscentedKalmanFilter)
@@ -159,3 +170,41 @@ def test_a_batch_of_many_is_each_alone():
     for i in (0, 17, 39):
         alone = run(of_van_der_pol(UnscentedKalmanFilter), y[:, i : i + 1])
         np.testing.assert_allclose(many[:, i], alone[:, 0], rtol=1e-9, atol=1e-11)
+
+
+def test_innovations_are_as_large_as_expected_where_the_model_holds(filters):
+    """On the linear system, with the noise that is assumed."""
+    rng, dt, system = np.random.default_rng(0), 0.02, TwoOutputs()
+    R = np.diag(np.square(system.measurement_noise))
+    Phi, Q = expm(F * dt), np.diag([0.01, 0.02])
+    ours = filters(system, dt, Q=Q, R=R, start=(np.zeros(2), np.eye(2)))
+    x, found = rng.normal(size=(400, 2)), []
+    for k in range(50):
+        if k:
+            x = x @ Phi.T + rng.normal(size=x.shape) * np.sqrt(np.diag(Q) * dt)
+        y = x + rng.normal(size=x.shape) * system.measurement_noise
+        ours.step(y) if k else ours.reset(y)
+        found.append(ours.nis)
+    assert np.mean(found) == pytest.approx(1.0, abs=0.03)
+    before = ours.nis.copy()
+    rows = np.arange(400) == 7
+    ours.advance(y, rows=rows)
+    np.testing.assert_array_equal(ours.nis[~rows], before[~rows])
+    assert ours.nis[7] != before[7]
+
+
+def test_missing_outputs_correct_nothing(filters):
+    """With NaN in place of the second output it is the filter of the first alone, and with none it only predicts."""
+    start, Q, dt = (np.array([0.2, -0.1]), np.array([[1.0, 0.3], [0.3, 0.5]])), np.diag([0.01, 0.02]), 0.02
+    both = filters(TwoOutputs(), dt, Q=Q, R=np.diag([0.3, 0.4]), start=start)
+    one = filters(Oscillator(), dt, Q=Q, R=np.array([[0.3]]), start=start)
+    y = np.random.default_rng(0).normal(size=(30, 3, 1))
+    found = run(both, np.concatenate([y, np.full_like(y, np.nan)], -1))
+    np.testing.assert_allclose(found, run(one, y), rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(both.nis, one.nis, rtol=1e-8)
+    x, P = both.x, both.P
+    both.advance(np.full((3, 2), np.nan))
+    Phi = expm(F * dt)
+    np.testing.assert_allclose(both.x, x @ Phi.T, rtol=1e-8)
+    np.testing.assert_allclose(both.P, Phi @ P @ Phi.T + Q * dt, rtol=1e-7)
+    assert (both.nis == 0).all()

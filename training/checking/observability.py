@@ -58,7 +58,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
         advice = "" if subject.policy else "mend first what is above"
         yield Finding("observability", "note", f"no error can be predicted for motions without input: {error}", advice)
         return
-    unknown = _unknown(subject, probe)
+    unknown = untold(subject, probe)
     yield from unknown.values()
     default, noise = Spectrum(eigenvalues(system, subject.dt)), system.measurement_noise
     errors = [probe.error_of_states(default, 0.0), probe.error_of_states(default, noise)]
@@ -77,7 +77,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
         yield Finding("observability", "note" if vague else "ok", found, advice if vague else "")
 
 
-def _unknown(subject: Subject, probe: Probe) -> dict[tuple[int, ...], Finding]:
+def untold(subject: Subject, probe: Probe) -> dict[tuple[int, ...], Finding]:
     """What cannot be told from all of y, by the states that it is of."""
     system, found = subject.system, dict[tuple[int, ...], Finding]()
     without_y = np.linalg.norm(probe.Phi[-1] * subject.half, axis=-1).mean(0) / subject.half

@@ -11,7 +11,7 @@ from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
 from training.evaluation.levels import Level
 from training.evaluation.metrics import nrmse, smape
-from training.kalman import ExtendedKalmanFilter, measurement_covariance
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.noise import draw_process_noise, noisy_output
@@ -20,7 +20,6 @@ from training.trajectories.signals import random_inputs
 
 TRANSIENT = 0.2  # part of a trajectory that is left out of the errors "after the transient"
 
-LEAST_PROCESS_NOISE = 0.005  # that a Kalman filter assumes: a tenth of the environments' default
 TRIES = 1000  # starts of which one at least should lie beyond X
 
 Domain = Literal["X", "1.5X", "2X"]
@@ -340,8 +339,7 @@ def kalman_filter(system: System, dt: float, process_noise: float, measurement_n
     ValueError
         If the equations take no symbols.
     """
-    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
-    Q = np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)  # of a uniform w that is held over dt
+    Q = process_intensity(system, process_noise, dt)
     return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, measurement_noise))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from training.evaluation.levels import Level
+from training.guided import GuidedKalmanFilter
 from training.kalman import (
     ExtendedKalmanFilter,
     KalmanFilter,
@@ -19,6 +20,12 @@ from training.methods.base import Arrays, CausalObserver, Configuration, Method,
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
 # linearisation, for there is none in the trajectories.
 DIFFUSION = (1e-3, 1e-2, 1e-1)
+GUIDED_DIFFUSION = (3e-4, 1e-2, 1e-1)  # where an observer takes the filter back, it may trust an exact model more
+
+
+def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
+    """Q, (nx, nx), per second, of the level of diffusion that was chosen."""
+    return np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
 
 
 class EKF(Method[Arrays]):
@@ -41,7 +48,7 @@ class EKF(Method[Arrays]):
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The filter, told the noise level."""
-        Q = np.diag((trained["diffusion"] * np.array(system.scale)) ** 2 / system.pace)
+        Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
         return self.filter(self.believed(system), dt, Q=Q, R=R)
 
@@ -52,6 +59,22 @@ class UKF(EKF):
     name: ClassVar[str] = "ukf"
     label: ClassVar[str] = "UKF"
     filter: ClassVar[type[KalmanFilter]] = UnscentedKalmanFilter
+
+
+class Guided(EKF):
+    """Kalman filter with the exact model and noise level, guided by the shipped map and tuned as the EKF is."""
+
+    name: ClassVar[str] = "guided"
+    label: ClassVar[str] = "UKF, guided by the shipped map"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Three levels of diffusion, as for the others; the least is smaller."""
+        return tuple({"diffusion": level} for level in GUIDED_DIFFUSION)
+
+    def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
+        """The filter and the map, told the noise level."""
+        Q = diffusion_intensity(trained, system)
+        return GuidedKalmanFilter(system, dt=dt, measurement_noise=noise, process_noise=0.0, Q=Q)
 
 
 class WrongEKF(WrongParameters, EKF):

@@ -38,33 +38,85 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
     ValueError
         If no sample with a state is as old as the greatest age.
     """
-    z = [_along(linear, record) for record in records]
-    x = [np.full((len(record.t), 0), np.nan) if record.x is None else record.x for record in records]
-    known = [np.flatnonzero(~np.isnan(values).any(-1)) if values.shape[1] else np.zeros(0, int) for values in x]
+    z = [along(linear, record) for record in records]
     xs, zs = [], []
     for age in ages:
-        old = [samples[samples >= age] for samples in known]
-        owner = np.repeat(np.arange(len(records)), [len(samples) for samples in old])
+        owner, sample = samples_as_old(records, int(age))
         if not len(owner):
             raise ValueError(
                 f"no recorded state is {age * linear.dt:.3g} s after the start of its record, or of a gap; record "
                 "longer runs, or take faster eigenvalues"
             )
         chosen = np.linspace(0, len(owner) - 1, n).round().astype(int)
-        owner, sample = owner[chosen], np.concatenate(old)[chosen]
-        power = np.linalg.matrix_power(linear.transition, int(age))
-        own_x, own_z = [], []
-        for i in np.unique(owner):
-            here = sample[owner == i]
-            start = linear.start(records[i].y[here - age])
-            own_x.append(x[i][here])
-            own_z.append(z[i][here] + (start - z[i][here - age]) @ power.T)
-        xs.append(np.concatenate(own_x))
-        zs.append(np.concatenate(own_z))
+        owner, sample = owner[chosen], sample[chosen]
+        xs.append(taken([record.x for record in records], owner, sample))
+        zs.append(restarted(linear, records, z, owner=owner, sample=sample, age=int(age)))
     return Trajectories(ages, np.stack(xs), np.stack(zs), np.zeros(n))
 
 
-def _along(linear: LinearFilter, record: Record) -> np.ndarray:
+def samples_as_old(records: Sequence[Record], age: int) -> tuple[np.ndarray, np.ndarray]:
+    """Find the samples with a state that have so many before them.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        As :func:`windows` takes them.
+    age : int
+        How many.
+
+    Returns
+    -------
+    owner, sample : ndarray of int, shape (n,)
+        The record of each, in order, and its row there; those that lack a state are left out.
+    """
+    found = [
+        np.zeros(0, int) if record.x is None else age + np.flatnonzero(~np.isnan(record.x[age:]).any(-1))
+        for record in records
+    ]
+    return np.repeat(np.arange(len(records)), [len(samples) for samples in found]), np.concatenate(found)
+
+
+def taken(values: Sequence[np.ndarray | None], owner: np.ndarray, sample: np.ndarray) -> np.ndarray:
+    """Rows of arrays, one for each record, as :func:`samples_as_old` names them; none of them is of a missing one."""
+    return np.concatenate([np.asarray(values[i])[sample[owner == i]] for i in np.unique(owner)])
+
+
+def restarted(
+    linear: LinearFilter,
+    records: Sequence[Record],
+    z: Sequence[np.ndarray],
+    *,
+    owner: np.ndarray,
+    sample: np.ndarray,
+    age: int,
+) -> np.ndarray:
+    """What the filter holds at some samples if it was switched on ``age`` samples before each.
+
+    Parameters
+    ----------
+    linear : LinearFilter
+        The filter.
+    records : sequence of Record
+        As :func:`windows` takes them.
+    z : sequence of ndarray, shape (n, size)
+        What the filter holds :func:`along` each.
+    owner, sample : ndarray of int, shape (m,)
+        As of :func:`samples_as_old`.
+    age : int
+        Samples since the start.
+
+    Returns
+    -------
+    ndarray, shape (m, size)
+        Its states.
+    """
+    began = sample - age
+    start = linear.start(taken([record.y for record in records], owner, began))
+    power = np.linalg.matrix_power(linear.transition, age)
+    return np.asarray(taken(z, owner, sample) + (start - taken(z, owner, began)) @ power.T)
+
+
+def along(linear: LinearFilter, record: Record) -> np.ndarray:
     """The filter's states along a whole record, (n, size)."""
     n = len(record.t)
     u = np.zeros((n, 1, 0)) if not linear.nu or record.u is None else record.u[:, None]

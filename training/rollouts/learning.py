@@ -12,7 +12,6 @@ from observers import Artifact
 from training.jobs import refuse_checkpoints
 from training.progress import ProgressBars, progress_bars
 from training.recorded.config import RecordedConfig, recorded_config
-from training.recorded.fit import train_recorded
 from training.rollouts.playing import make, roll_out
 from training.rollouts.policies import RANDOM, Policy, policy_of
 
@@ -65,6 +64,8 @@ def learn(
     ValueError
         If an argument makes no sense, or as :func:`training.recorded.fit.train_recorded`.
     """
+    from training.recorded.fit import train_recorded  # torch takes seconds to import
+
     if episodes is None and steps is None:
         steps = 100_000
     settings = {"seed": seed} | settings

@@ -267,6 +267,19 @@ def test_options_that_do_not_go_together_are_refused(tmp_path, options, says):
         learn_to_play(PENDULUM, information, tmp_path, **options)
 
 
+@pytest.mark.parametrize(
+    ("task", "algorithm", "says"),
+    [
+        (CART, "sac", "take ppo, a2c or dqn"),
+        (PENDULUM, "dqn", "take ppo, a2c, sac"),
+        (HiddenTask("FrozenLake-v1", (0,)), "td3", "take ppo"),
+    ],
+)
+def test_algorithms_that_cannot_act_there_are_refused(tmp_path, task, algorithm, says):
+    with pytest.raises(ValueError, match=says):
+        learn_to_play(task, "y", tmp_path, algorithm=algorithm)
+
+
 def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
     options = {"environments": ("CartPole-v1",), "seeds": 3, "episodes": 4, "jobs": 1, "out": tmp_path}
     Compare(**options, information=("state", "y")).run(Console())

@@ -5,7 +5,7 @@ import pytest
 
 from kkl_gym import get_system
 from training.methods import get_method
-from training.methods.kalman import DIFFUSION
+from training.methods.kalman import DIFFUSION, GUIDED_DIFFUSION
 
 
 def test_wrong_models_are_ten_percent_off():
@@ -38,6 +38,19 @@ def test_diffusion_is_in_multiples_of_the_scale_per_root_of_a_second(name):
         observer.step(np.zeros((1, 1)))
         variance.append(np.diag(observer.P[0]))
     np.testing.assert_allclose(variance[1] - variance[0], (0.1 * np.array(system.scale)) ** 2 * dt, rtol=1e-6)
+
+
+def test_the_guided_filter_takes_the_shipped_map_and_is_told_the_noise():
+    method, system = get_method("guided"), get_system("van_der_pol")
+    assert [one["diffusion"] for one in method.configurations(system)] == list(GUIDED_DIFFUSION)
+    y = np.array([[3.0], [-1.0]])
+    for noise in (0.0, 50.0):  # beyond what the map was trained for
+        ours = method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise)
+        alone = get_method("ukf").observer({"diffusion": np.array([0.01])}, system, 0.01, noise)
+        np.testing.assert_allclose(ours.reset(y), alone.reset(y), rtol=1e-12)
+        np.testing.assert_allclose(ours.step(y), alone.step(y), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"sampling interval dt = 0\.01"):
+        method.observer({"diffusion": np.array([0.01])}, system, 0.02, 0.0)
 
 
 def test_the_ukf_takes_every_trajectory_of_the_benchmark():

@@ -43,6 +43,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
     "ppo_lstm": RecurrentPPO,
 }
 RECURRENT = "ppo_lstm"
+CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
 OBSERVER_STEPS = 0.1  # of the steps of a training, in which actions are random and an observer is learned
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
@@ -185,6 +186,7 @@ def learn_to_play(
     if (name == RECURRENT) != (information == "recurrent"):
         raise ValueError(f"{RECURRENT} is for information 'recurrent', and only that; got {name} and {information!r}")
     settings = hyperparameters(name, task.env_id, timesteps)
+    _check_actions(name, actions, task.env_id)
     steps, began = settings["n_timesteps"], time.process_time()
     if observer is not None and information != "x_hat":
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
@@ -217,6 +219,20 @@ def learn_to_play(
         how = {"algorithm": name, **settings, "seed": seed, "observer_steps": spent, "aggregate": aggregate}
         player_of(model, task, information, observer=observer, training=how).save(folder / "agent.safetensors")
     return model
+
+
+def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
+    """Raise ValueError unless an algorithm can act in a space."""
+    if isinstance(space, spaces.Discrete):
+        fits, others = algorithm not in CONTINUOUS, "ppo, a2c or dqn"
+    elif isinstance(space, spaces.Box) and len(space.shape) == 1:
+        fits, others = algorithm != "dqn", "ppo, a2c, sac, td3 or tqc"
+        if algorithm in CONTINUOUS and not space.is_bounded():
+            fits, others = False, "ppo or a2c, as there are no bounds"
+    else:
+        raise ValueError(f"agents learn where actions are Discrete or a row of numbers; those of {env_id} are {space}")
+    if not fits:
+        raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
 
 
 def _fit(

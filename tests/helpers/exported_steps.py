@@ -1,0 +1,86 @@
+"""The observer's step written once more, in doubles throughout, and signals for it."""
+
+import numpy as np
+
+import kkl_gym
+from kkl_gym.simulate import simulate
+from observers import KKLObserver
+from training.export import Exported
+
+
+def exported_of(artifact, folder, name="made", **options):
+    artifact.save(folder / f"{name}.safetensors")
+    return Exported.read(str(folder / f"{name}.safetensors"), **options)
+
+
+def noise(artifact, steps, rows=()):
+    """Outputs and inputs that floats hold exactly; the inputs begin after a third of the steps."""
+    rng = np.random.default_rng(1)
+    y = rng.normal(scale=3.0, size=(steps, *rows, artifact.ny)).astype(np.float32).astype(float)
+    u = rng.normal(size=(steps, *rows, artifact.nu)).astype(np.float32).astype(float)
+    u[: steps // 3] = 0.0
+    return y, u
+
+
+def motion(artifact, steps, runs=1):
+    """The output along runs of a shipped system, end to end, under inputs that are held for a second.
+
+    No input acts in the first fifth.
+    """
+    system, dt, rng = kkl_gym.get_system(artifact.system), artifact.filter.dt, np.random.default_rng(2)
+    length, held = -(-steps // runs), round(1.0 / dt)
+    u = np.zeros((length, runs, artifact.nu))
+    if artifact.nu:
+        pieces = rng.uniform(-0.3, 0.3, (length // held + 1, runs, artifact.nu)) * system.u_max
+        u = np.repeat(pieces, held, axis=0)[:length]
+        u[:, : runs // 5] = 0.0
+        u[: length // 5] *= runs > 1
+    u = u.astype(np.float32).astype(float)
+    x0 = rng.uniform(*np.transpose(system.X), (runs, system.nx))
+    x = simulate(system, x0, length, dt, u if artifact.nu else None)[:length]
+    y = np.moveaxis(np.asarray(system.h(np.moveaxis(x, -1, 0))), 0, -1)
+    y, u = (np.swapaxes(signal, 0, 1).reshape(length * runs, -1)[:steps] for signal in (y, u))
+    return y.astype(np.float32).astype(float), u
+
+
+def in_doubles(exported, y, u):
+    """Estimates along a record, (steps, ..., nx), with a network of doubles too."""
+    artifact, linear = exported.artifact, exported.artifact.filter
+    z = [y[0] @ linear.equilibrium.T]
+    for k in range(1, len(y)):
+        driven = y[k - 1] @ linear.early_y.T + y[k] @ linear.late_y.T + u[k - 1] @ linear.held_u.T
+        z.append(z[-1] @ linear.transition.T + driven)
+    z = np.array(z)
+    age = (np.arange(len(y)) * linear.dt).reshape(-1, *(1 for _ in z.shape[1:]))
+
+    def mapped(inverse):
+        modes = (z[..., : len(inverse.z_offset)] - inverse.z_offset) @ inverse.whiten.T
+        told = [*inverse.noise_features(exported.measurement_noise, exported.process_noise)]
+        told += [inverse.age_feature(age)] if "age" in inverse.features else []
+        told = [np.broadcast_to(value, (*modes.shape[:-1], 1)) for value in told]
+        h = np.concatenate([modes * inverse.gain(exported.measurement_noise), *told], axis=-1)
+        for i, (weight, bias) in enumerate(zip(inverse.mlp.weights, inverse.mlp.biases)):
+            if i:
+                h = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}[
+                    inverse.mlp.activation
+                ](h)
+            h = h @ weight.T.astype(float) + bias
+        return inverse.x_offset + inverse.x_scale * h
+
+    x_hat = mapped(artifact.inverse)
+    if artifact.free_inverse is None:
+        return x_hat
+    return np.where(z[..., len(linear.A) :].any(-1)[..., None], x_hat, mapped(artifact.free_inverse))
+
+
+def apart(exported, x_hat, y, u):
+    """The largest difference from KKLObserver (float) or :func:`in_doubles` (double), in scales of the estimates."""
+    if exported.precision == "double":
+        expected = in_doubles(exported, y, u)
+    else:
+        artifact, levels = exported.artifact, (exported.measurement_noise,)
+        observer = KKLObserver(artifact, *levels, process_noise=exported.process_noise)
+        expected = observer.estimate(y, u)
+        if artifact.estimated_parameters:
+            expected = np.concatenate([expected, observer.estimate_parameters(y, u)], axis=-1)
+    return (abs(x_hat - expected) / exported.artifact.inverse.x_scale).max()

@@ -1,0 +1,176 @@
+"""The step in C99, compiled, against the same in Python."""
+
+import math
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from exported_steps import apart, exported_of, in_doubles, motion, noise
+from rollout_observers import observer_of
+
+from observers import shipped
+from training.export import Exported
+from training.export.c_source import c_files
+from training.export.exported import identifier
+from training.export.footprint import footprint
+
+WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler, cc")
+
+
+def compiled(exported, folder, *options):
+    """The program around an exported observer."""
+    for name, text in c_files(exported).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    program, sources = folder / "program", [folder / f"{exported.name}{end}.c" for end in ("", "_main")]
+    done = subprocess.run(["cc", *WARNINGS, *options, *sources, "-lm", "-o", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def fed(program, text):
+    return subprocess.run([program], input=text, capture_output=True, text=True)
+
+
+def estimates(program, y, u):
+    """What the program prints for a record."""
+    rows = np.concatenate([u[:-1], y[1:]], axis=-1).tolist()
+    done = fed(program, "\n".join(" ".join(map(repr, row)) for row in [y[0].tolist(), *rows]) + "\n")
+    assert (done.returncode, done.stderr) == (0, "")
+    return np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
+
+
+def activated(artifact, activation):
+    return replace(
+        artifact, inverse=replace(artifact.inverse, mlp=replace(artifact.inverse.mlp, activation=activation))
+    )
+
+
+@needs_cc
+@pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-10)])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"inputs": False, "noise": False, "age": False},
+        {"pair": True, "outputs": 2, "process": True, "free_inverse": True},
+        {"estimated": True, "process": True},
+        {"pair": True, "activation": "relu"},
+        {"system": "lorenz", "free_inverse": True, "activation": "tanh"},
+    ],
+)
+def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_path):
+    activation = options.get("activation", "silu")
+    artifact = activated(make_artifact(**{k: v for k, v in options.items() if k != "activation"}), activation)
+    exported = exported_of(artifact, tmp_path, precision=precision)
+    y, u = noise(artifact, 400)
+    x_hat = estimates(compiled(exported, tmp_path), y, u)
+    assert np.ptp(x_hat, axis=0).min() > 0.01
+    assert apart(exported, x_hat, y, u) < tolerance
+
+
+@needs_cc
+@pytest.mark.parametrize(
+    ("name", "precision", "tolerance"),
+    [
+        ("lorenz-spinn", "float", 1e-5),
+        *(
+            pytest.param(name, precision, tolerance, marks=pytest.mark.slow)
+            for name in sorted(set(shipped().values()))
+            for precision, tolerance in (("float", 5e-5), ("double", 5e-9))
+        ),
+    ],
+)
+def test_100_000_steps_of_what_ships(name, precision, tolerance, tmp_path):
+    exported = Exported.read(name, precision=precision)
+    y, u = motion(exported.artifact, 100_000, runs=20)
+    x_hat = estimates(compiled(exported, tmp_path), y, u)
+    assert len(x_hat) == 100_000
+    largest = apart(exported, x_hat, y, u)
+    print(f"{name} {precision}: {largest:.1e}, {footprint(tmp_path / f'{exported.name}.c')}")
+    assert largest < tolerance
+
+
+@needs_cc
+def test_the_compiler_may_be_told_other_levels_of_noise(make_artifact, tmp_path):
+    artifact = make_artifact(outputs=2, process=True, free_inverse=True)
+    exported = exported_of(artifact, tmp_path, precision="double", measurement_noise=(0.2, 0.7), process_noise=0.1)
+    y, u = noise(artifact, 50)
+    told = ["-DMADE_MEASUREMENT_NOISE_1=0.9", "-DMADE_MEASUREMENT_NOISE_2=7", "-DMADE_PROCESS_NOISE=0.02"]
+    x_hat = estimates(compiled(exported, tmp_path, *told), y, u)
+    other = replace(exported, measurement_noise=(0.9, 2.0), process_noise=0.02)  # 2 is the largest that is told
+    np.testing.assert_allclose(x_hat, in_doubles(other, y, u), rtol=0, atol=1e-9)
+    assert abs(x_hat - in_doubles(exported, y, u)).max() > 1e-3
+
+
+@needs_cc
+def test_names_of_others_end_no_comment(tmp_path):
+    names = ["*/ int x; /*", "a\\", "ends with ??/", "/*/"]
+    artifact = replace(observer_of("Any-v0", names[:1], names[1:3], names[3:]), environment=None)
+    exported = exported_of(artifact, tmp_path, name="2 weird-é names", precision="double")
+    assert exported.name == "observer_2_weird_names"
+    y, u = noise(artifact, 30)
+    assert apart(exported, estimates(compiled(exported, tmp_path), y, u), y, u) < 1e-10
+
+
+@needs_cc
+def test_a_line_without_all_its_numbers_is_an_error(make_artifact, tmp_path):
+    program = compiled(exported_of(make_artifact(), tmp_path), tmp_path)
+    for text in ("1.0\n0.5\n", "1.0\n0.5 word\n", "word\n"):
+        done = fed(program, text)
+        assert done.returncode == 1
+        assert done.stderr == "there is a line without all its numbers\n"
+    assert fed(program, "").returncode == 0
+
+
+def test_numbers_are_read_back_as_the_same(make_artifact, tmp_path):
+    exported = exported_of(make_artifact(), tmp_path, precision="double")
+    inverse, text = exported.artifact.inverse, c_files(exported)["made.c"]
+
+    def numbers(name):
+        found = re.search(rf" {name}[\[\]0-9]+ = {{(.*?)}};", text, re.DOTALL)
+        return [word.rstrip("f") for word in re.findall(r"[^\s,{}]+", found[1])]
+
+    assert np.array_equal(np.array(numbers("driven_whiten"), float), inverse.whiten.ravel())
+    assert np.array_equal(np.array(numbers("driven_weights0"), np.float32), inverse.mlp.weights[0].ravel())
+    assert all({".", "e", "inf"} & set(word) for word in numbers("driven_weights0"))  # 1f is no number of C
+
+
+def test_names():
+    assert [identifier(name) for name in ("lorenz-spinn-v1", "Pendulum-v1", "3d", "模", "_a b_")] == [
+        "lorenz_spinn_v1", "Pendulum_v1", "observer_3d", "observer", "a_b"
+    ]  # fmt: skip
+    assert Exported.read("lorenz-spinn").estimates == ["x1", "x2", "x3"]
+
+
+def test_what_cannot_be_exported(make_artifact, tmp_path):
+    inverse = make_artifact().inverse
+    artifact = replace(make_artifact(), inverse=replace(inverse, x_scale=1e39 * inverse.x_scale))
+    with pytest.raises(ValueError, match="beyond the range of floats: export it with --precision double"):
+        exported_of(artifact, tmp_path)
+    assert exported_of(artifact, tmp_path, precision="double").precision == "double"
+    with pytest.raises(ValueError, match="precision must be 'float' or 'double', got 'half'"):
+        Exported.read("lorenz", precision="half")
+
+
+def test_ages_stop_where_they_no_longer_matter(make_artifact, tmp_path):
+    assert exported_of(make_artifact(), tmp_path).last_age == math.ceil(2.0 / 0.01)
+    assert exported_of(make_artifact(age=False), tmp_path).last_age == 0
+
+
+@needs_cc
+@pytest.mark.skipif(shutil.which("size") is None, reason="there is no size")
+def test_the_footprint_is_that_of_weights_and_state(tmp_path):
+    exported = Exported.read("lorenz-spinn")
+    for name, text in c_files(exported).items():
+        (tmp_path / name).write_text(text)
+    found = footprint(tmp_path / "lorenz_spinn.c")
+    weights = sum(4 * weight.size for weight in exported.artifact.inverse.mlp.weights)
+    assert weights < found.flash < weights + 10_000
+    assert found.static == 0
+    assert 9 * 8 + 4 + 4 <= found.state <= 9 * 8 + 3 * 8
+    (tmp_path / "lorenz_spinn.h").write_text("#error no\n")
+    assert footprint(tmp_path / "lorenz_spinn.c") is None

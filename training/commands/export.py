@@ -1,0 +1,109 @@
+"""``kkl-gym export MAP``: an observer for programs without Python."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from observers.storage import replacing, write
+from training.commands.options import NoiseLevel
+
+if TYPE_CHECKING:
+    from training.export import Exported
+
+
+@dataclass(frozen=True)
+class ExportCommand:
+    """Export an observer for programs without Python: as an ONNX graph, or as C99.
+
+    Both take in a sample and the input before it, and give the filter's next state and the estimate, as
+    observers.KKLObserver does. All maps can be exported: those that ship, of your own systems, from records and from
+    rollouts. Missing samples and the monitor are left out.
+
+    --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
+    extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library's math.h alone, and
+    NAME_main.c, a program that reads samples and prints estimates. docs/export.md has both from end to end.
+    """
+
+    observer: Annotated[
+        tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP", help="A shipped map, or a .safetensors file.")
+    ]
+    format: Literal["onnx", "c"]
+    """What to write."""
+    precision: Literal["float", "double"] = "float"
+    """Type of the network, of samples and of estimates. The filter is of doubles in both, as floats would not do: what
+    the network is told of it are small differences."""
+    measurement_noise: Annotated[
+        NoiseLevel, tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: what is usual for the map)")
+    ] = None
+    """For --format c: standard deviation of the noise on each sample that the estimate assumes, or one for each output
+    as in 0.1,0.3. The compiler may be told another."""
+    process_noise: Annotated[float | None, tyro.conf.arg(help_behavior_hint="(default: the system's)")] = None
+    """For --format c: level of process noise that the estimate assumes, likewise."""
+    out: Path = Path("runs/export")
+    """Folder for what is written."""
+
+    def run(self, console: Console) -> list[Path]:
+        """Export.
+
+        Parameters
+        ----------
+        console : rich.console.Console
+            Where it is said what was written, and how large it is.
+
+        Returns
+        -------
+        list of Path
+            The files.
+
+        Raises
+        ------
+        ValueError
+            If there is no such observer, it cannot be exported, or an option makes no sense.
+        ModuleNotFoundError
+            If an ONNX graph is asked for without the extra ``onnx``.
+        """
+        from training.export import Exported
+
+        if self.format == "onnx" and (self.measurement_noise, self.process_noise) != (None, None):
+            raise ValueError(
+                "levels of noise are inputs of an ONNX graph: leave out --measurement-noise and --process-noise"
+            )
+        exported = Exported.read(
+            self.observer,
+            precision=self.precision,
+            measurement_noise=self.measurement_noise,
+            process_noise=self.process_noise,
+        )
+        if self.format == "onnx":
+            return [self._onnx(exported, console)]
+        return self._c(exported, console)
+
+    def _onnx(self, exported: "Exported", console: Console) -> Path:
+        from training.export.onnx_graph import onnx_model
+
+        content = onnx_model(exported).SerializeToString()
+        path = self.out / f"{exported.name}.onnx"
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+        _say(console, f"wrote {path}, {len(content) / 1e3:.0f} kB")
+        return path
+
+    def _c(self, exported: "Exported", console: Console) -> list[Path]:
+        from training.export.c_source import c_files
+        from training.export.footprint import footprint
+
+        files = {self.out / name: text for name, text in c_files(exported).items()}
+        for path, text in files.items():
+            write(path, text)
+        _say(console, f"wrote {', '.join(map(str, files))}")
+        found = footprint(self.out / f"{exported.name}.c")
+        _say(console, str(found) if found else "there is no cc or no size here, which would tell how large it is")
+        return list(files)
+
+
+def _say(console: Console, text: str) -> None:
+    """Print a line of which nothing is markup, and which is not broken where paths are to be copied."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,181 @@
+"""What is exported: an observer, the levels of noise that it assumes, and what is said of where it comes from."""
+
+import math
+import os
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from kkl_gym.systems import SYSTEMS
+from observers import Artifact, KKLObserver
+from observers.artifact import ArtifactError, InverseMap, resolve
+from observers.checks import choice
+from observers.storage import checksum
+
+# Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
+# what distinguishes them would be lost in the last digits of floats.
+PRECISIONS = ("float", "double")
+_MOST_SAMPLES = 2**32 - 1  # that C's unsigned long can count everywhere
+
+
+@dataclass(frozen=True)
+class Exported:
+    """An observer as it leaves this package.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        What was learned.
+    name : str
+        An identifier of C.
+    source : str
+        The file's name, for people.
+    checksum : str
+        Of what the file holds, as :func:`observers.storage.checksum` has it.
+    precision : {"float", "double"}
+        Of the network, of samples and of estimates.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample that is assumed, of all outputs or each.
+    process_noise : float
+        Level of process noise that is assumed, in multiples of the system's scale per second.
+    """
+
+    artifact: Artifact
+    name: str
+    source: str
+    checksum: str
+    precision: str
+    measurement_noise: float | tuple[float, ...]
+    process_noise: float
+
+    @classmethod
+    def read(
+        cls,
+        name_or_path: str | os.PathLike[str],
+        *,
+        precision: str = "float",
+        measurement_noise: float | tuple[float, ...] | None = None,
+        process_noise: float | None = None,
+    ) -> "Exported":
+        """Read an observer that is to be exported.
+
+        Parameters
+        ----------
+        name_or_path : str or PathLike
+            A shipped name, or a ``.safetensors`` file.
+        precision : {"float", "double"}, default "float"
+            As the attribute.
+        measurement_noise : float or tuple of float, length ny, optional
+            As for :class:`observers.KKLObserver`.
+        process_noise : float, optional
+            As for :class:`observers.KKLObserver`.
+
+        Returns
+        -------
+        Exported
+            The observer.
+
+        Raises
+        ------
+        ArtifactError
+            If there is no such observer, its file is damaged, or a number of it is beyond the range of floats.
+        ValueError
+            If the precision is unknown, or a level of noise is out of range.
+        """
+        choice("precision", precision, PRECISIONS)
+        text, path = os.fspath(name_or_path), resolve(name_or_path)
+        artifact = Artifact.read(path)
+        observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
+        exported = cls(
+            artifact,
+            name=identifier(path.stem if text.endswith(path.suffix) else text),
+            source=path.name,
+            checksum=checksum(path, ArtifactError),
+            precision=precision,
+            measurement_noise=observer.measurement_noise,
+            process_noise=observer.process_noise,
+        )
+        if precision == "float":
+            exported._check_range()
+        return exported
+
+    def _check_range(self) -> None:
+        largest = max(float(np.abs([*inverse.x_offset, *inverse.x_scale]).max()) for inverse in self.maps.values())
+        if largest > float(np.finfo(np.float32).max):
+            raise ArtifactError(
+                f"the scale of the estimates of {self.source}, {largest:g}, is beyond the range of floats: export it "
+                "with --precision double"
+            )
+
+    @property
+    def maps(self) -> dict[str, InverseMap]:
+        """The inverse maps by their names: "driven", and where there is one "free", of motion without input."""
+        free = self.artifact.free_inverse
+        return {"driven": self.artifact.inverse} | ({} if free is None else {"free": free})
+
+    @property
+    def levels(self) -> tuple[float, ...]:
+        """What is assumed of measurement noise: nothing, one level for all outputs, or one for each of several."""
+        rows = {inverse.noise_gain.ndim == 2 for inverse in self.maps.values()}
+        if True in rows:
+            return tuple(np.broadcast_to(self.measurement_noise, self.artifact.ny).tolist())
+        told = any(
+            "measurement_noise" in inverse.features or inverse.noise_gain.any() for inverse in self.maps.values()
+        )
+        return (float(np.max(self.measurement_noise)),) if told else ()
+
+    @property
+    def told_process_noise(self) -> bool:
+        """Whether the maps are told the level of process noise."""
+        return self.artifact.process_noise_max is not None
+
+    @property
+    def last_age(self) -> int:
+        """Samples since the first after which the age no longer matters; 0 if it never does."""
+        ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
+        return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
+
+    @property
+    def estimates(self) -> list[str]:
+        """Names of what is estimated: states, then parameters."""
+        artifact = self.artifact
+        if artifact.signals is not None:
+            states = list(artifact.signals["hidden"])
+        else:
+            system = SYSTEMS.get(artifact.system)
+            states = list(system.state_names) if system else _numbered("x", artifact.nx)
+        return [*states, *artifact.estimated_parameters]
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the measured outputs."""
+        signals = self.artifact.signals
+        return _numbered("y", self.artifact.ny) if signals is None else list(signals["measured"])
+
+    @property
+    def inputs(self) -> list[str]:
+        """Names of the known inputs."""
+        signals = self.artifact.signals
+        return _numbered("u", self.artifact.nu) if signals is None else list(signals["inputs"])
+
+
+def identifier(name: str) -> str:
+    """Make an identifier of C of an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``.
+
+    Parameters
+    ----------
+    name : str
+        Any text.
+
+    Returns
+    -------
+    str
+        Letters of ASCII, digits and underscores, a letter first.
+    """
+    word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+    return word if word[:1].isalpha() else f"observer_{word}".rstrip("_")
+
+
+def _numbered(letter: str, count: int) -> list[str]:
+    return [letter] if count == 1 else [f"{letter}{i}" for i in range(1, count + 1)]

@@ -1,0 +1,123 @@
+"""What was found as a table, as a file and as a figure."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from rich.table import Column, Table
+
+from observers.storage import replacing, write
+from training.checking.finding import percent
+from training.evaluation.levels import Level, as_cell, show_level
+from training.neighbours import RESOLUTION
+from training.observable.found import Observability
+
+COLOURS = {"determined": "green", "up": "cyan", "partly": "yellow", "not": "bold red", "never": "bold red"}
+LEAST_SHOWN = 1e-4  # in the figure
+
+
+def table(found: Observability, title: str) -> Table:
+    """What is said of each hidden signal, for people.
+
+    Parameters
+    ----------
+    found : Observability
+        To be shown.
+    title : str
+        What was looked at.
+
+    Returns
+    -------
+    Table
+        A row for each signal.
+    """
+    given = " and ".join(", ".join(names) for names in (found.measured, found.inputs) if names)
+    out = Table(
+        "signal",
+        "from",
+        Column("verdict", no_wrap=True),
+        *map(_column, found.noise),
+        "linear",
+        title=f"{title}\nwhat follows from {given}",
+        caption="rms error that is left, in standard deviations of the signal; a constant leaves 100 %; linear: what a "
+        "regression on z leaves without noise",
+    )
+    equations = [i for i in range(1, len(found.noise)) if found.least is not None]
+    for i in equations:
+        out.add_column(f"equations, {_column(found.noise[i])}")
+    for row, judged in enumerate(found.judgements):
+        least = [] if found.least is None else [_percent(found.least[i, row]) for i in equations]
+        colour = COLOURS[judged.verdict.split()[0]]
+        out.add_row(
+            judged.signal,
+            _window(judged.window, found.dt),
+            f"[{colour}]{judged.verdict}[/{colour}]",
+            *map(_percent, judged.errors),
+            _percent(judged.linear),
+            *least,
+        )
+    return out
+
+
+def _column(level: Level) -> str:
+    return f"noise {show_level(level)}" if np.any(level) else "no noise"
+
+
+def _window(window: int | None, dt: float) -> str:
+    if window is None:
+        return "–"
+    return "y alone" if window == 0 else f"{window} step{'s' * (window > 1)} ({window * dt:.3g} s)"
+
+
+def _percent(share: float) -> str:
+    if np.isnan(share):
+        return "–"
+    return percent(share) if share >= RESOLUTION else f"< {percent(RESOLUTION)}"
+
+
+def save(found: Observability, folder: Path, title: str) -> None:
+    """Write observability.csv and observability.png.
+
+    Parameters
+    ----------
+    found : Observability
+        To be written.
+    folder : Path
+        Where; created if missing.
+    title : str
+        What was looked at.
+    """
+    rows = [
+        (name, as_cell(level), window, window * found.dt, found.errors[k, m, i])
+        + ((found.linear[m, i], found.changes[m, i]) if k == 0 else (np.nan, np.nan))
+        for i, name in enumerate(found.hidden)
+        for k, level in enumerate(found.noise)
+        for m, window in enumerate(found.windows)
+    ]
+    columns = ["signal", "measurement_noise", "steps", "seconds", "error", "linear", "change"]
+    write(folder / "observability.csv", pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.6g"))
+    with replacing(folder / "observability.png") as temporary:
+        _draw(found, temporary, title)
+
+
+def _draw(found: Observability, path: Path, title: str) -> None:
+    """Errors against windows, a plot for each signal."""
+    from matplotlib.figure import Figure
+
+    n = len(found.hidden)
+    columns = min(n, 3)
+    figure = Figure(figsize=(4.5 * columns + 0.5, 3.5 * -(-n // columns)), layout="constrained")
+    figure.suptitle(title)
+    axes = figure.subplots(-(-n // columns), columns, squeeze=False, sharey=True).ravel()
+    for i, ax in enumerate(axes):
+        ax.set_visible(i < n)
+    for i, (ax, judged) in enumerate(zip(axes, found.judgements)):
+        for level, errors in zip(found.noise, found.errors):
+            ax.plot(found.windows, 100 * np.maximum(errors[:, i], LEAST_SHOWN), "o-", ms=3, label=_column(level))
+        ax.plot(found.windows, 100 * np.maximum(found.linear[:, i], LEAST_SHOWN), "k:", label="linear, no noise")
+        ax.plot(found.windows, 100 * np.maximum(found.changes[:, i], LEAST_SHOWN), "k--", label="its change, no noise")
+        ax.set_xscale("symlog", linthresh=1)
+        ax.set(yscale="log", xlabel="steps back", title=f"{judged.signal}: {judged.verdict}")
+    axes[0].set_ylabel("error in % of the standard deviation")
+    axes[0].legend(fontsize="small")
+    figure.savefig(path, dpi=110)
