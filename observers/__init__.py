@@ -6,6 +6,7 @@ from observers.filter import LinearFilter
 from observers.monitor import Limits, Monitor
 from observers.network import MLP
 from observers.observer import KKLObserver, load
+from observers.spread import Spread
 
 __all__ = [
     "MLP",
@@ -18,6 +19,7 @@ __all__ = [
     "Limits",
     "LinearFilter",
     "Monitor",
+    "Spread",
     "load",
     "shipped",
 ]

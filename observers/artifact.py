@@ -20,10 +20,12 @@ from observers.expression import Expression
 from observers.filter import LinearFilter
 from observers.monitor import Limits
 from observers.network import MLP
+from observers.spread import Spread
 
 # The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
-# each of several outputs, the fourth maps that estimate parameters too; the others are still written as the first.
-FORMATS = (1, 2, 3, 4)
+# each of several outputs, the fourth maps that estimate parameters too, the fifth maps with error bars; the others are
+# still written as the first.
+FORMATS = (1, 2, 3, 4, 5)
 FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
 _CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
@@ -35,6 +37,7 @@ _LIMITS = ("levels", "mean", "low", "high")
 _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 _FORWARD_ARRAYS = ("x_offset", "x_scale", "z_offset", "z_scale")
 _INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
+_SPREAD_ARRAYS = ("levels", "ages", "factors")
 # Scalars of an inverse map, and what the files call them.
 _SCALARS = {
     "measurement_noise_unit": "noise_unit",
@@ -140,12 +143,14 @@ class InverseMap:
         Seconds that count as one.
     age_max : float, default 0
         Seconds after which the age no longer matters.
+    spread : Spread, optional
+        The covariance of the state's error, where it was learned.
 
     Raises
     ------
     ArtifactError
-        If a shape does not fit the network, which has no outputs, a unit is not positive and finite, or nor is the end
-        of what is told.
+        If a shape does not fit the network, which has no outputs, or the spread does not, a unit is not positive and
+        finite, or nor is the end of what is told.
     """
 
     mlp: MLP
@@ -161,6 +166,7 @@ class InverseMap:
     process_noise_max: float = math.inf
     age_unit: float = 1.0
     age_max: float = 0.0
+    spread: Spread | None = None
 
     def __post_init__(self) -> None:
         if self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
@@ -194,6 +200,16 @@ class InverseMap:
         if not nx:
             raise ArtifactError("a map must estimate one state at least, its network has no outputs")
         _check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
+        spread = self.spread
+        if spread is not None and spread.mlp.inputs != self.mlp.inputs:
+            raise ArtifactError(
+                f"error bars of {spread.mlp.inputs} inputs do not fit a network of {self.mlp.inputs} inputs"
+            )
+        told = spread is not None and "measurement_noise" in self.features
+        if spread is not None and (not told or (spread.factors.ndim == 3) != ("process_noise" in self.features)):
+            raise ArtifactError(
+                f"error bars with factors of shape {spread.factors.shape} do not fit a map that is told {self.features}"
+            )
 
     def _each(self, name: str) -> tuple[Any, ...]:
         """A unit or an end: of each output where noise_gain has rows, else the only one there is."""
@@ -223,7 +239,8 @@ class InverseMap:
         if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
             return self
         x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
-        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale)
+        spread = self.spread if self.spread and range(self.spread.nx) == range(self.mlp.outputs)[outputs] else None
+        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, spread=spread)
 
     def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
         """Cut levels of measurement noise at the largest that the map is told.
@@ -257,6 +274,12 @@ class InverseMap:
         """What the whitened modes are multiplied with at these standard deviations of the noise, shape (modes,)."""
         sigma = np.reshape(measurement_noise, (-1, 1))
         return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
+
+    def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> tuple[float, float]:
+        """Return levels of noise in multiples of the highest that the map is told, of the noisiest output."""
+        return float(np.max(np.divide(measurement_noise, self.measurement_noise_max))), (
+            process_noise / self.process_noise_max
+        )
 
     def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
         """Return what the network is told of noise.
@@ -387,6 +410,11 @@ class Artifact:
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
         if free is not None and _process(free) != _process(self.inverse):
             raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
+        if free is not None and (free.spread is None) != (self.inverse.spread is None):
+            raise ArtifactError("of the maps of free and of driven motion one has error bars and the other has none")
+        for spread in (self.inverse.spread, None if free is None else free.spread):
+            if spread is not None and spread.nx != self.nx:
+                raise ArtifactError(f"error bars of {spread.nx} states do not fit {self.nx} states")
         if self.forward is not None and (self.forward.mlp.inputs, self.forward.mlp.outputs) != (self.nx, nz):
             raise ArtifactError(
                 f"a forward map of {self.forward.mlp.inputs} states to {self.forward.mlp.outputs} values "
@@ -549,6 +577,27 @@ class Artifact:
             )
         return self.forward
 
+    def require_spread(self) -> Spread:
+        """Return the error bars of T_inv.
+
+        Returns
+        -------
+        Spread
+            Those of :attr:`inverse`.
+
+        Raises
+        ------
+        ArtifactError
+            If none were learned; the message says how to.
+        """
+        if self.inverse.spread is None:
+            way = "kkl-gym errorbars NAME_OR_FILE learns them, and writes a map that has them"
+            raise ArtifactError(
+                f"this map for {self.system!r} holds no error bars; "
+                + (way if self.signals is None else "there are none yet for observers from recorded states")
+            )
+        return self.inverse.spread
+
     @property
     def process_noise_max(self) -> float | None:
         """The highest level of process noise that the map was trained for; None if it is not told the level."""
@@ -616,7 +665,13 @@ class Artifact:
             If JSON cannot hold ``training``, ``versions`` or a number.
         """
         tensors = {"A": self.filter.A, "B": self.filter.B}
-        told = (self.process_noise_max is not None, self.inverse.noise_gain.ndim == 2, bool(self.estimated_parameters))
+        inverse = self.inverse
+        told = (
+            self.process_noise_max is not None,
+            inverse.noise_gain.ndim == 2,
+            bool(self.estimated_parameters),
+            inverse.spread is not None,
+        )
         level = max(number * there for number, there in enumerate(told, 1))
         described: dict[str, Any] = {
             "format": FORMATS[level],
@@ -624,7 +679,7 @@ class Artifact:
             "dt": self.filter.dt,
             "inputs": self.filter.nu,
             "holds": _HOLDS,
-            "inverse": _put_inverse(tensors, "inverse", self.inverse),
+            "inverse": _put_inverse(tensors, "inverse", inverse),
             "training": dict(self.training),
             "versions": dict(self.versions),
         }
@@ -743,11 +798,21 @@ def _put_inverse(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMa
         "features": list(inverse.features),
         "activation": inverse.mlp.activation,
         **{name: value for name, value in scalars.items() if np.isfinite(value).all()},
+        **_put_spread(tensors, f"{prefix}.spread.", inverse.spread),
     }
 
 
+def _put_spread(tensors: dict[str, np.ndarray], prefix: str, spread: Spread | None) -> dict[str, Any]:
+    """Add the arrays of error bars, where there are any; returns what describes them."""
+    if spread is None:
+        return {}
+    storage.put_mlp(tensors, prefix, spread.mlp)
+    tensors |= {f"{prefix}{name}": np.asarray(getattr(spread, name), dtype=float) for name in _SPREAD_ARRAYS}
+    return {"spread": {"activation": spread.mlp.activation}}
+
+
 def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:
-    unknown = set(described) - {"activation", "features", *_SCALARS.values()}
+    unknown = set(described) - {"activation", "features", "spread", *_SCALARS.values()}
     if unknown:
         raise ArtifactError(f"its map {prefix} has settings that nobody knows: {', '.join(sorted(unknown))}")
     features = tuple(described["features"])
@@ -759,7 +824,12 @@ def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapp
     arrays: dict[str, Any] = {name: tensors[f"{prefix}.{name}"] for name in _INVERSE_ARRAYS}
     scalars = {name: described[key] for name, key in _SCALARS.items() if key in described}
     scalars = {name: tuple(value) if isinstance(value, list) else value for name, value in scalars.items()}
-    return InverseMap(mlp, features, **arrays, **scalars)
+    spread = None
+    if "spread" in described:
+        own = f"{prefix}.spread."
+        network = storage.get_mlp(tensors, own, described["spread"]["activation"])
+        spread = Spread(network, *(tensors[f"{own}{name}"] for name in _SPREAD_ARRAYS))
+    return InverseMap(mlp, features, **arrays, **scalars, spread=spread)
 
 
 def shipped() -> dict[str, str]:

@@ -2,15 +2,17 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact, ArtifactError, InverseMap, resolve
+from observers.artifact import Artifact, ArtifactError, resolve
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.decoder import Decoders, Read
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
+from observers.spread import deviations
 
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
@@ -70,6 +72,7 @@ class KKLObserver:
         self._monitored = bool(monitor)
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
+        self._read: Read | None  # what the networks were given for the last estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -92,7 +95,8 @@ class KKLObserver:
         monitor = Monitor(limits, level, self.artifact.filter.dt) if self._monitored and limits else None
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
-        self._measurement_noise, self._monitor, self._x_hat = level, monitor, None
+        self._measurement_noise, self._monitor = level, monitor
+        self._x_hat, self._read = None, None
         self._tell()
 
     @property
@@ -102,7 +106,7 @@ class KKLObserver:
 
     @process_noise.setter
     def process_noise(self, level: float | None) -> None:
-        self._process_noise, self._x_hat = self._level(level), None
+        self._process_noise, self._x_hat, self._read = self._level(level), None, None
         self._tell()
 
     def _level(self, process_noise: float | None) -> float:
@@ -116,11 +120,10 @@ class KKLObserver:
         self._states = self._decoders(slice(nx))
         self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
 
-    def _decoders(self, outputs: slice) -> "_Decoders":
+    def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
-        levels, free = (self._measurement_noise, self._process_noise), self.artifact.free_inverse
-        driven = _Decoder(self.artifact.inverse.part(outputs), *levels)
-        return _Decoders(driven, None if free is None else _Decoder(free.part(outputs), *levels))
+        level, process_noise = self._measurement_noise, self._process_noise
+        return Decoders.of(self.artifact, outputs, measurement_noise=level, process_noise=process_noise)
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
@@ -181,7 +184,7 @@ class KKLObserver:
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1], first=True)
         z0, age = self._start(y0, x0)
-        self._z, self._y, self._age, self._x_hat = z0, y0, age, None
+        self._z, self._y, self._age, self._x_hat, self._read = z0, y0, age, None, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -257,7 +260,7 @@ class KKLObserver:
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, age, self._age)
-        self._x_hat = None
+        self._x_hat, self._read = None, None
         if self._monitor is not None:
             self._monitor.restart(rows)
 
@@ -331,7 +334,7 @@ class KKLObserver:
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
-        self._x_hat = None
+        self._x_hat, self._read = None, None
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]
@@ -359,15 +362,13 @@ class KKLObserver:
         ValueError
             If ``rows`` does not fit the batch.
         """
-        if self._z is None:
-            raise RuntimeError("call reset(y0) before the observer is used")
-        z, age = self._z, self._age
-        if rows is not None:
-            rows = bool_array("rows", rows, z.shape[:-1])
-            z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
+        z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        return self._states(z, age * self.artifact.filter.dt)
+        read = self._states.read(z, age)
+        if rows is None:
+            self._read = read
+        return self._states.mean(read)
 
     @property
     def parameters_hat(self) -> np.ndarray:
@@ -386,7 +387,65 @@ class KKLObserver:
             raise RuntimeError("call reset(y0) before the observer is used")
         return self._identifier()(self._z, self._age * self.artifact.filter.dt)
 
-    def _identifier(self) -> "_Decoders":
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of the estimate's error x - x_hat as things stand, shape (..., nx, nx).
+
+        It is that of the errors in the runs that the map was calibrated on, given all that the map is told: z, the
+        levels of noise and the age. Nine errors in ten there lie where (x - x_hat)^T P^-1 (x - x_hat) is below the
+        90 % quantile of the chi-square distribution with nx degrees of freedom. On another plant, under a faulty
+        sensor or far from the training it says too little. Nothing is computed until it is asked for.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        ArtifactError
+            If the artifact holds no error bars. It is a ValueError.
+        """
+        return self.decode_covariance()
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviation of each state's error, shape (..., nx): the roots of :attr:`covariance`'s diagonal."""
+        return deviations(self.covariance)
+
+    def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
+        """Return the covariance of what :meth:`decode` returns; it is quicker right after that, of all rows.
+
+        Parameters
+        ----------
+        rows : ndarray of bool, shape (...,), optional
+            The rows of the batch that are meant, by default all.
+
+        Returns
+        -------
+        ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
+            As :attr:`covariance`.
+
+        Raises
+        ------
+        RuntimeError
+            Before :meth:`reset`.
+        ValueError
+            If ``rows`` does not fit the batch, or the artifact holds no error bars.
+        """
+        self.artifact.require_spread()
+        if rows is not None or self._read is None:
+            return self._states.covariance(self._states.read(*self._moment(rows)))
+        return self._states.covariance(self._read)
+
+    def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
+        """The filter's state and its age in seconds, of some rows."""
+        if self._z is None:
+            raise RuntimeError("call reset(y0) before the observer is used")
+        z, age = self._z, self._age
+        if rows is not None:
+            rows = bool_array("rows", rows, z.shape[:-1])
+            z, age = z[rows], np.broadcast_to(age, rows.shape)[rows]
+        return z, age * self.artifact.filter.dt
+
+    def _identifier(self) -> Decoders:
         if self._parameters is None:
             raise ValueError(
                 f"this observer for {self.artifact.system!r} estimates no parameters: train one that does "
@@ -436,7 +495,7 @@ class KKLObserver:
         ValueError
             As :meth:`reset` and :meth:`step`.
         """
-        return self._along(y, u, decoders=self._states, x0=x0)
+        return self._along(y, u, of=self._states, x0=x0)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Estimate the system's uncertain parameters along a whole record.
@@ -458,12 +517,44 @@ class KKLObserver:
         ValueError
             As :meth:`estimate`, and if the artifact estimates no parameters.
         """
-        return self._along(y, u, decoders=self._identifier())
+        return self._along(y, u, of=self._identifier())
+
+    def estimate_covariance(
+        self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Covariances of the errors of what :meth:`estimate` returns.
+
+        Parameters
+        ----------
+        y : array_like, shape (steps, ..., ny)
+            Outputs, as for :meth:`estimate`.
+        u : array_like, shape (steps - 1, ..., nu), optional
+            Inputs, as there.
+        x0 : array_like, shape (..., nx), optional
+            The state at y_0, as there.
+
+        Returns
+        -------
+        ndarray, shape (steps, ..., nx, nx)
+            What :attr:`covariance` would be at each sample.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`estimate`, and if the artifact holds no error bars.
+        """
+        self.artifact.require_spread()
+        return self._along(y, u, of=self._states.covariances, x0=x0)
 
     def _along(
-        self, y: np.ndarray, u: np.ndarray | None, *, decoders: "_Decoders", x0: np.ndarray | None = None
+        self,
+        y: np.ndarray,
+        u: np.ndarray | None,
+        *,
+        of: Callable[[np.ndarray, Any], np.ndarray],
+        x0: np.ndarray | None = None,
     ) -> np.ndarray:
-        """What decoders make of the filter's states along a record."""
+        """What a function of the filter's states and their ages gives along a record."""
         y = real_array("y", y)
         if y.ndim < 2 or not len(y):
             raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
@@ -477,7 +568,7 @@ class KKLObserver:
             if u.ndim < 1 or len(u) not in (steps - 1, steps):
                 raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
         linear = self.artifact.filter
-        out = np.empty((*y.shape[:-1], decoders.outputs))
+        out: np.ndarray | None = None
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
         z, age0 = self._start(y[0], x0)
         for first in range(0, steps, rows):
@@ -491,7 +582,10 @@ class KKLObserver:
                     z = linear.advance(z, y[k - 1], held, y[k])
                 record[i] = z
             age = (age0 + np.arange(first, first + count)) * linear.dt
-            out[first : first + count] = decoders(record, age.reshape(count, *(1 for _ in batch)))
+            found = of(record, age.reshape(count, *(1 for _ in batch)))
+            out = np.empty((steps, *found.shape[1:])) if out is None else out
+            out[first : first + count] = found
+        assert out is not None  # there is one sample at least
         return out
 
     def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
@@ -542,57 +636,6 @@ class KKLObserver:
         if not all_finite(u):
             raise ValueError("u holds NaN, infinity or values beyond 1e15")
         return u
-
-
-class _Decoders:
-    """The map of driven motion and, where there is one, that of free motion: each is asked where it holds."""
-
-    def __init__(self, driven: "_Decoder", free: "_Decoder | None") -> None:
-        self._driven, self._free, self.outputs = driven, free, driven.outputs
-
-    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        if self._free is None:
-            return self._driven(z, age)
-        nz = self._free.size  # behind it lies z_u, exactly 0 until an input acts
-        if z.ndim == 1:  # a single sample: every call of numpy would be felt
-            return self._driven(z, age) if any(z[nz:].tolist()) else self._free(z[:nz], age)
-        driven = z[..., nz:].any(-1)
-        if driven.all():
-            return self._driven(z, age)
-        if not driven.any():
-            return self._free(z[..., :nz], age)
-        age = np.broadcast_to(age, driven.shape)
-        out = np.empty((*driven.shape, self.outputs))
-        out[driven] = self._driven(z[driven], age[driven])
-        out[~driven] = self._free(z[~driven][:, :nz], age[~driven])
-        return out
-
-
-class _Decoder:
-    """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
-
-    def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
-        self._inverse = inverse
-        self.size, self.outputs = inverse.whiten.shape[1], inverse.mlp.outputs
-        self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
-        self._offset = -inverse.z_offset @ self._whiten
-        self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
-
-    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
-        inverse, conditions = self._inverse, self._conditions
-        modes = z @ self._whiten
-        modes += self._offset
-        if inverse.features[-1] == "age":
-            conditions = [*conditions, inverse.age_feature(age)]
-        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
-            inputs = np.array([*modes.tolist(), *conditions], dtype=np.float32)
-        else:
-            width = modes.shape[-1]
-            inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
-            inputs[..., :width] = modes
-            for i, condition in enumerate(conditions):
-                inputs[..., width + i] = condition
-        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
 
 
 def load(

@@ -24,6 +24,7 @@ COMMANDS = {
     "train": ("train", "Train"),
     "identify": ("identify", "Identify"),
     "adapt": ("identify", "Adapt"),
+    "errorbars": ("errorbars", "ErrorBars"),
     "evaluate": ("evaluate", "Evaluate"),
     "benchmark": ("benchmark", "Benchmark"),
     "agent": ("agent", "AgentCommand"),

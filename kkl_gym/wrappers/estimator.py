@@ -12,6 +12,7 @@ from kkl_gym.plant import Plant
 from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.artifact import resolve
 from observers.checks import choice, flag
+from observers.spread import deviations
 
 
 class Estimator(Protocol):
@@ -116,6 +117,8 @@ class KKLEstimator:
         Whether to keep the score.
     known_start : bool
         Whether the observer is told the true state at the start of an episode, and only there.
+    uncertainty : bool
+        Whether standard deviations are shown behind the state estimate.
 
     Attributes
     ----------
@@ -129,11 +132,11 @@ class KKLEstimator:
     Raises
     ------
     ValueError
-        If ``estimate`` is unknown, a flag is no bool, no map ships for the system, or the noise level is beyond the
-        map's range.
+        If ``estimate`` is unknown, a flag is no bool, no map ships for the system, the noise level is beyond the
+        map's range, or ``uncertainty`` is asked for beside z.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map and ``known_start`` is asked for.
+        forward map and ``known_start`` is asked for, or no error bars and ``uncertainty``.
     """
 
     def __init__(
@@ -146,8 +149,10 @@ class KKLEstimator:
         ignore_input: bool,
         monitor: bool,
         known_start: bool,
+        uncertainty: bool,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
+        self._uncertainty = flag("uncertainty", uncertainty)
         self._ignore_input = flag("ignore_input", ignore_input)
         self._known_start = flag("known_start", known_start)
         self._monitor = flag("monitor", monitor)
@@ -158,11 +163,22 @@ class KKLEstimator:
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if known_start:
             artifact.require_forward()  # an error now, not at the first reset
+        self._require_error_bars(artifact, estimate)
         noise = plant.measurement_noise if measurement_noise is None else measurement_noise
         self.observer = KKLObserver(artifact, noise, process_noise=plant.process_noise, monitor=monitor)
         self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
+        if uncertainty:
+            low, high = with_deviations(plant.state_space.low, plant.state_space.high)
+            self.space = gym.spaces.Box(low, high, dtype=np.float32)
+
+    def _require_error_bars(self, artifact: Artifact, estimate: str) -> None:
+        """Raise ValueError if standard deviations are to be shown, and cannot."""
+        if self._uncertainty and estimate != "x":
+            raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {estimate!r}")
+        if self._uncertainty:
+            artifact.require_spread()
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
         """Take other maps for the same filter, which goes on.
@@ -177,11 +193,13 @@ class KKLEstimator:
         ValueError
             As :meth:`observers.KKLObserver.replace`.
         observers.ArtifactError
-            If it differs in more than its maps, or holds no forward map and starts are known.
+            If it differs in more than its maps, or holds no forward map and starts are known, or no error bars and
+            they are shown.
         """
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
             artifact.require_forward()
+        self._require_error_bars(artifact, self.estimate)
         self.observer.replace(artifact)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
@@ -267,13 +285,15 @@ class KKLEstimator:
         Returns
         -------
         dict of str to ndarray
-            ``z``, and ``x_hat`` if it is shown, with ``parameters_hat`` beside it if the map estimates parameters: with
-            ``estimate="z"`` the network is not evaluated. ``score`` with a
-            monitor, which evaluates the network in any case.
+            ``z``, and ``x_hat`` if it is shown, with ``x_cov`` beside it if standard deviations are, and
+            ``parameters_hat`` if the map estimates parameters: with ``estimate="z"`` the network is not evaluated.
+            ``score`` with a monitor, which evaluates the network in any case.
         """
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
             found["x_hat"] = self.observer.decode(rows)
+            if self._uncertainty:
+                found["x_cov"] = self.observer.decode_covariance(rows)
             if self.observer.artifact.estimated_parameters:
                 found["parameters_hat"] = self.observer.parameters_hat[... if rows is None else rows]
         if self._monitor:
@@ -291,8 +311,10 @@ class KKLEstimator:
         Returns
         -------
         ndarray, shape (..., width)
-            x_hat or z, not yet clipped.
+            x_hat or z, not yet clipped; behind x_hat its standard deviations if they are shown.
         """
+        if self._uncertainty:
+            return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
 
 
@@ -312,6 +334,23 @@ def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
         A copy.
     """
     return clipped(values, space.low, space.high)
+
+
+def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of states and of their standard deviations behind them, which are no larger than the bounds are wide.
+
+    Parameters
+    ----------
+    low, high : ndarray, shape (nx,)
+        Bounds of the states.
+
+    Returns
+    -------
+    low, high : ndarray, shape (2 nx,)
+        Bounds of both.
+    """
+    with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
+        return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 
 
 def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:

@@ -9,7 +9,7 @@ import numpy as np
 from kkl_gym.identity import check_identity, source_of
 from kkl_gym.named import InputReader, Reader, observed, resolved
 from kkl_gym.signals import Inputs
-from kkl_gym.wrappers.estimator import KKLEstimator, reach
+from kkl_gym.wrappers.estimator import KKLEstimator, reach, with_deviations
 from observers import Artifact, ArtifactError, KKLObserver
 from observers.checks import choice, flag
 
@@ -33,6 +33,8 @@ class NamedEstimator(KKLEstimator):
         Whether to keep the score.
     known_start : bool
         Refused where it is True, as no map from rollouts has T.
+    uncertainty : bool
+        Whether standard deviations are shown behind the estimates.
 
     Attributes
     ----------
@@ -58,6 +60,7 @@ class NamedEstimator(KKLEstimator):
         measurement_noise: float | Sequence[float] | None,
         monitor: bool,
         known_start: bool,
+        uncertainty: bool,
     ) -> None:
         choice("estimate", estimate, ("x", "z"))
         self._monitor, self._known_start, self._blind = (
@@ -65,7 +68,9 @@ class NamedEstimator(KKLEstimator):
             flag("known_start", known_start),
             False,
         )
+        self._uncertainty = flag("uncertainty", uncertainty)
         check_identity(artifact, env)
+        self._require_error_bars(artifact, estimate)
         if known_start:
             artifact.require_forward()
         self.observer = KKLObserver(artifact, measurement_noise, monitor=monitor)
@@ -78,6 +83,8 @@ class NamedEstimator(KKLEstimator):
         measured, inputs = self.samples.outputs, self.samples.inputs
         if estimate == "x":
             low, high = _bounds(artifact, observation_space)
+            if uncertainty:
+                low, high = with_deviations(low, high)
         else:
             with np.errstate(over="ignore"):
                 high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)

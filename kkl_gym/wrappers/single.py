@@ -80,6 +80,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     known_start : bool
         Whether the observer is told the true state ``info["x"]`` at reset, and only there. It then has no transient.
         Only maps with a forward map T can use it: ``observer="SYSTEM-spinn"``.
+    uncertainty : bool
+        Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
+        ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with error bars, which
+        ``kkl-gym errorbars`` makes.
 
     Attributes
     ----------
@@ -97,7 +101,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map and ``known_start`` is asked for. It is a ValueError.
+        forward map and ``known_start`` is asked for, or no error bars and ``uncertainty``. It is a ValueError.
 
     Examples
     --------
@@ -123,6 +127,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,
+        uncertainty: bool = False,
     ) -> None:
         if not isinstance(env, gym.Env):
             raise ValueError(
@@ -141,6 +146,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 measurement_noise=measurement_noise,
                 monitor=monitor,
                 known_start=known_start,
+                uncertainty=uncertainty,
             )
             samples = estimator.samples
         elif isinstance(base, KKLEnv):
@@ -152,6 +158,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 ignore_input=ignore_input,
                 monitor=monitor,
                 known_start=known_start,
+                uncertainty=uncertainty,
             )
             samples = _SystemSamples()
         else:
@@ -168,6 +175,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             ignore_input=bool(ignore_input),
             monitor=bool(monitor),
             known_start=bool(known_start),
+            uncertainty=bool(uncertainty),
         )
         gym.Wrapper.__init__(self, env)
         self._estimator, self._samples = estimator, samples

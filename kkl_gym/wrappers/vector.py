@@ -297,6 +297,8 @@ class KKLVectorObservation(VectorEstimate):
         Whether to keep the score.
     known_start : bool
         As for :class:`kkl_gym.KKLObservation`, at the start of each row's episodes.
+    uncertainty : bool
+        As for :class:`kkl_gym.KKLObservation`; ``info["x_cov"]`` has the shape (num_envs, nx, nx).
 
     Attributes
     ----------
@@ -335,6 +337,7 @@ class KKLVectorObservation(VectorEstimate):
         ignore_input: bool = False,
         monitor: bool = False,
         known_start: bool = False,
+        uncertainty: bool = False,
     ) -> None:
         artifact = None if observer is None else Artifact.read(resolve(observer))
         estimator: KKLEstimator
@@ -348,6 +351,7 @@ class KKLVectorObservation(VectorEstimate):
                 measurement_noise=measurement_noise,
                 monitor=monitor,
                 known_start=known_start,
+                uncertainty=uncertainty,
             )
             env = _Telling(env, estimator.samples)
         else:
@@ -359,6 +363,7 @@ class KKLVectorObservation(VectorEstimate):
                 ignore_input=ignore_input,
                 monitor=monitor,
                 known_start=known_start,
+                uncertainty=uncertainty,
             )
             if estimator.observer.artifact.process_noise_max is not None:
                 plant_of(env, "process_noise")

@@ -376,6 +376,7 @@ def wrappers():
             ("ignore_input", "ignore_input", True, means.flag),
             ("monitor", "monitor", True, means.flag),
             ("known_start", "known_start|forward map T", False, means.flag),
+            ("uncertainty", "uncertainty|error bars", False, means.flag),
         ):
             yield Entry(
                 WRAPPERS,

@@ -14,6 +14,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from observers import Artifact
 from observers.storage import write
+from training.commands.coverage import coverage_table, default_levels, draw, judged
 from training.commands.options import (
     NoiseLevels,
     Observers,
@@ -92,6 +93,10 @@ class Evaluate:
     ekf: bool = False
     """Beside each observer, an extended Kalman filter that knows the equations, the inputs and the levels of noise.
     On another plant it knows those of the observer's model."""
+    calibration: bool = False
+    """In place of errors, say whether error bars are true: how many errors lie in regions of 50, 90 and 99 %, of all
+    states and of each, and the mean of their normalised squares (NEES); by default at six levels of noise. With --csv
+    there is a figure beside the file."""
     csv: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="(default: no file)")] = None
     """File to which the errors of each trajectory are written as well."""
 
@@ -123,13 +128,16 @@ class Evaluate:
         observers = [(*found, self._plant(found[-1])) for found in read_observers(self.observers, self.system)]
         with progress_bars(console) as progress:
             for name, artifact, system, plant in observers:
-                frames += self._evaluate(name, artifact, system, plant, progress)
+                judge = self._calibration if self.calibration else self._evaluate
+                frames += judge(name, artifact, system, plant, progress)
         if not frames:
             raise ValueError(f"nothing is left to evaluate of {', '.join(self.observers)}: the lines above say why")
         found = pd.concat(frames, ignore_index=True)
         if self.csv:
             write(self.csv, found.to_csv(index=False, float_format="%.6g"))
             console.print(f"wrote {self.csv}")
+        if self.csv and self.calibration:
+            draw(self.csv.with_suffix(".png"), found)
         return found
 
     def _plant(self, system: System) -> System | None:
@@ -197,6 +205,42 @@ class Evaluate:
         for reason in left_out:
             progress.say(f"{name}, left out: {reason}")
         return frames
+
+    def _calibration(
+        self, name: str, artifact: Artifact, system: System, plant: System | None, progress: ProgressBars
+    ) -> list["pd.DataFrame"]:
+        """Print whether an observer's error bars are true; rows of the CSV file."""
+        import pandas as pd
+
+        artifact.require_spread()
+        duration = system.duration if self.duration is None else self.duration
+        on = f", plant {show_parameters(plant)}" if plant else ""
+        policy = read_policy(artifact, system, self.policy)
+        levels, left_out = self._levels(artifact, system)
+        if self.measurement_noise is None:
+            levels = default_levels(artifact)
+        cases = CASES[: 3 if artifact.nu else 2] if levels else ()
+        rows: list[dict[str, Any]] = []
+        bar = progress.add_task(f"judging the error bars of {name}", total=len(cases) * len(levels))
+        for starts, domain, driven in cases:
+            trajectories = self._trajectories(
+                artifact, system, domain, duration=duration, driven=driven, policy=policy, plant=plant
+            )
+            if isinstance(trajectories, str):
+                left_out.append(f"starts in {starts}{', driven' if driven else ''}: {trajectories}")
+                progress.advance(bar, len(levels))
+                continue
+            for level in levels:
+                found = judged(artifact, system, trajectories, level=level, seed=self.seed, ekf=self.ekf)
+                rows += [{"map": name, "starts": starts, "driven": driven, **row} for row in found]
+                progress.advance(bar)
+        for reason in left_out:
+            progress.say(f"{name}, left out: {reason}")
+        if not rows:
+            return []
+        title = f"{name}: errors in regions, %, {self.trajectories} runs of {duration:g} s{on}"
+        progress.console.print(coverage_table(title, pd.DataFrame(rows), system))
+        return [pd.DataFrame(rows)]
 
     def _parameters(
         self,

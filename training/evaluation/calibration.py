@@ -16,7 +16,7 @@ from training.trajectories.expression import output_expression
 from training.trajectories.noise import draw_process_noise, noisy_output
 from training.trajectories.parameters import blind, with_parameters
 from training.trajectories.policy import under_policy
-from training.trajectories.signals import random_inputs
+from training.trajectories.signals import KINDS, random_inputs
 
 LEVELS = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0)  # of noise, in multiples of the largest that the map is told
 LARGEST = 2.0  # for maps that are not told the noise, in multiples of the usual
@@ -113,6 +113,8 @@ def sound_trajectories(
     duration: float,
     rng: np.random.Generator,
     policy: Controller | None = None,
+    process_noise: float | None = None,
+    kinds: tuple[str, ...] = KINDS,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate trajectories with process noise, every other one under random inputs if the map knows inputs.
 
@@ -132,6 +134,10 @@ def sound_trajectories(
         From which starts, inputs and process noise are drawn.
     policy : callable, optional
         Acts on the system in place of random inputs; every other trajectory is its own, without errors and exploration.
+    process_noise : float, optional
+        Its level, in multiples of the system's scale per second; by default the system's own.
+    kinds : tuple of str
+        Of random inputs, see :func:`training.trajectories.signals.random_inputs`.
 
     Returns
     -------
@@ -147,13 +153,13 @@ def sound_trajectories(
     """
     dt = artifact.filter.dt
     check_duration(duration, dt)
-    steps = round(duration / dt)
+    steps, level = round(duration / dt), system.process_noise if process_noise is None else process_noise
     kept: list[tuple[np.ndarray, np.ndarray]] = []
     while (missing := n - sum(x.shape[1] for x, _ in kept)) > 0:
         u = np.zeros((steps, missing, system.nu))
         if artifact.nu and not policy:
-            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng)
-        w = draw_process_noise(system, system.process_noise, n=missing, steps=steps, rng=rng)
+            u[:, ::2] = random_inputs(system, len(range(0, missing, 2)), steps, dt=dt, rng=rng, kinds=kinds)
+        w = draw_process_noise(system, level, n=missing, steps=steps, rng=rng)
         x0 = system.draw_starts(rng, missing)
         if policy:
             own = np.arange(missing) % 2 == 1

@@ -262,7 +262,7 @@ def errors(
     """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
-    y = _measured(system, trajectories, level, seed)
+    y = measured(system, trajectories, level, seed)
     x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
     return _errors(trajectories, x_hat, artifact.filter.dt, skip)
 
@@ -306,9 +306,8 @@ def kalman_errors(
         If the level of noise is none, or the equations take no symbols.
     """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
-    y = _measured(system, trajectories, level, seed)
-    Q = process_intensity(system, trajectories.process_noise, dt)
-    kalman = ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
+    y = measured(system, trajectories, level, seed)
+    kalman = kalman_filter(system, dt, trajectories.process_noise, level)
     x_hat = np.empty_like(trajectories.x)
     x_hat[0] = kalman.reset(y[0])
     for k in range(1, len(y)):
@@ -316,7 +315,53 @@ def kalman_errors(
     return _errors(trajectories, x_hat, dt, skip)
 
 
-def _measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
+def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:
+    """Make an extended Kalman filter that is told both levels of noise, and assumes a little process noise at least.
+
+    Parameters
+    ----------
+    system : System
+        The model.
+    dt : float
+        Sampling interval in seconds.
+    process_noise : float
+        Its level, in multiples of the system's scale per second.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of the noise on each sample, of all outputs or each.
+
+    Returns
+    -------
+    ExtendedKalmanFilter
+        One that awaits its first samples.
+
+    Raises
+    ------
+    ValueError
+        If the equations take no symbols.
+    """
+    Q = process_intensity(system, process_noise, dt)
+    return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, measurement_noise))
+
+
+def measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
+    """Measure trajectories.
+
+    Parameters
+    ----------
+    system : System
+        What measures, unless there is a plant.
+    trajectories : UnseenTrajectories
+        What is measured.
+    level : float or tuple of float, length ny
+        Standard deviation of the noise on each sample, of all outputs or each.
+    seed : int
+        Seed of the noise.
+
+    Returns
+    -------
+    ndarray, shape (steps + 1, n, ny)
+        Samples.
+    """
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)
 

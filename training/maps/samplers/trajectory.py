@@ -9,7 +9,7 @@ import torch
 from observers import InverseMap, LinearFilter
 from training.config import Scaling
 from training.filter_noise import noise_covariance, root, stationary_covariance
-from training.maps.coordinates import coordinates, settling_time
+from training.maps.coordinates import Coordinates, coordinates, settling_time
 from training.maps.networks import Network, tensor
 from training.maps.samplers.batch import Batch
 from training.maps.scaling import StateScale
@@ -64,6 +64,8 @@ class TrajectorySampler:
         Of states and their errors, see :class:`training.maps.scaling.StateScale`.
     silent : ndarray, shape (size, k), optional
         Directions of z that the network is not to see.
+    like : InverseMap, optional
+        A map whose network is to be given these batches: coordinates, scales, units and ends are then its own.
 
     Attributes
     ----------
@@ -106,6 +108,7 @@ class TrajectorySampler:
         parameters: int = 0,
         scaling: Scaling = "relative",
         silent: np.ndarray | None = None,
+        like: InverseMap | None = None,
     ) -> None:
         m, n, size = data.z.shape
         ny = linear.B.shape[1]
@@ -123,9 +126,11 @@ class TrajectorySampler:
         self.parameters = parameters
         self.scale = StateScale.of(data.x, scaling, nx=data.x.shape[-1] - parameters)
         self.process_noise_max = process_noise_max
-        self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self.age_max = float(min(data.ages[-1] * linear.dt, settling_time(linear)))
         self.age_unit = AGE_UNIT * linear.dt
+        if like is not None:
+            gain, whiten = self._take(like, together)
+        self._noise_free_share, self._high_noise_emphasis = noise_free_share, high_noise_emphasis
         self._per_age = batch // self.AGES_PER_BATCH
         self._modes = torch.empty((m, n, len(gain)), device=device)
         for i in range(m):
@@ -149,6 +154,16 @@ class TrajectorySampler:
         if process_noise_max:
             self._process, self._process_cell = self.process_conditions(data.process_noise, device)
         self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_noise_max else 0) + 1
+
+    def _take(self, inverse: InverseMap, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and whiten."""
+        whiten = inverse.whiten
+        gain = np.sqrt(np.maximum(np.einsum("ma,ab,mb->m", whiten, noise, whiten), 0.0))
+        self.coordinates, self.noise_gain = Coordinates(inverse.z_offset, whiten, gain), inverse.noise_gain
+        self.scale = StateScale(inverse.x_offset, inverse.x_scale, self.scale.relative, self.scale.nx)
+        self.measurement_noise_unit = np.broadcast_to(inverse.measurement_noise_unit, self.measurement_noise_max.shape)
+        self.age_max, self.age_unit = inverse.age_max, inverse.age_unit
+        return gain, whiten
 
     def __call__(self, generator: torch.Generator) -> Batch:
         """One batch."""

@@ -1,0 +1,112 @@
+"""From the filter's state to the estimate, and to the covariance of what that is off by, at given levels of noise."""
+
+from typing import Any, Self
+
+import numpy as np
+
+from observers.artifact import Artifact, InverseMap
+from observers.spread import Covariance
+
+# Which decoder is asked, in which rows (None for all), what its networks are given, and the age in seconds.
+Read = list[tuple["Decoder", np.ndarray | None, np.ndarray, Any]]
+
+
+class Decoders:
+    """The map of driven motion and, where there is one, that of free motion: each is asked where it holds."""
+
+    def __init__(self, driven: "Decoder", free: "Decoder | None") -> None:
+        self._driven, self._free = driven, free
+
+    @classmethod
+    def of(
+        cls, artifact: Artifact, outputs: slice, *, measurement_noise: float | tuple[float, ...], process_noise: float
+    ) -> Self:
+        """Those of an artifact at levels of noise, for some of the maps' outputs."""
+        driven, free = (
+            None if inverse is None else Decoder(inverse.part(outputs), measurement_noise, process_noise)
+            for inverse in (artifact.inverse, artifact.free_inverse)
+        )
+        assert driven is not None
+        return cls(driven, free)
+
+    def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
+        """The estimates, (..., nx)."""
+        return self.mean(self.read(z, age))
+
+    def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
+        """Of what the estimates are off by, (..., nx, nx)."""
+        return self.covariance(self.read(z, age))
+
+    def read(self, z: np.ndarray, age: Any) -> Read:
+        """What the networks are given for filter states, (..., size), of these ages in seconds."""
+        driven, free = self._driven, self._free
+        if free is None:
+            return [(driven, None, driven.read(z, age), age)]
+        nz = free.size  # behind it lies z_u, exactly 0 until an input acts
+        if z.ndim == 1:  # a single sample: every call of numpy would be felt
+            if any(z[nz:].tolist()):
+                return [(driven, None, driven.read(z, age), age)]
+            return [(free, None, free.read(z[:nz], age), age)]
+        moved = np.asarray(z[..., nz:].any(-1))
+        if moved.all():
+            return [(driven, None, driven.read(z, age), age)]
+        if not moved.any():
+            return [(free, None, free.read(z[..., :nz], age), age)]
+        age, still = np.broadcast_to(age, moved.shape), ~moved
+        return [
+            (driven, moved, driven.read(z[moved], age[moved]), age[moved]),
+            (free, still, free.read(z[still][:, :nz], age[still]), age[still]),
+        ]
+
+    def mean(self, read: Read) -> np.ndarray:
+        """The estimates, (..., nx)."""
+        return _in_place(read, [decoder.mean(inputs) for decoder, _, inputs, _ in read])
+
+    def covariance(self, read: Read) -> np.ndarray:
+        """Of what they are off by, (..., nx, nx)."""
+        return _in_place(read, [decoder.covariance(inputs, age) for decoder, _, inputs, age in read])
+
+
+def _in_place(read: Read, found: list[np.ndarray]) -> np.ndarray:
+    """What decoders say, each in its rows."""
+    if len(found) == 1:
+        return found[0]
+    rows = [np.asarray(rows) for _, rows, _, _ in read]
+    out = np.empty((*rows[0].shape, *found[0].shape[1:]))
+    for where, values in zip(rows, found):
+        out[where] = values
+    return out
+
+
+class Decoder:
+    """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
+
+    def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
+        self._inverse, self.size = inverse, inverse.whiten.shape[1]
+        self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
+        self._offset = -inverse.z_offset @ self._whiten
+        self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
+        if inverse.spread is not None:
+            shares = inverse.shares(measurement_noise, process_noise)
+            self.covariance = Covariance(inverse.spread, shares, inverse.x_scale)
+
+    def read(self, z: np.ndarray, age: Any) -> np.ndarray:
+        """What the network is given."""
+        inverse, conditions = self._inverse, self._conditions
+        modes = z @ self._whiten
+        modes += self._offset
+        if inverse.features[-1] == "age":
+            conditions = [*conditions, inverse.age_feature(age)]
+        if modes.ndim == 1:  # a single sample: every call of numpy would be felt
+            return np.array([*modes.tolist(), *conditions], dtype=np.float32)
+        width = modes.shape[-1]
+        inputs = np.empty((*modes.shape[:-1], width + len(conditions)), dtype=np.float32)
+        inputs[..., :width] = modes
+        for i, condition in enumerate(conditions):
+            inputs[..., width + i] = condition
+        return inputs
+
+    def mean(self, inputs: np.ndarray) -> np.ndarray:
+        """The estimate, (..., nx)."""
+        inverse = self._inverse
+        return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)

@@ -1,0 +1,164 @@
+"""How far an estimate may be off: the covariance of its error, as it was learned."""
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from observers.checks import shown
+from observers.network import MLP
+
+COVERAGE = 0.9  # of the regions that the factors make true
+_LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
+_LARGEST_FACTOR = 1e12
+
+
+@dataclass(frozen=True)
+class Spread:
+    """The covariance of x - x_hat, as far as what T_inv is told says it.
+
+    It is factor * D L L^T D. The network has the inputs of T_inv's own. Its first nx outputs are the logarithms of D,
+    which is diagonal, the others the entries of L below its diagonal of ones, row by row. All are in scaled units,
+    those of :attr:`observers.InverseMap.x_scale`. The factors come from runs that the network was not fitted to: with
+    them, nine errors in ten lie where (x - x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square
+    distribution with nx degrees of freedom.
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network, of nx (nx + 1) / 2 outputs.
+    levels : ndarray, shape (k,)
+        Levels of measurement noise, rising from 0, in multiples of the largest that the map is told.
+    ages : ndarray, shape (m,)
+        Seconds since reset, rising from 0.
+    factors : ndarray, shape (k, m) or (2, k, m)
+        At each of them; two tables are without process noise and with the highest level that the map is told.
+        Between them their logarithms are interpolated, and beyond the last ones they stay.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not go together, levels or ages do not rise from 0, or a factor is not positive.
+    """
+
+    mlp: MLP
+    levels: np.ndarray
+    ages: np.ndarray
+    factors: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("levels", "ages"):
+            values = getattr(self, name)
+            rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
+            if not rising or not np.isfinite(values).all():
+                raise ValueError(f"the {name} of error bars must rise from 0, got {shown(values)}")
+        tables = (len(self.levels), len(self.ages))
+        if self.factors.shape not in (tables, (2, *tables)):
+            raise ValueError(
+                f"factors of shape {self.factors.shape} do not fit {tables[0]} levels and {tables[1]} ages"
+            )
+        if not ((self.factors > 0) & (self.factors <= _LARGEST_FACTOR)).all():
+            raise ValueError(f"factors must be positive and at most {_LARGEST_FACTOR:g}, got {shown(self.factors)}")
+        if not self.nx or self.nx * (self.nx + 1) // 2 != self.mlp.outputs:
+            raise ValueError(f"a network of {self.mlp.outputs} outputs makes no covariance: it takes 1, 3, 6, 10, …")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return (math.isqrt(8 * self.mlp.outputs + 1) - 1) // 2
+
+
+class Covariance:
+    """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
+
+    Parameters
+    ----------
+    spread : Spread
+        What was learned.
+    levels : tuple of float
+        Of measurement noise and process noise, in multiples of the highest that the map is told.
+    scale : ndarray, shape (nx,)
+        Of the states.
+    """
+
+    def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
+        nx = self._nx = spread.nx
+        *weights, last = spread.mlp.weights
+        *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
+        bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
+        self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
+        tables, (measurement, process) = np.log(spread.factors) / 2, levels
+        if tables.ndim == 3:
+            share = min(process, 1.0)
+            tables = (1.0 - share) * tables[0] + share * tables[1]
+        self._ages = spread.ages.tolist()
+        self._log_factors = [float(np.interp(measurement, spread.levels, column)) for column in tables.T]
+
+    def __call__(self, inputs: np.ndarray, age: Any) -> np.ndarray:
+        """Evaluate.
+
+        Parameters
+        ----------
+        inputs : ndarray, shape (..., inputs)
+            Of T_inv's network.
+        age : float or ndarray
+            Seconds since reset, of a shape that goes with (...,).
+
+        Returns
+        -------
+        ndarray, shape (..., nx, nx)
+            In units of the states.
+        """
+        nx, out = self._nx, self._mlp(inputs)
+        if out.ndim == 1:  # a single sample: every call of numpy would be felt
+            values, factor = out.tolist(), self._log_factor(float(age))
+            scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
+            entries = _product(scales, values[nx:])
+            return np.array(entries).reshape(nx, nx)
+        values = np.moveaxis(out, -1, 0).astype(float, order="C")
+        np.minimum(values[:nx], _LARGEST_LOG, out=values[:nx])
+        values[:nx] += np.interp(age, self._ages, self._log_factors)
+        np.exp(values[:nx], out=values[:nx])
+        covariance = np.empty((*out.shape[:-1], nx * nx))
+        for i, entry in enumerate(_product(values[:nx], values[nx:])):
+            covariance[..., i] = entry
+        return covariance.reshape(*out.shape[:-1], nx, nx)
+
+    def _log_factor(self, age: float) -> float:
+        """As np.interp, without its overhead."""
+        ages, values = self._ages, self._log_factors
+        i = bisect_right(ages, age)
+        if i == len(ages):
+            return values[-1]
+        share = (age - ages[i - 1]) / (ages[i] - ages[i - 1])
+        return values[i - 1] + share * (values[i] - values[i - 1])
+
+
+def _product(scales: Any, lower: Any) -> list[Any]:
+    """D L L^T D row by row, from D and what L has below its diagonal: of numbers, or of arrays that hold a batch."""
+    nx, k = len(scales), 0
+    rows: list[list[Any]] = []
+    covariance: list[Any] = [0.0] * (nx * nx)
+    for i, scale in enumerate(scales):
+        row = []
+        for _ in range(i):
+            row.append(scale * lower[k])  # a comprehension takes longer for so few
+            k += 1
+        row.append(scale)
+        rows.append(row)
+        for j, other in enumerate(rows):
+            entry = row[0] * other[0]
+            for m in range(1, j + 1):
+                entry = entry + row[m] * other[m]
+            covariance[nx * i + j] = covariance[nx * j + i] = entry
+    return covariance
+
+
+def deviations(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (..., nx) of what has covariances (..., nx, nx)."""
+    return np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))
+
+
+__all__ = ["COVERAGE", "Covariance", "Spread", "deviations"]

@@ -1,0 +1,83 @@
+"""Standard deviations beside the estimate, in single and vector environments."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from error_bars import with_error_bars
+from gymnasium.utils.env_checker import check_env
+
+from kkl_gym import KKLObservation, KKLVectorObservation
+from observers import ArtifactError, KKLObserver
+
+
+@pytest.fixture(scope="module")
+def path(make_artifact, tmp_path_factory):
+    file = tmp_path_factory.mktemp("maps") / "map.safetensors"
+    with_error_bars(make_artifact("van_der_pol", dt=0.01, free_inverse=True, process=True)).save(file)
+    return str(file)
+
+
+@pytest.fixture(scope="module")
+def plain(saved):
+    return saved(system="van_der_pol", dt=0.01)
+
+
+@pytest.mark.filterwarnings("ignore:.*different from the unwrapped version")
+def test_single(path):
+    env = KKLObservation(gym.make("KKLVanDerPol-v0"), path, uncertainty=True)
+    check_env(env, skip_render_check=True)
+    assert env.spec.additional_wrappers[-1].kwargs["uncertainty"] is True
+    assert env.observation_space.shape == (4,)
+    assert (env.observation_space.low[2:] == 0).all()
+    obs, info = env.reset(seed=0)
+    for _ in range(5):
+        obs, _, _, _, info = env.step([0.3])
+    space = env.observation_space
+    shown = np.concatenate([info["x_hat"], np.sqrt(np.diag(info["x_cov"]))])
+    np.testing.assert_allclose(obs, np.clip(shown, space.low, space.high), rtol=1e-6)
+    assert info["x_cov"].shape == (2, 2)
+    np.testing.assert_array_equal(info["x_cov"], env.observer.covariance)
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_vector_is_single(path, mode):
+    envs = gym.make_vec("KKLVanDerPol-v0", num_envs=3, autoreset_mode=mode, max_episode_steps=4)
+    envs = KKLVectorObservation(envs, path, uncertainty=True)
+    singles = [KKLObservation(gym.make("KKLVanDerPol-v0"), path, uncertainty=True) for _ in range(3)]
+    assert envs.observation_space.shape == (3, 4)
+    obs, info = envs.reset(seed=0)
+    alone = [single.reset(seed=i) for i, single in enumerate(singles)]
+    for k in range(4):
+        for i in range(3):
+            np.testing.assert_allclose(obs[i], alone[i][0], rtol=1e-3, atol=1e-4)
+            np.testing.assert_allclose(info["x_cov"][i], alone[i][-1]["x_cov"], rtol=1e-3, atol=1e-6)
+        obs, _, _, _, info = envs.step(np.full((3, 1), 0.2))
+        alone = [single.step([0.2]) for single in singles]
+        if mode == "SameStep" and k == 3:
+            last, info, obs = info, info["final_info"], np.stack(info["final_obs"])
+    for i in range(3):
+        np.testing.assert_allclose(obs[i], alone[i][0], rtol=1e-3, atol=1e-4)
+        np.testing.assert_allclose(info["x_cov"][i], alone[i][-1]["x_cov"], rtol=1e-3, atol=1e-6)
+    if mode == "SameStep":
+        np.testing.assert_allclose(last["x_cov"], envs.observer.covariance, rtol=1e-6)
+
+
+def test_where_there_is_none(path, plain):
+    env = gym.make("KKLVanDerPol-v0")
+    with pytest.raises(ArtifactError, match="no error bars"):
+        KKLObservation(env, plain, uncertainty=True)
+    with pytest.raises(ValueError, match="estimate='x'"):
+        KKLObservation(env, path, uncertainty=True, estimate="z")
+    with pytest.raises(ValueError, match="uncertainty must be True or False"):
+        KKLObservation(env, path, uncertainty="no")
+    with pytest.raises(ArtifactError, match="no error bars"):
+        KKLObservation(env, path, uncertainty=True).replace_observer(plain)
+    assert "x_cov" not in KKLObservation(env, path).reset(seed=0)[1]
+
+
+def test_monitor_and_missing_samples(path):
+    artifact = KKLObservation(gym.make("KKLVanDerPol-v0"), path).observer.artifact
+    observer = KKLObserver(artifact, 0.1)
+    observer.reset(np.zeros((3, 1)))
+    observer.step(None)
+    assert observer.covariance.shape == (3, 2, 2)

@@ -1,0 +1,154 @@
+"""What ``kkl-gym evaluate --calibration`` prints: whether error bars are true."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from kkl_gym.system import System
+from observers import Artifact
+from observers.storage import replacing
+from training.evaluation.coverage import REGIONS, Coverage, coverage, kalman_coverage
+from training.evaluation.errors import UnseenTrajectories
+from training.evaluation.levels import Level, as_cell, show_level
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FIRST, SETTLED = (
+    2.0,
+    5.0,
+)  # seconds at the pace of the shipped systems: spans are the first ones, and all after the last
+SHARES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # levels of noise, in multiples of the largest that the map is told
+
+
+def default_levels(artifact: Artifact) -> list[Level]:
+    """Levels of noise at which error bars are judged."""
+    largest = np.asarray(artifact.inverse.measurement_noise_max)
+    return [float(level) if level.ndim == 0 else tuple(level.tolist()) for level in (s * largest for s in SHARES)]
+
+
+def judged(
+    artifact: Artifact,
+    system: System,
+    trajectories: UnseenTrajectories,
+    *,
+    level: Level,
+    seed: int,
+    ekf: bool,
+) -> list[dict[str, Any]]:
+    """Judge error bars, and a Kalman filter's covariance beside them, on trajectories.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, with error bars.
+    system : System
+        What it was made for.
+    trajectories : UnseenTrajectories
+        What is to be followed.
+    level : float or tuple of float, length ny
+        Of measurement noise.
+    seed : int
+        Seed of the noise.
+    ekf : bool
+        Whether to judge an extended Kalman filter too.
+
+    Returns
+    -------
+    list of dict of str to object
+        A row for each of them and span of time: "observer", "span", and the measures of :class:`Coverage` in percent.
+    """
+    dt, steps = artifact.filter.dt, len(trajectories.x)
+    first, settled = (round(seconds * system.pace / dt) for seconds in (FIRST, SETTLED))
+    spans = {
+        f"first {first * dt:g} s": slice(0, first),
+        f"after {settled * dt:g} s": slice(min(settled, steps - 1), None),
+    }
+    how: dict[str, Any] = {"measurement_noise": level, "seed": seed, "spans": tuple(spans.values())}
+    found = {"KKL": coverage(artifact, system, trajectories, **how)}
+    if ekf:
+        found["EKF"] = kalman_coverage(system, trajectories, dt, **how)
+    return [
+        {"observer": who, "span": span, "measurement_noise": as_cell(level), **_cells(one, system)}
+        for who, each in found.items()
+        for span, one in zip(spans, each, strict=True)
+    ]
+
+
+def _cells(found: Coverage, system: System) -> dict[str, float]:
+    cells = {}
+    for i, region in enumerate(REGIONS):
+        cells[f"{100 * region:g}"] = 100 * found.joint[i]
+        for name, value in zip(system.state_names, found.states[i], strict=True):
+            cells[f"{100 * region:g} {name}"] = 100 * value
+    low, high = found.limits
+    return {**cells, "nees": found.nees, "nees_low": low, "nees_high": high}
+
+
+def coverage_table(title: str, rows: "pd.DataFrame", system: System) -> Table:
+    """Show rows of :func:`judged`.
+
+    Parameters
+    ----------
+    title : str
+        Of the table.
+    rows : DataFrame
+        Rows with the columns "starts" and "driven" beside theirs.
+    system : System
+        What is estimated.
+
+    Returns
+    -------
+    Table
+        To be printed.
+    """
+    regions = [f"{100 * region:g}" for region in REGIONS]
+    shown = Table(title=title)
+    columns = ["observer", "starts", "driven", "span", "noise\non y", *(f"{region} %" for region in regions)]
+    for column in [*columns, *(f"90 %\n{name}" for name in system.state_names), "NEES\n(95 % limits)"]:
+        shown.add_column(column, justify="left" if column in columns[:4] else "right")
+    for row in rows.to_dict("records"):
+        values = [row[name] for name in (*regions, *(f"90 {name}" for name in system.state_names))]
+        shown.add_row(
+            row["observer"],
+            row["starts"],
+            "yes" if row["driven"] else "no",
+            row["span"],
+            str(row["measurement_noise"])
+            if isinstance(row["measurement_noise"], str)
+            else show_level(row["measurement_noise"]),
+            *(f"{value:.1f}" for value in values),
+            f"{row['nees']:.2f} ({row['nees_low']:.2f} – {row['nees_high']:.2f})",
+        )
+    return shown
+
+
+def draw(path: Path, rows: "pd.DataFrame") -> None:
+    """Draw the coverage of 90 % regions by level of noise, a panel for each span.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    rows : DataFrame
+        As for :func:`coverage_table`.
+    """
+    from matplotlib.figure import Figure
+
+    spans = list(rows.span.unique())
+    figure = Figure(figsize=(4.0 * len(spans), 3.4), layout="constrained")
+    axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
+    for ax, span in zip(axes, spans, strict=True):
+        for (who, starts, driven), group in rows[rows.span == span].groupby(
+            ["observer", "starts", "driven"], sort=False
+        ):
+            label = f"{who}, {starts}{', driven' if driven else ''}"
+            ax.plot(group.measurement_noise.astype(str), group["90"], "o-" if who == "KKL" else "s--", label=label)
+        ax.axhline(90, color="k", linewidth=0.8)
+        ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
+    axes[0].set_ylabel("errors in the 90 % region, %")
+    axes[-1].legend(loc="lower right", fontsize="small")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -1,0 +1,75 @@
+"""``kkl-gym errorbars``."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from observers import Artifact
+from observers.artifact import resolve
+from training.commands.options import OwnPolicy, OwnSystem, read_observers, read_policy
+from training.progress import progress_bars
+
+
+@dataclass(frozen=True)
+class ErrorBars:
+    """Learn how far an observer's estimates are off: the covariance of its errors, at each sample.
+
+    T_inv and all else in the file stay as they are, to the last bit. A small network beside it learns from motions like
+    those of the training, but others, and is calibrated on further ones: regions of 90 % then hold 90 % of the errors
+    at each level of measurement noise that the map is told, at each age and with or without process noise.
+    """
+
+    observer: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]
+    """A shipped map, or a .safetensors file."""
+    system: OwnSystem = None
+    policy: OwnPolicy = None
+    steps: int = 4000
+    """Batches for the network, or each of the two where motions without input have a map of their own."""
+    trajectories: int = 1000
+    """Number of motions to learn from; to calibrate on there are twice as many."""
+    seed: int = 0
+    """Seed of everything random."""
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
+    """The file to write; by default one of the map's own name in runs/errorbars."""
+
+    def run(self, console: Console) -> Artifact:
+        """Learn and write.
+
+        Parameters
+        ----------
+        console : Console
+            Where progress is shown.
+
+        Returns
+        -------
+        Artifact
+            What was written.
+
+        Raises
+        ------
+        ValueError
+            If the observer cannot be had or has no error bars to learn, or a number makes no sense.
+        """
+        from training.evaluation.errorbars import learn_error_bars  # torch takes seconds that help need not wait for
+
+        source = resolve(self.observer)
+        out = Path("runs/errorbars") / source.name if self.out is None else self.out
+        if out.suffix != ".safetensors":
+            raise ValueError(f"out = {out} must end in .safetensors")
+        ((_, artifact, system),) = read_observers([self.observer], self.system)
+        with progress_bars(console) as progress:
+            found = learn_error_bars(
+                artifact,
+                system,
+                steps=self.steps,
+                trajectories=self.trajectories,
+                seed=self.seed,
+                policy=read_policy(artifact, system, self.policy),
+                console=progress,
+            )
+        found.save(out)
+        console.print(f"wrote {out}")
+        return found

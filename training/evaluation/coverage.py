@@ -1,0 +1,179 @@
+"""Whether error bars are true: how many errors lie in the regions that should hold them, and how large they are."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver
+from observers.spread import deviations
+from training.evaluation.errors import UnseenTrajectories, kalman_filter, measured
+from training.evaluation.levels import Level
+from training.evaluation.metrics import chi_square, squared_distance
+
+REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
+CHUNK = 200  # trajectories at once: each sample has a matrix
+INTERVAL = 0.95  # of the mean NEES of a filter that is consistent
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many errors lie in the regions that covariances say, in a span of time.
+
+    Parameters
+    ----------
+    joint : ndarray, shape (regions,)
+        Parts of the errors in the ellipsoids of ``REGIONS``, over all samples of all trajectories.
+    states : ndarray, shape (regions, nx)
+        Parts of each state's errors in its own intervals.
+    nees : float
+        Mean of (x - x_hat)^T P^-1 (x - x_hat), the normalised estimation error squared: nx for a true P.
+    limits : tuple of float
+        Between which it lies for so many trajectories with a probability of 95 %, were the errors of a trajectory one
+        Gaussian (Bar-Shalom, Li and Kirubarajan, 2001, sec. 5.4). They are wider than those of independent samples.
+    rms, said : ndarray, shape (nx,)
+        Root mean square of each state's errors, and of the standard deviations said of them.
+    """
+
+    joint: np.ndarray
+    states: np.ndarray
+    nees: float
+    limits: tuple[float, float]
+    rms: np.ndarray
+    said: np.ndarray
+
+
+def coverage(
+    artifact: Artifact,
+    system: System,
+    trajectories: UnseenTrajectories,
+    *,
+    measurement_noise: Level,
+    seed: int,
+    spans: tuple[slice, ...] = (slice(None),),
+) -> list[Coverage]:
+    """Judge an observer's error bars on test trajectories. It is told the levels of noise, nothing of another plant.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, with error bars.
+    system : System
+        What it was made for.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
+    seed : int
+        Seed of the measurement noise.
+    spans : tuple of slice
+        Of samples, each judged by itself.
+
+    Returns
+    -------
+    list of Coverage
+        One for each span.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none or beyond the map's range, or the artifact holds no error bars.
+    """
+    artifact.require_spread()
+    observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
+    y = measured(system, trajectories, observer.measurement_noise, seed)
+
+    def estimates() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for rows in _chunks(y.shape[1]):
+            u = trajectories.u[:, rows] if artifact.nu else None
+            yield observer.estimate(y[:, rows], u), observer.estimate_covariance(y[:, rows], u)
+
+    return _judged(trajectories.x, estimates(), spans)
+
+
+def kalman_coverage(
+    system: System,
+    trajectories: UnseenTrajectories,
+    dt: float,
+    *,
+    measurement_noise: Level,
+    seed: int,
+    spans: tuple[slice, ...] = (slice(None),),
+) -> list[Coverage]:
+    """Judge the covariance that an extended Kalman filter says, on what :func:`coverage` takes.
+
+    Parameters
+    ----------
+    system : System
+        What it takes for what moves.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    dt : float
+        Sampling interval in seconds.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
+    seed : int
+        Seed of the measurement noise.
+    spans : tuple of slice
+        As for :func:`coverage`.
+
+    Returns
+    -------
+    list of Coverage
+        One for each span.
+
+    Raises
+    ------
+    ValueError
+        If the equations take no symbols.
+    """
+    y = measured(system, trajectories, measurement_noise, seed)
+
+    def estimates() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        kalman = kalman_filter(system, dt, trajectories.process_noise, measurement_noise)
+        for rows in _chunks(y.shape[1]):
+            kalman.reset(y[0, rows])
+            found = [(kalman.x, kalman.P)]
+            for k in range(1, len(y)):
+                kalman.step(y[k, rows], trajectories.u[k - 1, rows])
+                found.append((kalman.x, kalman.P))
+            x_hat, P = zip(*found, strict=True)
+            yield np.array(x_hat), np.array(P)
+
+    return _judged(trajectories.x, estimates(), spans)
+
+
+def _chunks(n: int) -> list[slice]:
+    return [slice(first, first + CHUNK) for first in range(0, n, CHUNK)]
+
+
+def _judged(
+    x: np.ndarray, estimates: Iterator[tuple[np.ndarray, np.ndarray]], spans: tuple[slice, ...]
+) -> list[Coverage]:
+    """Judge estimates and covariances, chunk by chunk of the trajectories."""
+    distances: list[np.ndarray] = []
+    ratios: list[np.ndarray] = []
+    squares: list[np.ndarray] = []
+    said: list[np.ndarray] = []
+    for rows, (x_hat, covariance) in zip(_chunks(x.shape[1]), estimates, strict=True):
+        error, std = x[:, rows] - x_hat, deviations(covariance)
+        distances.append(squared_distance(error, covariance))
+        ratios.append((error / std) ** 2)
+        squares.append(error**2)
+        said.append(std**2)
+    distance, ratio, square, variance = (np.concatenate(each, 1) for each in (distances, ratios, squares, said))
+    nx, n = x.shape[-1], x.shape[1]
+    joint, single = chi_square(REGIONS, nx), chi_square(REGIONS, 1)
+    low, high = (float(chi_square((1 + side * INTERVAL) / 2, n * nx) / n) for side in (-1, 1))
+    return [
+        Coverage(
+            np.array([(distance[span] <= edge).mean() for edge in joint]),
+            np.array([(ratio[span] <= edge).mean((0, 1)) for edge in single]),
+            float(distance[span].mean()),
+            (low, high),
+            np.sqrt(square[span].mean((0, 1))),
+            np.sqrt(variance[span].mean((0, 1))),
+        )
+        for span in spans
+    ]

@@ -1,0 +1,289 @@
+"""Error bars for an observer that is there already: the covariance of its errors, learned and then calibrated."""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from kkl_gym.system import System
+from observers import Artifact, InverseMap, Spread
+from observers.decoder import Decoders
+from observers.spread import COVERAGE
+from training.config import Config, settings_of
+from training.evaluation.calibration import sound_trajectories
+from training.evaluation.metrics import chi_square, squared_distance
+from training.maps.optimise import Stage, optimise
+from training.maps.samplers import TrajectorySampler
+from training.maps.spread import SpreadProblem
+from training.pipeline import LEAD_IN_SHARE, NOMINAL_SHARE
+from training.progress import ProgressBars, progress_bars
+from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
+from training.trajectories.parameters import blind, with_parameters
+from training.trajectories.record import Motions, record, recording_ages
+from training.trajectories.signals import DRIVEN, KINDS
+
+# Of measurement noise, in multiples of the largest that the map is told; dense near 0, where errors of the map end.
+LEVELS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
+AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
+FEWEST = 50  # errors from which a quantile is taken
+PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
+WIDTH, DEPTH = 32, 1
+LEARNING_RATE = 3e-3
+
+
+def learn_error_bars(
+    artifact: Artifact,
+    system: System,
+    *,
+    steps: int = 4000,
+    trajectories: int = 1000,
+    seed: int = 0,
+    policy: Controller | None = None,
+    device: torch.device | None = None,
+    console: Console | ProgressBars | None = None,
+) -> Artifact:
+    """Learn the covariance of an observer's errors. Its estimates stay as they are.
+
+    Motions are simulated as in its training, but others. A small network is fitted to what T_inv is off by on them, at
+    every age and level of noise, by Gaussian likelihood. Then factors are found on further motions, so that regions of
+    90 % hold 90 % of the errors at each age and level of noise, on free and on driven motions.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, whose maps are told measurement noise and age. Error bars that it has are replaced.
+    system : System
+        What it was made for.
+    steps : int
+        Batches for the network, or each of the two where free motions have a map of their own.
+    trajectories : int
+        Number of motions to learn from, and twice as many to calibrate on.
+    seed : int
+        Of everything random; no seed gives the motions of a training, or of an evaluation.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one.
+    device : torch.device, optional
+        Where networks are trained; by default on the CPU.
+    console : Console or ProgressBars, optional
+        Where progress is shown; by default nowhere.
+
+    Returns
+    -------
+    Artifact
+        The same with error bars.
+
+    Raises
+    ------
+    ValueError
+        If a number makes no sense, the observer does not say how it was trained, is not told what it takes, or most
+        motions leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if it was made for another
+        system.
+    """
+    artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
+    if steps < 1 or trajectories < 100 or seed < 0:
+        raise ValueError(
+            f"need a step at least, 100 trajectories and a seed that is not negative, got {steps}, {trajectories}, "
+            f"{seed}"
+        )
+    for inverse in (artifact.inverse, artifact.free_inverse):
+        if inverse is not None and not {"measurement_noise", "age"} <= set(inverse.features):
+            raise ValueError(
+                f"error bars need a map that is told measurement noise and age, this one is told "
+                f"{', '.join(inverse.features)}: train one with kkl-gym train"
+            )
+    config, policy = settings_of(artifact.training), policy and blind(policy, system.nx)
+    plant = with_parameters(system, artifact.parameter_ranges, NOMINAL_SHARE)
+    with progress_bars(console) as progress:
+        run = _Run(artifact, plant, config, steps, trajectories, seed, policy, device or torch.device("cpu"), progress)
+        torch.manual_seed(seed)
+        driven = run.learned("driven" if artifact.nu else "all", artifact.inverse)
+        free = None if artifact.free_inverse is None else run.learned("free", artifact.free_inverse)
+        learned = dataclasses.replace(artifact, inverse=driven, free_inverse=free)
+        with progress.phase("calibrating the error bars", 2 * len(run.tables)) as report:
+            return run.calibrated(learned, report)
+
+
+@dataclasses.dataclass
+class _Run:
+    """What the stages share."""
+
+    artifact: Artifact
+    plant: System
+    config: Config
+    steps: int
+    trajectories: int
+    seed: int
+    policy: Controller | None
+    device: torch.device
+    progress: ProgressBars
+
+    def __post_init__(self) -> None:
+        largest = self.artifact.process_noise_max
+        self.tables = (0.0,) if largest is None else (0.0, largest)  # levels of process noise
+        self.duration = self.config.duration
+        dt, settled = self.artifact.filter.dt, min(self.artifact.inverse.age_max, self.duration / 2)
+        later = [round(age * self.plant.pace / dt) for age in AGES]
+        last = max(1, round(settled / dt))
+        self.knots = np.array(sorted({*(k for k in (*FIRST, *later) if k < last), last}))  # ages in samples
+
+    def learned(self, name: str, inverse: InverseMap) -> InverseMap:
+        """The map with a network of its errors, fitted on motions as in its training."""
+        free, config = inverse is self.artifact.free_inverse, self.config
+        linear = self.artifact.filter
+        if free or not linear.nu:
+            linear = type(linear)(linear.A, linear.B, linear.dt)
+        noisy = self.artifact.process_noise_max is not None
+        motions = Motions(
+            kinds=() if free else DRIVEN if self.artifact.free_inverse else KINDS,
+            lead_in_share=LEAD_IN_SHARE if free else 0.0,
+            lead_in_input=config.lead_in_input if free else 0.0,
+            process_noise_share=config.process_noise_share if noisy else 0.0,
+            box_factor=config.box_factor,
+            policy=None if free else self.policy,
+        )
+        rng, count = generator(Stream.CALIBRATION, self.seed, 2 if free else 1), round(self.duration / linear.dt)
+        data = record(
+            self.plant,
+            linear,
+            n=self.trajectories,
+            steps=count,
+            ages=recording_ages(count, config.samples),
+            rng=rng,
+            motions=motions,
+            report=self.progress.bar(f"simulating {name} motions", self.trajectories),
+        )
+        nx = self.artifact.nx
+        sampler = TrajectorySampler(
+            dataclasses.replace(data, x=data.x[..., : inverse.mlp.outputs]),
+            linear,
+            measurement_noise_max=inverse.measurement_noise_max,
+            batch=config.batch,
+            device=self.device,
+            measurement_noise=self.artifact.measurement_noise,
+            noise_free_share=config.noise_free_share,
+            high_noise_emphasis=config.high_noise_emphasis,
+            process_noise_max=self.artifact.process_noise_max or 0.0,
+            parameters=inverse.mlp.outputs - nx,
+            like=inverse,
+        )
+        problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=self.device)
+        with tempfile.TemporaryDirectory() as folder:
+            stage = Stage(
+                name=f"error bars, {name}",
+                steps=self.steps,
+                learning_rate=LEARNING_RATE,
+                folder=Path(folder),
+                fingerprint="",
+                seed=self.seed,
+                optimiser="soap",
+            )
+            optimise(stage, problem.network, problem.loss, self.progress, resume=False)
+        ones = np.ones((*(() if len(self.tables) == 1 else (2,)), len(LEVELS), len(self.knots)))
+        spread = Spread(problem.network.export(), np.array(LEVELS), self.knots * linear.dt, ones)
+        return dataclasses.replace(inverse, spread=spread)
+
+    def calibrated(self, artifact: Artifact, report: Callable[[float], object]) -> Artifact:
+        """The observer with factors by which its regions hold as many errors as they should."""
+        inverse, free = artifact.inverse, artifact.free_inverse
+        driven_factors, free_factors = [], []
+        for table, process_noise in enumerate(self.tables):
+            x, z, noise, ages = self._runs(artifact, process_noise, generator(Stream.CALIBRATION, self.seed, 3 + table))
+            report(2 * table + 1)
+            moved = np.asarray(z[..., len(artifact.filter.A) :].any(-1))
+            groups = (moved, ~moved) if free is not None else (np.ones_like(moved), None)
+            distances = [
+                self._distances(artifact, x, z + level * noise, ages, level=level, process_noise=process_noise)
+                for level in LEVELS
+            ]
+            driven_factors.append(self._factors(distances, ages, groups[0]))
+            if groups[1] is not None:
+                free_factors.append(self._factors(distances, ages, groups[1]))
+            report(2 * table + 2)
+
+        def with_factors(inverse: InverseMap, factors: list[np.ndarray]) -> InverseMap:
+            assert inverse.spread is not None
+            tables = np.array(factors) if len(factors) > 1 else factors[0]
+            return dataclasses.replace(inverse, spread=dataclasses.replace(inverse.spread, factors=tables))
+
+        return dataclasses.replace(
+            artifact,
+            inverse=with_factors(inverse, driven_factors),
+            free_inverse=None if free is None else with_factors(free, free_factors),
+        )
+
+    def _runs(
+        self, artifact: Artifact, process_noise: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """States, filter states without noise, what the largest noise adds to these, and ages in samples."""
+        linear, system = artifact.filter, self.plant
+        x, u = sound_trajectories(
+            artifact,
+            system,
+            n=2 * self.trajectories,
+            duration=self.duration,
+            rng=rng,
+            policy=self.policy,
+            process_noise=process_noise,
+            kinds=DRIVEN,
+        )
+        ages = np.unique(np.concatenate(self._windows(len(u))))
+        u = u[..., : linear.nu]
+        z = linear.run(system.output(x), u, ages)
+        largest = np.broadcast_to(artifact.inverse.measurement_noise_max, (system.ny,))
+        noise = linear.run(largest * rng.standard_normal((*x.shape[:2], system.ny)), np.zeros_like(u), ages)
+        return x[ages][..., : artifact.nx], z, noise, ages
+
+    def _windows(self, steps: int) -> list[np.ndarray]:
+        """Ages in samples that stand for each of the knots: those about it, and all behind the last."""
+        between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
+        edges = [0.0, *between.tolist(), float(steps)]
+        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
+        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
+        return [np.unique(span.round()).astype(int) for span in spans]
+
+    def _distances(
+        self,
+        artifact: Artifact,
+        x: np.ndarray,
+        z: np.ndarray,
+        ages: np.ndarray,
+        *,
+        level: float,
+        process_noise: float,
+    ) -> np.ndarray:
+        """Squared distances of the errors in units of the covariance, (ages, n)."""
+        largest = np.asarray(artifact.inverse.measurement_noise_max)
+        decoders = Decoders.of(
+            artifact,
+            slice(artifact.nx),
+            measurement_noise=_plain(level * largest),
+            process_noise=process_noise,
+        )
+        read = decoders.read(z, (ages * artifact.filter.dt)[:, None])
+        return squared_distance(x - decoders.mean(read), decoders.covariance(read))
+
+    def _factors(self, distances: list[np.ndarray], ages: np.ndarray, group: np.ndarray) -> np.ndarray:
+        """Factors (levels, knots) from the errors of a group, (ages, n)."""
+        rows = [np.isin(ages, window) for window in self._windows(int(ages[-1]))]
+        inside = chi_square(COVERAGE, self.artifact.nx)
+        factors = np.empty((len(LEVELS), len(rows)))
+        for i, distance in enumerate(distances):
+            for j, row in enumerate(rows):
+                found = distance[row][group[row]]
+                # Where hardly any motion is of the group, as driven ones at the first sample: those of the next age.
+                factors[i, j] = np.nan if len(found) < FEWEST else np.quantile(found, COVERAGE, method="weibull")
+            known = np.isfinite(factors[i])
+            if not known.any():
+                raise ValueError("hardly any motion is of the kind that error bars are for; simulate more trajectories")
+            factors[i] = np.interp(np.arange(len(rows)), np.flatnonzero(known), factors[i, known])
+        return np.clip(factors / inside, 1e-6, 1e6)
+
+
+def _plain(level: np.ndarray) -> float | tuple[float, ...]:
+    return tuple(level.tolist()) if level.ndim else float(level)
