@@ -9,7 +9,7 @@ from linear_system import TwoOutputs
 import kkl_gym.elementary as e
 from kkl_gym import System, VanDerPol, get_system
 from training import unseen_trajectories
-from training.evaluation.errors import _measured
+from training.evaluation.errors import measured
 from training.evaluation.plants import off_by, show_parameters
 
 
@@ -62,7 +62,7 @@ def test_a_plant_moves_from_the_models_starts_under_its_inputs():
     assert right.plant is None
     assert other.first(2).plant is plant
     noise = [
-        _measured(model, runs, 0.1, 0) - moving.output(runs.x) for runs, moving in ((right, model), (other, plant))
+        measured(model, runs, 0.1, 0) - moving.output(runs.x) for runs, moving in ((right, model), (other, plant))
     ]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
 
