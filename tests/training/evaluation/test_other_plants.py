@@ -61,9 +61,7 @@ def test_a_plant_moves_from_the_models_starts_under_its_inputs():
             np.testing.assert_allclose(np.transpose(plant.step(other.x[k].T, other.u[k].T)), other.x[k + 1], atol=1e-12)
     assert right.plant is None
     assert other.first(2).plant is plant
-    noise = [
-        measured(model, runs, 0.1, 0) - moving.output(runs.x) for runs, moving in ((right, model), (other, plant))
-    ]
+    noise = [measured(model, runs, 0.1, 0) - moving.output(runs.x) for runs, moving in ((right, model), (other, plant))]
     np.testing.assert_allclose(noise[0], noise[1], atol=1e-12)
 
 
