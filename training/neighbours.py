@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-RESOLUTION = 1e-3  # to which z is read, in standard deviations
+RESOLUTION = 1e-3  # to which a network reads z, in standard deviations: what is left where there is no noise
 FEWEST = 32  # neighbours, or twice as many as z has coordinates, so that planes rest on enough of them
 ROUNDING = 1e-9  # of z, in a linear regression
 

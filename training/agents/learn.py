@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 import yaml
 from rich.progress import Progress
 from sb3_contrib import RecurrentPPO
@@ -22,7 +21,6 @@ from stable_baselines3.common.vec_env import VecMonitor
 from torch import nn
 
 from kkl_gym import ENV_IDS, get_system
-from observers import MLP
 from observers.storage import naming
 from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
@@ -30,6 +28,7 @@ from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
 from training.agents.information import Features, Information, make, observer_of
 from training.agents.play import Policy
+from training.agents.policy import linear, perceptron
 from training.checkpoints import SUFFIX
 from training.seeds import agent_training_seed
 from training.systems import ControlTask, profile
@@ -121,7 +120,7 @@ def learn(
     )
     resumed = {"resumed": checkpoint.resumed} if checkpoint.resumed else {}
     agent = Agent(
-        network=_policy(model),
+        network=perceptron(model),
         squashed=name == "sac",
         task=task,
         training={**how, "timesteps": model.num_timesteps, **resumed},
@@ -222,7 +221,7 @@ def _fit(
     vec_env = VecMonitor(SB3VecEnv(Cost(env, task)))
     rate = settings.pop("learning_rate")
     if isinstance(rate, str):
-        rate = _linear(float(rate.removeprefix("lin_")))
+        rate = linear(float(rate.removeprefix("lin_")))
     first, callbacks = (
         agent_training_seed(seed),
         list[BaseCallback]([_Bar(progress, f"{description} {seed}", timesteps)]),
@@ -280,26 +279,6 @@ def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[st
 def _read(name: str) -> dict[str, Any]:
     text = files("training.agents").joinpath("hyperparameters", f"{name}.yml").read_text()
     return dict(yaml.safe_load(text))
-
-
-def _linear(start: float) -> Callable[[float], float]:
-    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
-
-
-def _policy(model: BaseAlgorithm) -> MLP:
-    """The deterministic policy's layers."""
-    if isinstance(model, SAC):
-        body: Any = [*model.actor.latent_pi, model.actor.mu]
-    else:
-        policy: Any = model.policy
-        body = [*policy.mlp_extractor.policy_net, policy.action_net]
-    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
-    with torch.no_grad():
-        return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], "tanh")
-
-
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().copy()
 
 
 class _Bar(BaseCallback):

@@ -1,10 +1,14 @@
 """What trained agents' scores say together: normalised means of seeds, with intervals."""
 
 import warnings
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
@@ -65,3 +69,29 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
         found_in = scipy.stats.bootstrap(samples, statistic, n_resamples=2000, method="percentile", rng=0)
     ends = found_in.confidence_interval
     return found, float(ends.low), float(ends.high)
+
+
+def draw_panel(ax: "Axes", cells: Sequence[Mapping[str, Any] | None], labels: Sequence[str], title: str) -> None:
+    """Draw the normalised scores of one task: agents as dots, their means with intervals.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+        Where.
+    cells : sequence of mapping or None
+        From bottom to top: ``interval``, as :func:`interval` gives it, and ``agents``, each one's normalised score;
+        None where there are none.
+    labels : sequence of str
+        What is told apart, in the same order.
+    title : str
+        Of the task.
+    """
+    for place, cell in enumerate(cells):
+        if cell is not None:
+            found, low, high = cell["interval"]
+            ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color="0.6", markersize=4)
+            ax.plot([low, high], [place, place], color="C0", lw=2)
+            ax.plot(found, place, "o", color="C0")
+    ax.axvline(1.0, color="0.8", lw=0.8)
+    ax.set(title=title, xlabel="normalised score")
+    ax.set_yticks(range(len(labels)), labels)

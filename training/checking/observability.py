@@ -7,10 +7,11 @@ import numpy as np
 from kkl_gym import EquationError
 from training.checking.finding import Finding, number, percent
 from training.checking.subject import Subject
+from training.neighbours import RESOLUTION
 from training.presets import eigenvalues
 from training.smoothness import intervals, smoothness
 from training.spectrum import Spectrum
-from training.tuning.probe import RESOLUTION, Probe
+from training.tuning.probe import Probe
 
 MOTIONS = 20  # that the prediction follows
 UNTOLD, HARDLY = 0.9, 0.3  # of the standard deviation of a start that all of y leaves in some direction

@@ -24,7 +24,7 @@ from training.agents.comparison import (
     run_case,
 )
 from training.agents.information import observer_of
-from training.agents.statistics import interval, middle, normalised
+from training.agents.statistics import draw_panel, interval, middle, normalised
 from training.agents.tasks import TASKS
 from training.commands.compare_environments import compare_environments
 from training.commands.environment import EnvironmentOptions
@@ -269,16 +269,9 @@ def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, str]], par
     axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
     cells = _cells(results, tasks)
     for ax, task in zip(axes, tasks, strict=True):
-        for place, knows in enumerate(reversed(COMPARED)):
-            cell = cells.get((*task, knows))
-            if cell is not None:
-                found, low, high = cell["interval"]
-                ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color="0.6", markersize=4)
-                ax.plot([low, high], [place, place], color="C0", lw=2)
-                ax.plot(found, place, "o", color="C0")
-        ax.axvline(1.0, color="0.8", lw=0.8)
-        ax.set(title=f"{task[0].replace('_', ' ')}, noise {task[1]}", xlabel="normalised score")
-        ax.set_yticks(range(len(COMPARED)), [LABELS[knows] for knows in reversed(COMPARED)])
+        shown = [cells.get((*task, knows)) for knows in reversed(COMPARED)]
+        labels = [LABELS[knows] for knows in reversed(COMPARED)]
+        draw_panel(ax, shown, labels, f"{task[0].replace('_', ' ')}, noise {task[1]}")
     figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)

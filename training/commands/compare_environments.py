@@ -1,4 +1,4 @@
-"""``kkl-gym agent compare --environments``."""
+"""``kkl-gym agent compare ENV_ID ...``."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -12,11 +12,11 @@ from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance
 from training.kalman import unknown_start
+from training.neighbours import RESOLUTION
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, bessel_spectrum
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
-RESOLUTION = 1e-3  # to which a network reads z, as a part of the signal: what is left where there is no noise
 REAL_MODES = 24  # in the library
 FREQUENCIES = np.array([0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98, 0.999])  # quantiles of the power of y
 DECAYS = 5  # of pairs at each frequency

@@ -49,7 +49,7 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     if information not in SHOWN:
         raise ValueError(f"an agent is shown one of {', '.join(SHOWN)}, got {information!r}")
     if information == "state":
-        return HiddenTask(task.env_id, task.measured, env_kwargs=task.env_kwargs).make()
+        return task.without_noise.make()
     env = task.make()
     if information == "x_hat":
         if observer is None:

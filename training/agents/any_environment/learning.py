@@ -11,7 +11,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 import yaml
 from gymnasium import spaces
 from sb3_contrib import TQC, RecurrentPPO
@@ -21,15 +20,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecNormalize
-from torch import nn
 
-from observers import MLP
 from observers.storage import replacing
 from training.agents.agent import fingerprint
 from training.agents.any_environment.information import Shown, show
 from training.agents.any_environment.observing import OBSERVER, learn_observer, refitting
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
+from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
 from training.seeds import agent_training_seed
 
@@ -47,7 +45,6 @@ CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
 OBSERVER_STEPS = 0.1  # of the steps of a training, in which actions are random and an observer is learned
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
-_ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
 
 
 def algorithm_for(action_space: gym.Space[Any], env_id: str, information: Shown) -> str:
@@ -268,22 +265,6 @@ def _fit(
     return model
 
 
-def linear(start: float) -> Callable[[float], float]:
-    """Make a schedule that ends at zero.
-
-    Parameters
-    ----------
-    start : float
-        Its first value.
-
-    Returns
-    -------
-    callable
-        Of the share of the training that is left.
-    """
-    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
-
-
 class Bar(BaseCallback):
     """Tells how many steps are done.
 
@@ -362,27 +343,18 @@ def player_of(
     Player
         The policy, with the scaling of what it is shown.
     """
-    policy: Any = model.policy
-    head: Head = "argmax" if isinstance(model.action_space, spaces.Discrete) else "clip"
-    if isinstance(model, SAC | TQC):
-        body, head = [*model.actor.latent_pi, model.actor.mu], "tanh"
-    elif isinstance(model, TD3):
-        body, head = list(model.actor.mu), "tanh"
-    elif isinstance(model, DQN):
-        body = list(policy.q_net.q_net)
-    else:
-        body = [*policy.mlp_extractor.policy_net, policy.action_net]
-    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
-    activation = next((_ACTIVATIONS[type(layer)] for layer in body if type(layer) in _ACTIVATIONS), "tanh")
-    with torch.no_grad():
-        network = MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
+    head: Head = "clip"
+    if isinstance(model.action_space, spaces.Discrete):
+        head = "argmax"
+    elif isinstance(model, SAC | TQC | TD3):
+        head = "tanh"
     normal = model.get_vec_normalize_env()
     scaling: dict[str, Any] = {}
     if normal is not None:
         moments: Any = normal.obs_rms
         scaling = {"mean": moments.mean.copy(), "scale": np.sqrt(moments.var + normal.epsilon)}
     return Player(
-        network,
+        perceptron(model),
         head,
         task,
         information,
@@ -391,10 +363,6 @@ def player_of(
         fingerprint=None if observer is None else fingerprint(observer),
         training=training or {},
     )
-
-
-def _array(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().copy()
 
 
 __all__ = ["ALGORITHMS", "algorithm_for", "hyperparameters", "learn_to_play", "player_of"]

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 
 from observers import MLP, storage
-from observers.checks import choice
+from observers.checks import choice, shown
 from training.agents.agent import AgentError, fingerprint
 from training.agents.any_environment.information import SHOWN, Shown, show
 from training.agents.any_environment.task import HiddenTask
@@ -70,10 +70,10 @@ class Player:
             if not isinstance(getattr(self, name), str | None):
                 raise AgentError(f"{name} must be a string, got {getattr(self, name)!r}")
         if (self.mean is None) != (self.scale is None):
-            raise AgentError("mean and scale belong together")
-        for values in (self.mean, self.scale):
+            raise AgentError(f"mean and scale belong together, {'scale' if self.scale is None else 'mean'} is missing")
+        for name, values in (("mean", self.mean), ("scale", self.scale)):
             if values is not None and (values.shape != (self.network.inputs,) or not np.isfinite(values).all()):
-                raise AgentError(f"mean and scale must be {self.network.inputs} numbers each")
+                raise AgentError(f"{name} must be {self.network.inputs} finite numbers, got {shown(values)}")
         if not isinstance(self.training, Mapping):
             raise AgentError(f"training must be a mapping, got {self.training!r}")
 

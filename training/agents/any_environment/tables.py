@@ -10,7 +10,7 @@ from observers.storage import replacing, write
 from training import markdown
 from training.agents.any_environment.comparison import RANDOM, Case
 from training.agents.any_environment.information import SHOWN
-from training.agents.statistics import interval, middle, normalised
+from training.agents.statistics import draw_panel, interval, middle, normalised
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -142,16 +142,9 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
     axes = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     shown = [kind for kind in reversed(SHOWN) if kind in set(results.shown)]
     for ax, task in zip(axes, tasks):
-        for place, kind in enumerate(shown):
-            found = cell(results, task, kind)
-            if found is not None and "interval" in found and np.isfinite(found["interval"][0]):
-                value, low, high = found["interval"]
-                ax.plot(found["agents"], np.full(len(found["agents"]), place), ".", color="0.6", markersize=4)
-                ax.plot([low, high], [place, place], color="C0", lw=2)
-                ax.plot(value, place, "o", color="C0")
-        ax.axvline(1.0, color="0.8", lw=0.8)
-        ax.set(title=_named(task), xlabel="normalised return")
-        ax.set_yticks(range(len(shown)), [LABELS[kind] for kind in shown])
+        found = [cell(results, task, kind) for kind in shown]
+        known = [one if one is not None and np.isfinite(one.get("interval", [np.nan])[0]) else None for one in found]
+        draw_panel(ax, known, [LABELS[kind] for kind in shown], _named(task))
     for ax in axes[len(tasks) :]:
         ax.set_axis_off()
     figure.suptitle(f"What agents are shown and how well they act.{partial}", fontsize="medium")
@@ -165,7 +158,7 @@ def curves(cases: Sequence[Case]) -> "pd.DataFrame":
     Parameters
     ----------
     cases : sequence of Case
-        Agents, those that are done among them.
+        Agents that are done.
 
     Returns
     -------
@@ -176,7 +169,7 @@ def curves(cases: Sequence[Case]) -> "pd.DataFrame":
 
     groups: dict[tuple[str, float, str], list[pd.DataFrame]] = {}
     for case in cases:
-        if case.kind != RANDOM and case.done:
+        if case.kind != RANDOM:
             curve = pd.read_csv(case.folder / "curve.csv")
             if len(curve) > 1:
                 groups.setdefault((case.task.env_id, case.task.measurement_noise, case.kind), []).append(curve)

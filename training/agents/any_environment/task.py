@@ -1,7 +1,7 @@
 """Environments of others in which a part of the observation is hidden, and noise lies on the rest."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gymnasium as gym
@@ -61,6 +61,11 @@ class HiddenTask:
         """For people and folders: the environment, and the noise if there is any."""
         noise = f" noise {self.measurement_noise:g}" if self.measurement_noise else ""
         return f"{self.env_id.replace('/', '-')}{noise}"
+
+    @property
+    def without_noise(self) -> "HiddenTask":
+        """The same environment, measured exactly."""
+        return replace(self, measurement_noise=0.0)
 
     def make(self, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
         """Make the environment, with flat observations and noise on what is measured.

@@ -1,0 +1,62 @@
+"""What all agents of stable-baselines3 have here: policies as perceptrons, and schedules that end at zero."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from sb3_contrib import TQC
+from stable_baselines3 import DQN, SAC, TD3
+from stable_baselines3.common.base_class import BaseAlgorithm
+from torch import nn
+
+from observers import MLP
+
+_ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
+
+
+def perceptron(model: BaseAlgorithm) -> MLP:
+    """Take the layers of the deterministic policy out of a trained agent.
+
+    Parameters
+    ----------
+    model : stable_baselines3 algorithm
+        SAC, TQC, TD3, DQN, PPO or A2C.
+
+    Returns
+    -------
+    MLP
+        Observations in; actions before they are bounded, or values of discrete ones, out.
+    """
+    policy: Any = model.policy
+    if isinstance(model, SAC | TQC):
+        body = [*model.actor.latent_pi, model.actor.mu]
+    elif isinstance(model, TD3):
+        body = list(model.actor.mu)
+    elif isinstance(model, DQN):
+        body = list(policy.q_net.q_net)
+    else:
+        body = [*policy.mlp_extractor.policy_net, policy.action_net]
+    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
+    activation = next((_ACTIVATIONS[type(layer)] for layer in body if type(layer) in _ACTIVATIONS), "tanh")
+    return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
+
+
+def linear(start: float) -> Callable[[float], float]:
+    """Make a schedule that ends at zero.
+
+    Parameters
+    ----------
+    start : float
+        Its first value.
+
+    Returns
+    -------
+    callable
+        Of the share of the training that is left.
+    """
+    return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()
