@@ -65,11 +65,11 @@ ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumabl
 	mkdir -p docs/results/ablation
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
 
-certificates: $(VENV)/ready  ## the figures in docs/certificates.md
+certificates: $(VENV)/ready  ## the figures in docs/background/certificates.md
 	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
 	$(BIN)/kkl-gym faults --out docs/results/faults
 
-agents: $(VENV)/ready  ## every agent in docs/agents.md, and those that ship: hours on two cores; resumable
+agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md scores.png) docs/results/agents

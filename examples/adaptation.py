@@ -5,7 +5,8 @@ Every parameter of the plant is 10 % larger than the observer's model has it. Th
     python examples/adaptation.py lorenz --noise 0.5
 
 Three observers are compared on the plant: the shipped one as it is, the one that :func:`training.identification.adapt`
-makes from it, and one that is trained on the true parameters by the same settings. docs/identification.md has a table.
+makes from it, and one that is trained on the true parameters by the same settings.
+docs/guides/identification.md has a table.
 """
 
 import time

@@ -1,7 +1,7 @@
 """The Silverbox, the standard benchmark of nonlinear identification: an electronic Duffing oscillator, measured.
 
 The data are not part of this project: nonlinearbenchmark.org has them, as SNLS80mV.csv with columns V1 (input) and V2
-(output), 131,072 samples at 610.35 Hz. docs/silverbox.md says what is assumed and what comes out::
+(output), 131,072 samples at 610.35 Hz. docs/results/silverbox.md says what is assumed and what comes out::
 
     python examples/silverbox.py SNLS80mV.csv
 """

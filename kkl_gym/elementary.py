@@ -6,7 +6,8 @@ Plain arithmetic and comparisons already work on Python floats, NumPy arrays, to
     from kkl_gym.elementary import sin, where
 
 Numbers may stand beside arrays, tensors or expressions. Everywhere exp(1000) is infinite, log(0) minus infinite and
-sqrt(-1) not a number, without a warning. "Your own system" in ``docs/systems.md`` has a table of the functions.
+sqrt(-1) not a number, without a warning. "Your own system" in ``docs/environments/index.md`` has a table of the
+functions.
 """
 
 import builtins

@@ -1,4 +1,4 @@
-"""docs/adding_a_system.md, followed literally in a copy of the packages."""
+"""docs/guides/own_system.md, followed literally in a copy of the packages."""
 
 import dataclasses
 import os
@@ -13,7 +13,7 @@ import pytest
 from training.systems import Profile
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "adding_a_system.md").read_text()
+PAGE = (ROOT / "docs" / "guides" / "own_system.md").read_text()
 
 # The line above a block says what to do with it.
 NEW = re.compile(r"New file `(?P<path>[^`]+)`:")

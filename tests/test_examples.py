@@ -1,4 +1,4 @@
-"""The examples, and what docs/systems.md says of a system of one's own."""
+"""The examples, and what docs/environments/index.md says of a system of one's own."""
 
 import re
 import runpy
@@ -15,7 +15,7 @@ from training.evaluation import calibration
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
 OWN_SYSTEM, OTHER_PLANTS = (
-    (ROOT / "docs" / "systems.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
+    (ROOT / "docs" / "environments" / "index.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
     for title in ("Your own system", "Unstable plants")
 )
 
@@ -157,7 +157,7 @@ def test_memory(capsys):
 
 
 def test_the_page_on_memory_runs():
-    page = (ROOT / "docs" / "memory.md").read_text()
+    page = (ROOT / "docs" / "guides" / "memory.md").read_text()
     small = {"20_000": "1", "1024": "3", "HalfCheetah-v5": "Pendulum-v1"}  # MuJoCo comes with the extra envs alone
     made = {"kkl_gym": kkl_gym}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):

@@ -1,4 +1,4 @@
-"""docs/paper.md: what it names is there."""
+"""docs/background/paper.md: what it names is there."""
 
 import ast
 import re
@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-PAGE = (ROOT / "docs" / "paper.md").read_text()
+PAGE = (ROOT / "docs" / "background" / "paper.md").read_text()
 
 
 @cache

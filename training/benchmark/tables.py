@@ -127,7 +127,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
             "",
             "Median for starts in X / 1.5X \\ X / 2X \\ X. In brackets what the notebooks released with the paper "
             "print for 1.5X \\ X, from other networks, budgets and data. They contradict a heatmap in the same "
-            "notebooks: docs/benchmark.md says how, and what they rest on.",
+            "notebooks: docs/results/benchmark.md says how, and what they rest on.",
             "",
             *_by_method(methods, partial(_beside_printed, component["median"])),
         ]

@@ -48,8 +48,8 @@ class Train:
         ),
     ]
     information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
-    """What the agent knows: docs/agents.md explains each. In an environment: state, x_hat, z, stacked, recurrent or
-    y."""
+    """What the agent knows: docs/guides/agents.md explains each. In an environment: state, x_hat, z, stacked,
+    recurrent or y."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None

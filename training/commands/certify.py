@@ -30,8 +30,8 @@ SHOWN = 30_000  # states in the figure
 class Certify:
     """Say how far an observer is to be trusted: learned maps, sensitivities, noise, and the paper's bounds.
 
-    Prints a table and writes table.md, and for each observer NAME.json and NAME.png. docs/certificates.md explains
-    each line.
+    Prints a table and writes table.md, and for each observer NAME.json and NAME.png.
+    docs/background/certificates.md explains each line.
     """
 
     observers: Observers

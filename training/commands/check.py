@@ -29,7 +29,8 @@ class Check:
     """Look at a system before anything is trained: what is right, what is wrong, and what to change.
 
     Takes some ten seconds. Equations on all kinds of numbers, starts, bounds, rate, sampling, outputs, target, noise,
-    and the error to expect of each state. The exit status is 1 if there is a problem. docs/check.md explains the lines.
+    and the error to expect of each state. The exit status is 1 if there is a problem.
+    docs/guides/check.md explains the lines.
     """
 
     system: SystemName

@@ -59,13 +59,15 @@ class Compare:
     environments: Annotated[
         tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="[ENV_ID ...]", help_behavior_hint="")
     ] = ()
-    """Any environments of Gymnasium, of which agents see a part, in place of systems: docs/partly_observed.md."""
+    """Any environments of Gymnasium, of which agents see a part, in place of systems.
+
+    See docs/results/partly_observed.md."""
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
         tuple[Compared, ...] | None, tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all)")
     ] = None
-    """What agents know: docs/agents.md explains each. In environments: state, x_hat, z, stacked, recurrent, y."""
+    """What agents know (docs/guides/agents.md). In environments: state, x_hat, z, stacked, recurrent, y."""
     seeds: int = 5
     """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
     episodes: int = 100

@@ -24,7 +24,7 @@ class ExportCommand:
 
     --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
     extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library's math.h alone, and
-    NAME_main.c, a program that reads samples and prints estimates. docs/export.md has both from end to end.
+    NAME_main.c, a program that reads samples and prints estimates. docs/guides/export.md has both from end to end.
     """
 
     observer: Annotated[

@@ -34,8 +34,8 @@ class ObservabilityCommand:
     episodes: as far as their hidden signals differ, no observer can tell them. Takes some ten seconds.
 
     A signal is "determined" (no more than 5 % of its standard deviation is left), so "up to a constant" (how it changes
-    is, where it is is not), "partly" or "not determined". docs/observability.md says how errors are predicted, and how
-    near trained observers come.
+    is, where it is is not), "partly" or "not determined". docs/guides/observability.md says how errors are predicted,
+    and how near trained observers come.
     """
 
     name: Annotated[

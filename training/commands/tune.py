@@ -33,7 +33,7 @@ class Tune:
     Takes a minute. Writes config.json for `kkl-gym train SYSTEM --config`: the real modes of the system's default and
     what adds most to them. front.csv and front.png show the predicted error against the number of modes chosen anew,
     for this noise and others. For spinn it chooses an interval of real eigenvalues for which T is smooth, and writes
-    intervals.csv instead. docs/tuning.md says what the prediction rests on.
+    intervals.csv instead. docs/guides/tuning.md says what the prediction rests on.
     """
 
     system: SystemName

@@ -19,7 +19,7 @@ def onnx_model(exported: Exported) -> Any:
     The inputs have a row for each observer of a batch: ``z`` (size), ``y`` (ny), ``u`` (nu), ``y_next`` (ny), ``age``
     (1), the samples since the observer was switched on, and as far as the map is told of them ``measurement_noise``
     and ``process_noise``. The outputs are ``z_next`` (size) and ``x_hat`` (nx, and estimated parameters). A row of age
-    0 begins: its z, y and u count for nothing. docs/export.md says more.
+    0 begins: its z, y and u count for nothing. docs/guides/export.md says more.
 
     Parameters
     ----------

@@ -235,7 +235,7 @@ class Task:
 
 
 class Method(ABC, Generic[Trained]):
-    """A contender of the benchmark: a way to make observers. docs/benchmark.md says how to add one.
+    """A contender of the benchmark: a way to make observers. docs/results/benchmark.md says how to add one.
 
     Attributes
     ----------

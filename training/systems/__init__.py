@@ -1,6 +1,6 @@
 """What is known of each shipped system beyond its equations: a module for each, found by the system's name.
 
-docs/adding_a_system.md says how to add one.
+docs/guides/own_system.md says how to add one.
 """
 
 import numpy as np

@@ -13,7 +13,7 @@ from training.trajectories.controllers import Controller, linear_quadratic
 class Profile:
     """What is chosen for one system; the defaults serve any.
 
-    docs/adding_a_system.md explains them on an example.
+    docs/guides/own_system.md explains them on an example.
 
     Parameters
     ----------

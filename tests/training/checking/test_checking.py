@@ -595,7 +595,7 @@ def test_motions_are_no_longer_than_can_be_followed_in_seconds(monkeypatch):
 
 
 def test_the_page_explains_every_line():
-    page = (EXAMPLES.parent / "docs" / "check.md").read_text(encoding="utf-8")
+    page = (EXAMPLES.parent / "docs" / "guides" / "check.md").read_text(encoding="utf-8")
     for name in (*FIRST, *THEN):
         assert f"\n| {name} |" in page
     shown = page.split("```\n")[2]

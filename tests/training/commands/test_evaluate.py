@@ -245,7 +245,7 @@ def test_the_page_says_what_the_published_errors_on_other_plants_are():
     found = pd.read_csv(RESULTS / "plant-error.csv")
     assert found.columns[:2].tolist() == ["observer", "plant"]
     medians = found.groupby(["starts", "driven", "observer", "measurement_noise"])[["smape", "smape_late"]].median()
-    page = (RESULTS.parent / "benchmark.md").read_text()
+    page = (RESULTS / "benchmark.md").read_text()
     for starts, driven, title, column in (
         ("X", False, "starts in X, all steps", "smape"), ("X", False, "starts in X, after 20 %", "smape_late"),
         ("2X \\ X", False, "starts in 2X \\ X, all steps", "smape"),

@@ -1,4 +1,4 @@
-"""The figures in docs/certificates.md are those of the committed certificates."""
+"""The figures in docs/background/certificates.md are those of the committed certificates."""
 
 import dataclasses
 import json
@@ -16,7 +16,7 @@ DOCS = Path(__file__).parents[3] / "docs"
 
 
 def page():
-    return " ".join((DOCS / "certificates.md").read_text().split())
+    return " ".join((DOCS / "background" / "certificates.md").read_text().split())
 
 
 def committed():
