@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clean help
+.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clients clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -85,6 +85,22 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
+
+# RLlib pins Gymnasium, so that it has an environment of its own. Tianshou imports joblib, which it does not ask for.
+CLIENTS := rl-zoo3 torchrl "tianshou>=2" joblib "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
+RLLIB := "ray[rllib]>=2.40"
+
+clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
+	CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" .venv-clients/bin/pytest -W default -m clients \
+		tests/clients/test_clients.py
+	RAY_worker_niceness=0 .venv-rllib/bin/pytest -W default -m clients tests/clients/test_rllib.py
+	@cat runs/clients/table.md
+
+.venv-clients/ready .venv-rllib/ready: pyproject.toml Makefile
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(@D)/bin/python -m pip install --quiet --editable ".[agents]" pytest $(if $(findstring rllib,$@),$(RLLIB),$(CLIENTS))
+	touch $@
 
 clean:  ## remove environments and caches; what lies under runs/ stays
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*
