@@ -48,7 +48,7 @@ def test_rl_zoo3(algorithm, env_id, row, tmp_path):
     printed = output_of(*command.split(), "--conf-file", settings, "-n", str(steps), "--device", "cpu", cwd=tmp_path)
     assert "training.agents.OnTask" in printed
     made = PPO if algorithm == "ppo" else SAC
-    agent = made.load(tmp_path / algorithm / f"{env_id}_1" / env_id, device="cpu")
+    agent = made.load(tmp_path / algorithm / f"{env_id}_1" / f"{env_id}.zip", device="cpu")
     assert agent.num_timesteps == steps
     assert agent.observation_space.high.tolist() == [np.inf] * len(agent.observation_space.high)  # those of OnTask
 

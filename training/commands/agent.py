@@ -19,6 +19,7 @@ from training.agents.any_environment.player import KEY, Player
 from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
+from training.commands.agent_files import Export, Import
 from training.commands.compare import Compare
 from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
 from training.commands.options import NoiseLevel
@@ -214,12 +215,14 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class AgentCommand:
-    """Train, evaluate and compare agents that act on what an observer shows."""
+    """Train, evaluate, compare and convert agents that act on what an observer shows."""
 
     command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Compare, tyro.conf.subcommand("compare")],
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Import, tyro.conf.subcommand("import")],
         tyro.conf.arg(name=""),
     ]
 
