@@ -88,7 +88,7 @@ speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one t
 
 # RLlib pins Gymnasium, so that it has an environment of its own. Tianshou imports joblib, which it does not ask for.
 CLIENTS := rl-zoo3 torchrl "tianshou>=2" joblib "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
-RLLIB := "ray[rllib]>=2.40"
+RLLIB := "ray[rllib]>=2.40" torch tyro
 
 clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
 	CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" .venv-clients/bin/pytest -W default -m clients \
@@ -99,7 +99,8 @@ clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our env
 .venv-clients/ready .venv-rllib/ready: pyproject.toml Makefile
 	$(PYTHON) -m venv $(@D)
 	$(@D)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(@D)/bin/python -m pip install --quiet --editable ".[agents]" pytest $(if $(findstring rllib,$@),$(RLLIB),$(CLIENTS))
+	$(@D)/bin/python -m pip install --quiet pytest \
+		$(if $(findstring rllib,$@),--editable . $(RLLIB),--editable ".[agents]" $(CLIENTS))
 	touch $@
 
 clean:  ## remove environments and caches; what lies under runs/ stays

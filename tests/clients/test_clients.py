@@ -70,7 +70,7 @@ def test_cleanrl(row, tmp_path):
         row("CleanRL", "", "a single file")
         pytest.skip("no release for Python 3.11 or newer; name a file: make clients CLEANRL=ppo_continuous_action.py")
     its_version, ran = f"sha256 {sha256(Path(path).read_bytes()).hexdigest()[:8]}", Path(path).name
-    options = "--total-timesteps 4096 --no-cuda".split()
+    options = ["--total-timesteps", "4096", "--no-cuda"]
     how = [path]
     try:
         output_of(*how, "--env-id", "Pendulum-v1", "--total-timesteps", "1", "--no-cuda", cwd=tmp_path)

@@ -1,13 +1,14 @@
-"""``kkl-gym agent export`` and ``import``: agents as stable-baselines3's files."""
+"""``kkl-gym agent export`` and ``import``: agents as stable-baselines3's files, and where agents lie."""
 
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 
-from training.agents.agent import Agent
+from training.agents.agent import Agent, AgentError
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,6 @@ class Export:
             If the agent cannot be read or does not fit its task.
         """
         from training.agents.sb3_files import to_sb3
-        from training.commands.agent import find
 
         model = to_sb3(Agent.read(find(self.agent)), system=self.system)
         self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -79,3 +79,31 @@ class Import:
 
         from_sb3(self.path, self.system, self.observer).save(self.out)
         console.print(f"wrote {self.out}")
+
+
+def find(name: str) -> Path:
+    """Find the file of an agent.
+
+    Parameters
+    ----------
+    name : str
+        A system whose agent ships, or a path that ends in ``.safetensors``.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    AgentError
+        If no such agent ships.
+    """
+    if name.endswith(".safetensors"):
+        return Path(name)
+    folder = files("training.agents").joinpath("shipped")
+    names = sorted(entry.name for entry in folder.iterdir())
+    shipped = [entry.removesuffix(".safetensors") for entry in names if entry.endswith(".safetensors")]
+    if name not in shipped:
+        raise AgentError(f"no agent {name!r} ships; there are {', '.join(shipped)}; a file ends in .safetensors")
+    return Path(str(folder.joinpath(f"{name}.safetensors")))

@@ -106,7 +106,5 @@ class ControlTask:
         kkl_gym.VectorActionRepeat
             The environment.
         """
-        env: VectorEnv = KKLVectorEnv(
-            self.system, num_envs, **self.options, autoreset_mode=AutoresetMode.DISABLED
-        )
+        env: VectorEnv = KKLVectorEnv(self.system, num_envs, **self.options, autoreset_mode=AutoresetMode.DISABLED)
         return VectorActionRepeat(env if wrap is None else wrap(env), self.repeat, autoreset_mode)

@@ -1,5 +1,6 @@
 """The control tasks for programs that train on single environments, rl-zoo3 above all."""
 
+from dataclasses import replace
 from importlib.resources import files
 
 import gymnasium as gym
@@ -9,10 +10,12 @@ import yaml
 
 from kkl_gym import ENV_IDS
 from training.agents import OnTask
+from training.agents.agent import Agent
 from training.agents.cost import WORST, Cost
 from training.agents.information import make
 from training.agents.learn import hyperparameters
 from training.agents.tasks import TASKS
+from training.commands.agent import find
 from training.systems import ControlTask
 
 
@@ -73,6 +76,25 @@ def test_an_escape_is_paid_for_the_rest_of_the_episode():
     assert info["sample"] == 1
     total = env.unwrapped.step([0.0])[1]
     assert reward == pytest.approx(-min((1 / total - 1) / 4, WORST) * task.steps)
+
+
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in TASKS if name != "lorenz"]
+
+
+@pytest.mark.parametrize("name", ["lorenz", *SLOW])
+def test_the_shipped_agent_reaches_the_reward_threshold(name):
+    """On the registered environment, acting as slowly as in its task; without acting the threshold is not reached."""
+    agent, spec = Agent.read(find(name)), gym.spec(ENV_IDS[name])
+    duration = spec.max_episode_steps * agent.task.dt
+    task = replace(agent.task, duration=duration, start_box=None)
+    env = make(task, "x_hat", 8, autoreset_mode="Disabled", observer=agent.observer)
+    for act, reached in ((agent, True), (lambda obs: np.zeros((len(obs), 1)), False)):
+        obs, _ = env.reset(seed=70_000)
+        total = np.zeros(8)
+        for _ in range(task.steps):
+            obs, reward, *_ = env.step(act(obs))
+            total += reward
+        assert (total.mean() > spec.reward_threshold) == reached
 
 
 def test_refusals():
