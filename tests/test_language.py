@@ -12,7 +12,7 @@ WRITTEN = {"table.md"}
 PAGES = [ROOT / "README.md", *(path for path in sorted((ROOT / "docs").rglob("*.md")) if path.name not in WRITTEN)]
 
 # A full stop after one of these ends no sentence where something follows.
-ABBREVIATIONS = re.compile(r"\b(?:e\.g|i\.e|et al|al|cf|vs|sec|Sec|eq|Eq|fig|Fig|ch|no|[A-Z])\.$")
+ABBREVIATIONS = re.compile(r"\b(?:e\.g|i\.e|et al|al|cf|vs|sec|Sec|eq|Eq|fig|Fig|ch|no|[C-SU-WYZ])\.$")
 ENDS = re.compile(r"(?<=[.!?])[)\"'*_”]*\s+")
 
 
