@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clean help
+.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -85,6 +85,9 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
+
+docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
 
 clean:  ## remove environments and caches; what lies under runs/ stays
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*
