@@ -87,6 +87,7 @@ speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one t
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
 
 docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
+	$(BIN)/python docs/site/commands.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
 
 clean:  ## remove environments and caches; what lies under runs/ stays
