@@ -45,6 +45,8 @@ maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; 
 
 results: $(VENV)/ready  ## the figures and the accuracy in the README and in docs/
 	$(BIN)/kkl-gym demo --out docs/figures
+	$(BIN)/kkl-gym demo --gif --seed 7 --duration 12 --out runs/portraits
+	cp runs/portraits/estimates.gif docs/figures/portraits.gif
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
