@@ -47,6 +47,9 @@ results: $(VENV)/ready  ## the figures and the accuracy in the README and in doc
 	$(BIN)/kkl-gym demo --out docs/figures
 	$(BIN)/kkl-gym demo --gif --seed 7 --duration 12 --out runs/portraits
 	cp runs/portraits/estimates.gif docs/figures/portraits.gif
+	for system in $(SYSTEMS); do \
+		$(BIN)/kkl-gym demo $$system --gif --seed 7 --duration 12 --out runs/portraits || exit 1; \
+		cp runs/portraits/estimates-$$system.gif docs/figures/$$system.gif || exit 1; done
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
