@@ -146,8 +146,8 @@ def options():
 def test_commands_in_sentences_exist(page, options):
     """There a command may lack what it needs, but has no option that there is not."""
     for shown in re.findall(r"`kkl-gym ([^`]*)`", Page(page).prose):
-        command = re.match(r"agent \w+|[\w-]+|", shown)[0]
-        if not command.islower():  # in the place of any command
+        command = re.match(r"agent [a-z]+|[a-z][\w-]*|", shown)[0]
+        if not command:  # an option of all, or a word in the place of any command
             continue
         assert command in options, f"{name(page)}: kkl-gym {shown}"
         used = set(re.findall(r"(?<!\S)--[\w-]+", shown))
@@ -159,6 +159,10 @@ def test_links_lead_somewhere(page):
     text = re.sub(r"`[^`\n]*`", "", Page(page).prose)
     links = re.findall(r"\]\(([^)\s]+)\)|\b(?:href|src|srcset)=\"([^\"]+)\"", text)
     for link in filter(None, (one for both in links for one in both)):
-        target = link.partition("#")[0]
-        if not re.match(r"[a-z]+:", link) and target:
-            assert (page.parent / target).exists(), f"{name(page)}: {link}"
+        if re.match(r"[a-z]+:", link):
+            continue
+        target, _, anchor = link.partition("#")
+        found = page.parent / target if target else page
+        assert found.exists(), f"{name(page)}: {link}"
+        if anchor and found.suffix == ".md":
+            assert anchor in Page(found).anchors, f"{name(page)}: {link}"

@@ -1,12 +1,6 @@
 """What is shown on the Markdown pages of the repository: blocks of code, command lines, links.
 
-A comment above a block of Python says how it is run, where it is not run as it stands:
-
-- ``<!-- slow -->``: it trains. It is run behind the marker `slow`, and before that its names are looked up.
-- ``<!-- continues -->``: it needs what a slow block has made.
-- ``<!-- small: steps=40_000 -> steps=300; n=100 -> n=2 -->``: these texts are replaced, so that it takes seconds.
-- ``<!-- first: code -->``: code that readers need not see, run before it.
-- ``<!-- run by tests/test_examples.py -->``, on top of a page: somebody else runs all its blocks.
+A comment above a block of Python says how it is run, where it is not run as it stands: CONTRIBUTING.md lists them.
 """
 
 import re
@@ -18,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "examples/README.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 BLOCK = re.compile(r"((?:^<!--(?:(?!-->).)*-->\n+)*)^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
@@ -86,6 +80,12 @@ class Page:
     def prose(self):
         """The text without its blocks."""
         return re.sub(r"^```.*?^```", "", self.text, flags=re.MULTILINE | re.DOTALL)
+
+    @property
+    def anchors(self):
+        """Where its titles are, as GitHub and the site name the places."""
+        titles = re.findall(r"^#+ (.*)$", self.prose, re.MULTILINE)
+        return {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
 
     @property
     def commands(self):
