@@ -59,7 +59,7 @@ def test_links_lead_to_the_same_place_in_the_site(source, page, link, becomes):
 
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-f", str(DOCS / "site" / "mkdocs.yml")]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(DOCS / "site" / "mkdocs.yml")]
     done = subprocess.run([*command, "-d", str(tmp_path / "site")], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     for path in (tmp_path / "site").rglob("*.html"):
