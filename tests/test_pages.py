@@ -35,13 +35,18 @@ def playground(tmp_path, monkeypatch):
     """A folder in which blocks of code run, with the examples; agents learn for a few steps only."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
+    from sb3_contrib import RecurrentPPO
     from stable_baselines3 import DQN, PPO, SAC
 
-    for agent in (DQN, PPO, SAC):
-        learn = agent.learn
-        monkeypatch.setattr(
-            agent, "learn", lambda self, steps, *rest, learn=learn, **more: learn(self, 2, *rest, **more)
-        )
+    def briefly(learn):
+        def few_steps(agent, total_timesteps, *rest, **more):
+            agent.n_epochs = 1  # which off-policy agents have not, and do not ask for
+            return learn(agent, 2, *rest, **more)
+
+        return few_steps
+
+    for agent in (DQN, PPO, RecurrentPPO, SAC):
+        monkeypatch.setattr(agent, "learn", briefly(agent.learn))
     return tmp_path
 
 
