@@ -54,7 +54,8 @@ def animate(path: Path, motions: Sequence[Motion]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.4 * len(motions), 3.1), dpi=120, layout="constrained")
+    side = 2.4 if len(motions) > 1 else 4.8  # one alone must have room for the legend
+    figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120, layout="constrained")
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(motions), squeeze=False, height_ratios=[4, 1])
     columns = [Column(motion, *pair) for motion, pair in zip(motions, axes.T, strict=True)]
