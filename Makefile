@@ -97,8 +97,9 @@ RLLIB := "ray[rllib]>=2.40" torch tyro
 
 clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
 	CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" .venv-clients/bin/pytest -W default -m clients \
-		tests/clients/test_clients.py
-	RAY_worker_niceness=0 .venv-rllib/bin/pytest -W default -m clients tests/clients/test_rllib.py
+		tests/clients/test_clients.py tests/clients/test_guide.py
+	RAY_worker_niceness=0 .venv-rllib/bin/pytest -W default -m clients \
+		tests/clients/test_rllib.py tests/clients/test_guide.py
 	@cat runs/clients/table.md
 
 .venv-clients/ready .venv-rllib/ready: pyproject.toml Makefile
