@@ -91,8 +91,8 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
 
-# RLlib pins Gymnasium, so that it has an environment of its own. Tianshou imports joblib, which it does not ask for.
-CLIENTS := rl-zoo3 torchrl "tianshou>=2" joblib "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
+# RLlib pins Gymnasium, so that it has an environment of its own.
+CLIENTS := rl-zoo3 torchrl "tianshou[eval]>=2" "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
 RLLIB := "ray[rllib]>=2.40" torch tyro
 
 clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one

@@ -12,8 +12,9 @@ BLOCKS = [block for block in Page(ROOT / "docs" / "guides" / "clients.md").block
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=lambda block: re.findall(r"(?:from|import) (\w+)", block.text)[-1])
-def test_block(block, monkeypatch):
+def test_block(block, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     try:
         exec(compile(block.text, "<a block of clients.md>", "exec"), {"__name__": "__main__"})
     except ModuleNotFoundError as error:
