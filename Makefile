@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clean help
+.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents environments speed clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -22,6 +22,9 @@ test-slow: $(VENV)/ready  ## the tests that train for minutes
 
 test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
+
+test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+	$(BIN)/pytest tests/browser -m browser
 
 lint: $(VENV)/ready  ## style, types and the contract of imports
 	$(BIN)/ruff check .
