@@ -74,7 +74,7 @@ class Picture {
   }
 }
 
-/** Every so many samples that no pixel has more than two; the same ones as time goes on, and always the last. */
+/** Every so many samples that no pixel has two or more; the same ones as time goes on, and always the last. */
 function thinned(samples, pixels) {
   const stride = Math.max(1, Math.floor(samples.length / pixels));
   return samples.filter(({ k }, i) => k % stride === 0 || i === samples.length - 1);
@@ -234,7 +234,7 @@ export class Traces extends Picture {
       context.beginPath();
       context.rect(left, lane.top - 4, right - left, lane.tall + 8);
       context.clip();
-      if (lane.i === world.measured) this.#samples(context, all, T, lane.Y);
+      if (lane.i === world.measured) this.#samples(context, thinned(all, 1.5 * (right - left)), T, lane.Y);
       if (shown.at(-1).std) this.#band(context, shown, T, lane);
       for (const [key, colour, width] of LINES) {
         context.strokeStyle = look[colour];

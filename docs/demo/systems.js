@@ -76,7 +76,7 @@ export class System {
 
   #motion(x, seconds) {
     const still = [this.u_max.map(() => 0), this.scale.map(() => 0)], motion = [x];
-    for (let t = 0; t < seconds && this.inside(x); t += 0.025) motion.push((x = this.advance(x, ...still, 0.025)));
+    for (let t = 0; t < seconds && this.inside(x); t += 0.0125) motion.push((x = this.advance(x, ...still, 0.0125)));
     return motion;
   }
 }

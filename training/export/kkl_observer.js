@@ -19,10 +19,25 @@ export function readTensors(buffer) {
 }
 
 const ACTIVATIONS = {
-  tanh: Math.tanh,
-  silu: (h) => 0.5 * h + 0.5 * h * Math.tanh(0.5 * h), // cannot overflow
-  relu: (h) => Math.max(h, 0),
+  tanh: (h) => h.forEach((value, i) => (h[i] = Math.tanh(value))),
+  silu: (h) => h.forEach((value, i) => (h[i] = 0.5 * value + 0.5 * value * Math.tanh(0.5 * value))), // cannot overflow
+  relu: (h) => h.forEach((value, i) => (h[i] = Math.max(value, 0))),
 };
+
+/** out = weights h + biases. */
+function product(weights, biases, inputs, outputs, h, out) {
+  for (let i = 0, w = 0; i < outputs; i++) {
+    let a = biases[i], b = 0, c = 0, d = 0, j = 0; // several sums: none waits for the one before
+    for (; j + 3 < inputs; j += 4, w += 4) {
+      a += weights[w] * h[j];
+      b += weights[w + 1] * h[j + 1];
+      c += weights[w + 2] * h[j + 2];
+      d += weights[w + 3] * h[j + 3];
+    }
+    for (; j < inputs; j++) a += weights[w++] * h[j];
+    out[i] = a + b + (c + d);
+  }
+}
 
 class Network {
   constructor(tensors, prefix, activation) {
@@ -39,20 +54,12 @@ class Network {
   /** The outputs, in an array that the next call writes into. */
   run(given) {
     let h = given;
-    this.layers.forEach(({ weights, biases, outputs, inputs, out }, depth) => {
-      const last = depth === this.layers.length - 1;
-      for (let i = 0, w = 0; i < outputs; i++) {
-        let [a, b] = [biases[i], 0]; // two sums: neither waits for the other
-        let j = 0;
-        for (; j + 1 < inputs; j += 2, w += 2) {
-          a += weights[w] * h[j];
-          b += weights[w + 1] * h[j + 1];
-        }
-        if (j < inputs) a += weights[w++] * h[j];
-        out[i] = last ? a + b : this.activate(a + b);
-      }
+    for (let depth = 0; depth < this.layers.length; depth++) {
+      const { weights, biases, outputs, inputs, out } = this.layers[depth];
+      product(weights, biases, inputs, outputs, h, out);
+      if (depth < this.layers.length - 1) this.activate(out);
       h = out;
-    });
+    }
     return h;
   }
 }
