@@ -74,9 +74,9 @@ class Picture {
   }
 }
 
-/** Every so many samples that no pixel has two or more; the same ones as time goes on, and always the last. */
-function thinned(samples, pixels) {
-  const stride = Math.max(1, Math.floor(samples.length / pixels));
+/** Every so many samples that fewer than twice `count` are left; the same ones as time goes on, and always the last. */
+function thinned(samples, count) {
+  const stride = Math.max(1, Math.floor(samples.length / count));
   return samples.filter(({ k }, i) => k % stride === 0 || i === samples.length - 1);
 }
 
@@ -127,7 +127,7 @@ export class Portrait extends Picture {
 
   foreground(context) {
     const { i, j, left, right, top, low, X, Y } = this.axes, { world, look } = this;
-    const recent = thinned(world.history.slice(-Math.round((TRAIL * world.system.seconds) / world.system.dt)), 500);
+    const recent = thinned(world.history.slice(-Math.round((TRAIL * world.system.seconds) / world.system.dt)), 300);
     const now = recent.at(-1);
     context.save();
     context.beginPath();
@@ -226,7 +226,7 @@ export class Traces extends Picture {
   foreground(context) {
     const { lanes, score, left, right } = this.lanes, { world, look } = this, { seconds, dt } = world.system;
     const now = world.time, from = Math.max(0, now - seconds);
-    const all = world.history.slice(-Math.round(seconds / dt) - 1), shown = thinned(all, right - left);
+    const all = world.history.slice(-Math.round(seconds / dt) - 1), shown = thinned(all, (right - left) / 2);
     const T = (t) => left + ((t - from) / seconds) * (right - left);
     this.#faults(context, shown, T, lanes[0].top - 4, score.Y(0));
     for (const lane of lanes) {
@@ -234,7 +234,7 @@ export class Traces extends Picture {
       context.beginPath();
       context.rect(left, lane.top - 4, right - left, lane.tall + 8);
       context.clip();
-      if (lane.i === world.measured) this.#samples(context, thinned(all, 1.5 * (right - left)), T, lane.Y);
+      if (lane.i === world.measured) this.#samples(context, thinned(all, right - left), T, lane.Y);
       if (shown.at(-1).std) this.#band(context, shown, T, lane);
       for (const [key, colour, width] of LINES) {
         context.strokeStyle = look[colour];
