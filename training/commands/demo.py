@@ -16,6 +16,7 @@ from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
+from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
@@ -43,6 +44,8 @@ class Demo:
     live: bool = False
     """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
     the sensor. Keys are shown there."""
+    gif: bool = False
+    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
 
     def run(self, console: Console) -> Path | None:
         """Run.
@@ -64,8 +67,8 @@ class Demo:
         """
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        if self.live and self.duration is not None:
-            raise ValueError("a window stays open until it is closed: leave out --duration beside --live")
+        if self.live and (self.duration is not None or self.gif):
+            raise ValueError("a window stays open until it is closed: leave out --duration and --gif beside --live")
         environments = shown(self.system or ("van_der_pol" if self.live else None), self.observer)
         for one in environments:
             if not one.observed:
@@ -89,6 +92,11 @@ class Demo:
             with progress.phase("drawing"):
                 draw(path, episodes)
             progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
+            if self.gif:
+                moving = path.with_suffix(".gif")
+                with progress.phase("drawing the moving picture"):
+                    animate(moving, [episode.motion for episode in episodes])
+                progress.say(f"wrote {moving}: states in black, estimates in red, measured outputs below")
         return path
 
 
@@ -127,6 +135,12 @@ class Episode:
     def name(self) -> str:
         """The system's."""
         return self.env.unwrapped.system.name  # type: ignore[attr-defined]
+
+    @property
+    def motion(self) -> Motion:
+        """What a moving picture shows of it."""
+        env: Any = self.env.unwrapped
+        return Motion(env.system, env.dt, self.x, self.x_hat, self.y)
 
     @property
     def measurement_noise(self) -> str:

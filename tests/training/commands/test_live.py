@@ -128,7 +128,7 @@ def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
     ("arguments", "message"),
     [
         ([], "--live needs a window, and matplotlib's backend here is 'agg'"),
-        (["--duration", "3"], "leave out --duration beside --live"),
+        (["--duration", "3"], "leave out --duration and --gif beside --live"),
         ([OWN], "no observer ships for 'oscillator'"),
     ],
 )
