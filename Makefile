@@ -97,6 +97,7 @@ speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one t
 docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
 	$(BIN)/python docs/site/commands.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
+	$(BIN)/python docs/demo/build.py runs/site/demo
 
 clean:  ## remove environments and caches; what lies under runs/ stays
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*
