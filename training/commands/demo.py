@@ -41,11 +41,11 @@ class Demo:
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
+    gif: bool = False
+    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
     live: bool = False
     """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
     the sensor. Keys are shown there."""
-    gif: bool = False
-    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
 
     def run(self, console: Console) -> Path | None:
         """Run.
