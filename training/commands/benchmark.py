@@ -1,6 +1,6 @@
 """``kkl-gym benchmark``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +11,7 @@ from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
 from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
-from training.commands.running import run_missing
+from training.commands.running import Workers, run_missing
 from training.evaluation.levels import multiple, show_level
 from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator
@@ -45,8 +45,7 @@ class Benchmark:
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
-    jobs: int = 2
-    """Worker processes, of one thread each."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     seed: int = 0
     """Seed of the test trajectories; training's is always 0."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
@@ -85,7 +84,7 @@ class Benchmark:
             failures = list[str]()
             if not self.report:
                 jobs = self._jobs(name, out)
-                failures = run_missing(run_job, jobs, workers=self.jobs, what="observers", progress=progress)
+                failures = run_missing(run_job, jobs, workers=self.workers, what="observers", progress=progress)
                 trained = [job for job in jobs if job.done]
                 for job in progress.track(trained, description="timing steps"):
                     try:
@@ -112,8 +111,8 @@ class Benchmark:
         from training.methods import METHODS, WrongParameters, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
-        if self.jobs < 1 or not self.systems or not methods or levels == ():
-            raise ValueError("give at least one system, method, noise level and worker process")
+        if not self.systems or not methods or levels == ():
+            raise ValueError("give at least one system, method and noise level")
         generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
         for names in (*named, [show_level(level) for level in levels or ()]):
