@@ -17,11 +17,12 @@ from typing import Any, Literal, Protocol, TypeVar
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import get_reusable_executor
 
+from training.clusters import CLUSTERS
+
 Backend = Literal["loky", "dask", "ray"]
 
 WORKERS = 2  # of this machine, unless told otherwise
 TRIES = 3  # of a job whose worker dies
-BEAT = 1.0  # seconds between a Dask worker's looks at whether its job is still wanted
 
 
 class Named(Protocol):
@@ -158,9 +159,8 @@ def engine(workers: int | None = None, *, backend: Backend = "loky", address: st
     if address is None:
         example = {"dask": "tcp://HOST:8786", "ray": "auto, or HOST:6379"}[backend]
         raise ValueError(f"--backend {backend} needs the --address of its cluster, as in {example}")
-    connect = {"dask": _dask, "ray": _ray}[backend]
-    with connect(address, workers) as found:
-        yield found
+    with CLUSTERS[backend](address) as (cores, futures, around):
+        yield Engine(min(workers or cores, cores), {"backend": futures}, partial(around, Path.cwd()))
 
 
 @contextmanager
@@ -186,61 +186,3 @@ def _prepare(lifeline: Connection) -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _dask(address: str, workers: int | None) -> Iterator[Engine]:
-    from distributed import Client
-
-    with Client(address) as client:
-        try:
-            client.wait_for_workers(2, timeout=60)
-        except TimeoutError:
-            raise ValueError(
-                f"the Dask scheduler at {address} has fewer than two workers: dask worker {address} --nthreads 1"
-            ) from None
-        threads = client.nthreads()
-        if set(threads.values()) != {1}:
-            raise ValueError(
-                "a job counts the CPU time of its process, so that Dask's workers must have one thread: start them "
-                f"with --nthreads 1; got {threads}"
-            )
-        yield Engine(min(workers or len(threads), len(threads)), {"backend": "dask"}, partial(_on_dask, Path.cwd()))
-
-
-@contextmanager
-def _on_dask(folder: Path) -> Iterator[None]:
-    """Work in a folder, and end the worker when nobody wants the job any more: threads cannot be interrupted."""
-    from distributed import get_worker
-
-    worker, ended = get_worker(), threading.Event()
-    job = worker.state.tasks[worker.get_current_task()]
-
-    def watch() -> None:
-        while not ended.wait(BEAT):
-            if job.state == "cancelled":
-                os._exit(1)  # its nanny starts another
-
-    with chdir(folder):
-        if worker.nanny is not None:
-            threading.Thread(target=watch, daemon=True).start()
-        try:
-            yield
-        finally:
-            ended.set()
-
-
-@contextmanager
-def _ray(address: str, workers: int | None) -> Iterator[Engine]:
-    import ray
-
-    from training.ray_backend import RayTasks
-
-    ray.init(address=address, log_to_driver=False, logging_level="WARNING")
-    try:
-        cores = int(ray.cluster_resources().get("CPU", 0))
-        if not cores:
-            raise ValueError(f"the Ray cluster at {address} has no cores for jobs")
-        yield Engine(min(workers or cores, cores), {"backend": RayTasks()}, partial(chdir, Path.cwd()))
-    finally:
-        ray.shutdown()
