@@ -4,6 +4,7 @@ Both libraries have one, which jobs of minutes cannot use: joblib's for Dask (1.
 scheduler has given up, and Ray's (2.60) gives the next job to the next worker in turn, whether that is free or not.
 """
 
+import logging
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -167,7 +168,7 @@ def ray(address: str) -> Iterator[Cluster]:
         tasks[future] = task
         return future
 
-    ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level="WARNING")
+    ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.WARNING)
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))
         yield max(1, cores), Futures(begin, lambda future: ray.cancel(tasks[future], force=True)), chdir

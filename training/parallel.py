@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, chdir, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
@@ -55,9 +55,7 @@ class Engine:
     settings: Mapping[str, Any]
     around: Callable[[], AbstractContextManager[None]] = nullcontext
 
-    def run(
-        self, run: Callable[[Job], None], jobs: Sequence[Job]
-    ) -> Iterator[tuple[Job, str | None, list[str]]]:
+    def run(self, run: Callable[[Job], None], jobs: Sequence[Job]) -> Iterator[tuple[Job, str | None, list[str]]]:
         """Run jobs, whatever goes wrong in one of them.
 
         Where a worker dies, what it and those beside it were at is run again, ``TRIES`` times in all. An interruption

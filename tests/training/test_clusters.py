@@ -1,16 +1,16 @@
 """Jobs on real clusters of Dask's and Ray's, which run on this machine here: as in worker processes, file for file."""
 
 import os
-import signal
-import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from busy_jobs import Busy, alive, until, work
 
+from training import clusters
 from training.parallel import engine
 
+dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 ray = pytest.importorskip("ray")
 
@@ -31,7 +31,7 @@ def ray_cluster():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_AUTH_MODE", "disabled")
-        ray.init(num_cpus=2, include_dashboard=False, object_store_memory=100 * 2**20, log_to_driver=False)
+        ray.init("local", num_cpus=2, include_dashboard=False, object_store_memory=100 * 2**20, log_to_driver=False)
         address = ray.get_runtime_context().gcs_address
         yield "ray", address
         ray.shutdown()
@@ -40,3 +40,94 @@ def ray_cluster():
 @pytest.fixture(params=["dask", "ray"])
 def cluster(request):
     return request.getfixturevalue(f"{request.param}_cluster")
+
+
+def counted(job):
+    """Numbers that hang together, so that another order of rounding would show."""
+    rng = np.random.default_rng(len(job.name))
+    matrix = rng.normal(size=(60, 60))
+    job.path.write_bytes(np.linalg.solve(matrix, matrix @ matrix).tobytes())
+    if job.name == "bad":
+        raise ValueError("this one is bad")
+
+
+def test_the_same_files_and_the_same_failures_as_in_worker_processes(cluster, tmp_path):
+    backend, address = cluster
+    written = []
+    for options in ({}, {"backend": backend, "address": address}):
+        folder = tmp_path / options.get("backend", "loky")
+        folder.mkdir()
+        with engine(2, **options) as here:
+            assert here.workers == 2
+            ended = list(here.run(counted, [Busy(name, folder) for name in ("a", "bad", "ccc", "dddd")]))
+        assert {job.name: failure for job, failure, _ in ended if failure} == {"bad": "this one is bad"}
+        assert ended[-1][2] == []
+        written.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert len(written[0]) == 4
+    assert written[0] == written[1]
+
+
+def relative(job):
+    Path(job.name).write_text("here")
+
+
+def test_paths_are_meant_from_where_the_command_was_begun(cluster, tmp_path, monkeypatch):
+    backend, address = cluster
+    monkeypatch.chdir(tmp_path)
+    with engine(backend=backend, address=address) as here:
+        assert [failure for _, failure, _ in here.run(relative, [Busy(name, Path()) for name in "ab"])] == [None] * 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
+
+
+@needs_proc
+def test_a_single_job_runs_in_the_cluster_and_again_if_its_worker_dies(cluster, tmp_path):
+    backend, address = cluster
+    job = Busy("a", tmp_path, kills=1)
+    with engine(1, backend=backend, address=address) as here:
+        assert [failure for _, failure, _ in here.run(work, [job])] == [None]
+    assert len(job.processes) == 2
+    assert os.getpid() not in job.processes
+
+
+@needs_proc
+def test_an_interruption_ends_the_jobs_and_leaves_the_cluster(cluster, tmp_path):
+    backend, address = cluster
+    mine = Busy("long", tmp_path, 600.0)
+    with engine(2, backend=backend, address=address) as here:
+        runs = here.run(work, [Busy("short", tmp_path), mine])
+        next(runs)
+        until(lambda: mine.processes)
+        with pytest.raises(KeyboardInterrupt):
+            runs.throw(KeyboardInterrupt)
+        until(lambda: not alive(mine.processes[0]))
+        assert [failure for _, failure, _ in here.run(work, [Busy("after", tmp_path)])] == [None]
+
+
+def test_workers_with_several_threads_are_refused():
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        pytest.raises(ValueError, match="Dask's workers must have one thread each: start them with --nthreads 1"),
+        engine(backend="dask", address=cluster.scheduler_address),
+    ):
+        raise AssertionError
+
+
+def test_a_scheduler_without_workers(monkeypatch):
+    monkeypatch.setattr(clusters, "PATIENCE", 0.1)
+    options = {"n_workers": 0, "processes": False, "dashboard_address": None}
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        pytest.raises(ValueError, match="has no workers: start some, dask worker"),
+        engine(backend="dask", address=cluster.scheduler_address),
+    ):
+        raise AssertionError
+
+
+def test_nobody_answers(monkeypatch):
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}),
+        pytest.raises(OSError, match=r"tcp://127\.0\.0\.1:9"),
+        engine(backend="dask", address="tcp://127.0.0.1:9"),
+    ):
+        raise AssertionError

@@ -54,13 +54,13 @@ def test_a_worker_has_one_thread(monkeypatch, tmp_path):
     assert [job.path.read_text() for job in jobs] == ["1 1 1"] * 2
 
 
-class Unsendable(Exception):
+class UnsendableError(Exception):
     def __init__(self, lock):
         super().__init__(f"with {lock}")
 
 
 def fail(job):
-    raise {"odd": Unsendable("a lock"), "silent": ValueError()}[job.name]
+    raise {"odd": UnsendableError("a lock"), "silent": ValueError()}[job.name]
 
 
 def test_errors_that_cannot_be_sent_or_say_nothing(tmp_path):
@@ -99,11 +99,12 @@ def test_an_interruption_ends_the_workers_and_nobody_else(tmp_path):
     unrelated.start()
     try:
         mine = [Busy("first", tmp_path, 600.0), Busy("second", tmp_path, 600.0)]
-        with pytest.raises(KeyboardInterrupt), engine(2) as here:
+        with engine(2) as here:
             runs = here.run(work, [Busy("short", tmp_path), *mine])
             next(runs)
             until(lambda: mine[0].processes)
-            runs.throw(KeyboardInterrupt)
+            with pytest.raises(KeyboardInterrupt):
+                runs.throw(KeyboardInterrupt)
         workers = [number for job in mine for number in job.processes]
         assert not any(map(alive, workers))
         assert unrelated.is_alive()

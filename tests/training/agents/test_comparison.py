@@ -31,7 +31,14 @@ from training.systems import PROFILES
 
 
 def toy(out, **options):
-    settings = {"systems": ("lorenz",), "seeds": 2, "episodes": 3, "timesteps": 1, "more_noise": False, "workers": Workers(1)}
+    settings = {
+        "systems": ("lorenz",),
+        "seeds": 2,
+        "episodes": 3,
+        "timesteps": 1,
+        "more_noise": False,
+        "workers": Workers(1),
+    }
     return Compare(out=out, **{**settings, **options})
 
 

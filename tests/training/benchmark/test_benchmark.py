@@ -39,6 +39,7 @@ TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, cpu_seconds=1e9
 SHORT = Protocol(trajectories=2, duration=2.0)
 RESULTS = Path(__file__).parents[3] / "docs" / "results"
 
+
 def run_all(jobs, workers):
     with engine(workers) as here:
         return list(here.run(run_job, jobs))
@@ -328,7 +329,9 @@ def test_step_time_is_that_of_the_fastest_round_and_of_whole_batches(monkeypatch
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     name, trainings = toy
     out = tmp_path / "out"
-    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, workers=Workers(1)).run(quiet())
+    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, workers=Workers(1)).run(
+        quiet()
+    )
     results = pd.read_csv(out / "results.csv")
     assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
     expected = unseen_trajectories(get_system("lorenz"), TINY.dt, n=2, duration=2.0, seed=0).x
@@ -455,9 +458,9 @@ def test_wrong_methods_are_trained_on_another_system_than_they_see(toy, tiny, tm
     monkeypatch.setattr(
         training.benchmark.jobs, "measure", lambda *its, **how: measured.append(its[2].parameters) or seen(*its, **how)
     )
-    Benchmark(quick=True, systems=("van_der_pol",), methods=(f"{script}:Wrong",), out=tmp_path / "out", workers=Workers(1)).run(
-        quiet()
-    )
+    Benchmark(
+        quick=True, systems=("van_der_pol",), methods=(f"{script}:Wrong",), out=tmp_path / "out", workers=Workers(1)
+    ).run(quiet())
     assert trainings.read_text().splitlines() == ["{'mu': 3.3000000000000003}"]
     assert measured == [{"mu": 3.0}]
 
@@ -654,7 +657,9 @@ def test_new_rows_stand_beside_those_of_an_earlier_run(toy, tiny, tmp_path):
         header, *rows = (earlier / file).read_text().splitlines(True)
         both = [row.replace("lorenz", system) for system in ("rossler", "van_der_pol") for row in rows]
         (earlier / file).write_text("".join([header, *both]))
-    Benchmark(systems=("rossler",), methods=("ekf-untuned", name), out=out, beside=earlier, workers=Workers(1)).run(quiet())
+    Benchmark(systems=("rossler",), methods=("ekf-untuned", name), out=out, beside=earlier, workers=Workers(1)).run(
+        quiet()
+    )
     methods, results = (pd.read_csv(out / file) for file in ("methods.csv", "results.csv"))
     expected = [("van_der_pol", "ekf-untuned"), ("rossler", "ekf-untuned"), ("rossler", "constant")]
     assert list(zip(methods.system, methods.method)) == expected
@@ -729,7 +734,9 @@ def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeyp
 
 def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert Benchmark(systems=("lorenz",), methods=(toy[0],), workers=Workers(1)).run(quiet()) == Path("runs/benchmark/cpu")
+    assert Benchmark(systems=("lorenz",), methods=(toy[0],), workers=Workers(1)).run(quiet()) == Path(
+        "runs/benchmark/cpu"
+    )
     assert (tmp_path / "runs" / "benchmark" / "cpu" / "table.md").exists()
 
 
