@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pyte
 
 @pytest.fixture(scope="module")
 def dask_cluster():
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     with distributed.LocalCluster(**options) as cluster:
         yield "dask", cluster.scheduler_address
 
@@ -104,7 +104,7 @@ def test_an_interruption_ends_the_jobs_and_leaves_the_cluster(cluster, tmp_path)
 
 
 def test_workers_with_several_threads_are_refused():
-    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
         pytest.raises(ValueError, match="Dask's workers must have one thread each: start them with --nthreads 1"),
@@ -115,7 +115,7 @@ def test_workers_with_several_threads_are_refused():
 
 def test_a_scheduler_without_workers(monkeypatch):
     monkeypatch.setattr(clusters, "PATIENCE", 0.1)
-    options = {"n_workers": 0, "processes": False, "dashboard_address": None}
+    options = {"n_workers": 0, "processes": False, "dashboard_address": ":0"}
     with (
         distributed.LocalCluster(**options) as cluster,
         pytest.raises(ValueError, match="has no workers: start some, dask worker"),
