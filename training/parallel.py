@@ -96,8 +96,7 @@ class Engine:
                 for index in list(todo)[:workers]:
                     lost[index] += 1
                     if lost[index] == TRIES:
-                        died = f"its worker, or one beside it, died {TRIES} times: {error}"
-                        yield todo.pop(index), died, self._running(todo)
+                        yield todo.pop(index), f"was lost {TRIES} times with its worker: {error}", self._running(todo)
             except BaseException:
                 with warnings.catch_warnings(action="ignore"):  # that not all jobs have run
                     ended.close()

@@ -1,13 +1,19 @@
 """Jobs on real clusters of Dask's and Ray's, which run on this machine here: as in worker processes, file for file."""
 
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from busy_jobs import Busy, alive, until, work
+from rich.console import Console
+from safetensors.numpy import load_file
 
 from training import clusters
+from training.commands.benchmark import Benchmark
+from training.commands.running import Workers
 from training.parallel import engine
 
 dask = pytest.importorskip("dask")
@@ -31,6 +37,7 @@ def ray_cluster():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_AUTH_MODE", "disabled")
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))  # of the workers
         ray.init("local", num_cpus=2, include_dashboard=False, object_store_memory=100 * 2**20, log_to_driver=False)
         address = ray.get_runtime_context().gcs_address
         yield "ray", address
@@ -65,6 +72,34 @@ def test_the_same_files_and_the_same_failures_as_in_worker_processes(cluster, tm
         written.append({path.name: path.read_bytes() for path in folder.iterdir()})
     assert len(written[0]) == 4
     assert written[0] == written[1]
+
+
+@pytest.mark.slow
+def test_a_quick_benchmark_is_the_same_bit_for_bit(dask_cluster, ray_cluster, tmp_path):
+    """Results, errors of every trajectory and weights; seconds of training and microseconds of a step are left out."""
+    written = []
+    for backend, address in (("loky", None), dask_cluster, ray_cluster):
+        command = Benchmark(
+            quick=True,
+            systems=("van_der_pol",),
+            methods=("default", "node", "ekf-untuned"),
+            out=tmp_path / backend,
+            workers=Workers(2, backend, address),
+        )
+        out = command.run(Console(quiet=True))
+        files = {path.relative_to(out): path.read_bytes() for path in [out / "results.csv", *out.rglob("errors.csv")]}
+        weights = {
+            (path.relative_to(out), name): array.tobytes()
+            for path in out.rglob("trained.safetensors")
+            for name, array in load_file(path).items()
+        }
+        costs = pd.read_csv(out / "methods.csv").drop(columns=["train_seconds", "us_batch_1", "us_batch_1000"])
+        written.append((files, weights, costs.to_csv()))
+    files, weights, _ = written[0]
+    assert len(files) == 4
+    assert len(weights) > 4
+    assert written[0] == written[1]
+    assert written[0] == written[2]
 
 
 def relative(job):
