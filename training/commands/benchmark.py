@@ -26,15 +26,16 @@ class Benchmark:
 
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer; a run that was interrupted goes on where it stopped, and jobs may be spread over several runs by
-    --systems and --methods. What is missing from the full set is said in table and figure.
+    trained observer; a run that was interrupted goes on where it stopped, and --systems and --methods do a
+    part of it. What is missing from the full set is said in table and figure.
     """
 
     budget: Literal["short", "cpu", "paper"] = "cpu"
     """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s. paper: 8 million
     points, networks of 4 x 512, an hour each; wants a GPU."""
     quick: bool = False
-    """In place of the budget: short trainings, no search, few and short test trajectories; a matter of minutes."""
+    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of minutes,
+    with the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
