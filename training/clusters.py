@@ -142,7 +142,7 @@ def ray(address: str) -> Iterator[Cluster]:
     Parameters
     ----------
     address : str
-        Of its head; auto for the one of this machine.
+        Of its head; auto for the one of this machine. A caller who is connected already stays so.
 
     Yields
     ------
@@ -168,12 +168,14 @@ def ray(address: str) -> Iterator[Cluster]:
         tasks[future] = task
         return future
 
-    ray.init(address=address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.WARNING)
+    if connected := not ray.is_initialized():
+        ray.init(address=address, log_to_driver=False, logging_level=logging.WARNING)
     try:
         cores = int(ray.cluster_resources().get("CPU", 0))
         yield max(1, cores), Futures(begin, lambda future: ray.cancel(tasks[future], force=True)), chdir
     finally:
-        ray.shutdown()
+        if connected:
+            ray.shutdown()
 
 
 def _call(call: Call) -> Any:

@@ -6,6 +6,8 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 WAIT = 120.0  # seconds, for processes that import much on a busy machine
 
 
@@ -38,6 +40,19 @@ def work(job):
     if len(job.processes) <= job.kills:
         os.kill(os.getpid(), signal.SIGKILL)
     time.sleep(job.seconds)
+
+
+def solve(job):
+    """Write numbers that hang together, so that another order of rounding would show; a bad job fails after it."""
+    matrix = np.random.default_rng(len(job.name)).normal(size=(60, 60))
+    job.path.write_bytes(np.linalg.solve(matrix, matrix @ matrix).tobytes())
+    if job.name == "bad":
+        raise ValueError("this one is bad")
+
+
+def write_here(job):
+    """Write a file to the working directory."""
+    Path(job.name).write_text("here")
 
 
 def until(condition):

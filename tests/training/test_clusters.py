@@ -4,10 +4,9 @@ import os
 import sys
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import pytest
-from busy_jobs import Busy, alive, until, work
+from busy_jobs import Busy, alive, solve, until, work, write_here
 from rich.console import Console
 from safetensors.numpy import load_file
 
@@ -20,6 +19,7 @@ dask = pytest.importorskip("dask")
 distributed = pytest.importorskip("distributed")
 ray = pytest.importorskip("ray")
 
+HELPERS = Path(__file__).parents[1] / "helpers"
 needs_proc = pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
 # What the libraries themselves leave open when a cluster ends.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
@@ -37,7 +37,7 @@ def ray_cluster():
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_AUTH_MODE", "disabled")
-        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))  # of the workers
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(HELPERS), *sys.path]))  # of the workers
         ray.init("local", num_cpus=2, include_dashboard=False, object_store_memory=100 * 2**20, log_to_driver=False)
         address = ray.get_runtime_context().gcs_address
         yield "ray", address
@@ -49,15 +49,6 @@ def cluster(request):
     return request.getfixturevalue(f"{request.param}_cluster")
 
 
-def counted(job):
-    """Numbers that hang together, so that another order of rounding would show."""
-    rng = np.random.default_rng(len(job.name))
-    matrix = rng.normal(size=(60, 60))
-    job.path.write_bytes(np.linalg.solve(matrix, matrix @ matrix).tobytes())
-    if job.name == "bad":
-        raise ValueError("this one is bad")
-
-
 def test_the_same_files_and_the_same_failures_as_in_worker_processes(cluster, tmp_path):
     backend, address = cluster
     written = []
@@ -66,7 +57,7 @@ def test_the_same_files_and_the_same_failures_as_in_worker_processes(cluster, tm
         folder.mkdir()
         with engine(2, **options) as here:
             assert here.workers == 2
-            ended = list(here.run(counted, [Busy(name, folder) for name in ("a", "bad", "ccc", "dddd")]))
+            ended = list(here.run(solve, [Busy(name, folder) for name in ("a", "bad", "ccc", "dddd")]))
         assert {job.name: failure for job, failure, _ in ended if failure} == {"bad": "this one is bad"}
         assert ended[-1][2] == []
         written.append({path.name: path.read_bytes() for path in folder.iterdir()})
@@ -102,15 +93,11 @@ def test_a_quick_benchmark_is_the_same_bit_for_bit(dask_cluster, ray_cluster, tm
     assert written[0] == written[2]
 
 
-def relative(job):
-    Path(job.name).write_text("here")
-
-
 def test_paths_are_meant_from_where_the_command_was_begun(cluster, tmp_path, monkeypatch):
     backend, address = cluster
     monkeypatch.chdir(tmp_path)
     with engine(backend=backend, address=address) as here:
-        assert [failure for _, failure, _ in here.run(relative, [Busy(name, Path()) for name in "ab"])] == [None] * 2
+        assert [failure for _, failure, _ in here.run(write_here, [Busy(name, Path()) for name in "ab"])] == [None] * 2
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b"]
 
 

@@ -34,8 +34,8 @@ class Benchmark:
     """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s. paper: 8 million
     points, networks of 4 x 512, an hour each; wants a GPU."""
     quick: bool = False
-    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of minutes,
-    with the same results each time."""
+    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of
+    minutes, with the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
