@@ -26,8 +26,8 @@ class Benchmark:
 
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer; a run that was interrupted goes on where it stopped, and --systems and --methods do a
-    part of it. What is missing from the full set is said in table and figure.
+    trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
+    work. What is missing from the full set is said in table and figure.
     """
 
     budget: Literal["short", "cpu", "paper"] = "cpu"

@@ -16,6 +16,7 @@ from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
+from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
@@ -40,6 +41,8 @@ class Demo:
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
+    gif: bool = False
+    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
 
     def run(self, console: Console) -> Path:
         """Run.
@@ -79,6 +82,11 @@ class Demo:
             with progress.phase("drawing"):
                 draw(path, episodes)
             progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
+            if self.gif:
+                moving = path.with_suffix(".gif")
+                with progress.phase("drawing the moving picture"):
+                    animate(moving, [episode.motion for episode in episodes])
+                progress.say(f"wrote {moving}: states in black, estimates in red, measured outputs below")
         return path
 
 
@@ -117,6 +125,12 @@ class Episode:
     def name(self) -> str:
         """The system's."""
         return self.env.unwrapped.system.name  # type: ignore[attr-defined]
+
+    @property
+    def motion(self) -> Motion:
+        """What a moving picture shows of it."""
+        env: Any = self.env.unwrapped
+        return Motion(env.system, env.dt, self.x, self.x_hat, self.y)
 
     @property
     def measurement_noise(self) -> str:
