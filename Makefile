@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents environments speed docs clean help
+.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents \
+	environments speed clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -93,6 +94,24 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
+
+# RLlib pins Gymnasium, so that it has an environment of its own.
+CLIENTS := rl-zoo3 torchrl "tianshou[eval]>=2" "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
+RLLIB := "ray[rllib]>=2.40" torch tyro
+
+clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
+	CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" .venv-clients/bin/pytest -W default -m clients \
+		tests/clients/test_clients.py tests/clients/test_guide.py
+	RAY_worker_niceness=0 .venv-rllib/bin/pytest -W default -m clients \
+		tests/clients/test_rllib.py tests/clients/test_guide.py
+	@cat runs/clients/table.md
+
+.venv-clients/ready .venv-rllib/ready: pyproject.toml Makefile
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(@D)/bin/python -m pip install --quiet pytest \
+		$(if $(findstring rllib,$@),--editable . $(RLLIB),--editable ".[agents]" $(CLIENTS))
+	touch $@
 
 docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
 	$(BIN)/python docs/site/commands.py

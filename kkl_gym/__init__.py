@@ -16,6 +16,9 @@ __version__ = "0.1.0"
 
 ENV_IDS = {cls.name: f"KKL{cls.__name__}-v0" for cls in SYSTEMS.values()}
 
+# About nine tenths of what the shipped agents reach on x_hat. Without acting it is 1,850 to 2,700.
+_REWARD_THRESHOLDS = {"reverse_duffing": 4100.0, "van_der_pol": 3900.0, "rossler": 4300.0, "lorenz": 4400.0}
+
 for _name, _id in ENV_IDS.items():
     if _id not in gym.registry:  # a second import, as after importlib.reload, changes nothing
         gym.register(
@@ -23,6 +26,7 @@ for _name, _id in ENV_IDS.items():
             entry_point="kkl_gym.envs:KKLEnv",
             vector_entry_point="kkl_gym.vector:KKLVectorEnv",
             kwargs={"system": _name},
+            reward_threshold=_REWARD_THRESHOLDS.get(_name),
             max_episode_steps=5000,
         )
 

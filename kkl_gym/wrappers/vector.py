@@ -84,6 +84,11 @@ class VectorEstimate(VectorWrapper):
         """
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if not isinstance(info, dict) or not isinstance(info["y"], np.ndarray):
+            raise ValueError(
+                f"the observer reads info['y'] as an array, and {shown(self.env)} changes info: put wrappers such as "
+                "DictInfoToList and NumpyToTorch outside"
+            )
         if mask.all():
             self._estimator.reset(info["y"], _states(info, mask))
         else:
@@ -219,6 +224,8 @@ class _Telling(VectorWrapper):
     ) -> tuple[Any, Infos]:
         options, mask = with_mask(options, self.num_envs)
         obs, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
+        if not isinstance(info, dict):
+            return obs, info  # of which the observers say what is wrong
         self._ended, self._count = self._ended & ~mask, np.where(mask, 0, self._count)
         told = {"y": self._read.outputs(obs, info, (self.num_envs,)), "sample": self._count.copy()}
         told |= self._states(obs, info)

@@ -552,6 +552,21 @@ def test_a_repeat_inside_the_observer_is_noticed(saved):
         env.step(np.zeros((N, 1)))
 
 
+class _OfLists(gym.vector.VectorWrapper):
+    """Makes lists of what ``info`` holds, as some conversions do."""
+
+    def reset(self, **options):
+        obs, info = self.env.reset(**options)
+        return obs, {key: value.tolist() for key, value in info.items()}
+
+
+@pytest.mark.parametrize("wrapper", [gym.wrappers.vector.DictInfoToList, _OfLists])
+def test_what_changes_info_inside_the_observer_is_named(wrapper, saved):
+    envs = KKLVectorObservation(wrapper(KKLVectorEnv("van_der_pol", 2)), saved())
+    with pytest.raises(ValueError, match=rf"{wrapper.__name__}.*changes info: put wrappers such as DictInfoToList"):
+        envs.reset(seed=0)
+
+
 def test_foreign_and_mixed_vectors(saved):
     with pytest.raises(ValueError, match="needs a vector of kkl_gym environments"):
         KKLVectorObservation(gym.make_vec("CartPole-v1", num_envs=2, vectorization_mode="sync"))

@@ -10,11 +10,36 @@ from training.systems import ControlTask
 WORST = 10.0  # of the cost, three scales off in every state; beyond it, networks would learn little else
 
 
-class Cost(VectorWrapper):
-    """Rewards minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
+def paid(task: ControlTask, total: Any, age: Any, terminated: Any) -> Any:
+    """Minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
 
-    The environment's reward is flat far from the target, where c still tells an agent which way to go. A state that
-    escapes is taken to stay where it left for the rest of the episode, so that escaping never pays.
+    Parameters
+    ----------
+    task : ControlTask
+        What is to be done.
+    total : float or ndarray, shape (n,)
+        Sums of the environment's rewards over the samples of an action.
+    age : int or ndarray of int, shape (n,)
+        Samples since reset, where the episode has ended.
+    terminated : bool or ndarray of bool, shape (n,)
+        Whether a state has escaped; it is taken to stay where it left for the rest of the episode.
+
+    Returns
+    -------
+    ndarray, shape () or (n,)
+        What the agent is paid for the action.
+    """
+    samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
+    remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
+    cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
+    return -cost * (1.0 + remaining)
+
+
+class Cost(VectorWrapper):
+    """Pays minus the cost, see :func:`paid`.
+
+    The environment's reward is flat far from the target, where c still tells an agent which way to go. Escaping never
+    pays.
 
     Parameters
     ----------
@@ -42,11 +67,5 @@ class Cost(VectorWrapper):
             What the environment returns, but for the rewards.
         """
         obs, total, terminated, truncated, info = self.env.step(actions)
-        samples = np.full(self.num_envs, self._task.repeat)
-        remaining = np.zeros(self.num_envs)
-        if terminated.any():
-            age = info["final_info"]["sample"]
-            samples = np.where(terminated, (age - 1) % self._task.repeat + 1, samples)
-            remaining = np.where(terminated, self._task.steps - np.ceil(age / self._task.repeat), 0.0)
-        cost = np.minimum((samples / np.maximum(total, 1e-6) - 1.0) / 4.0, WORST)
-        return obs, -cost * (1.0 + remaining), terminated, truncated, info
+        age = info["final_info"]["sample"] if terminated.any() else info["sample"]
+        return obs, paid(self._task, total, age, terminated), terminated, truncated, info

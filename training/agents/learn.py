@@ -1,5 +1,6 @@
 """Train an agent with stable-baselines3 on a control task."""
 
+import ast
 import hashlib
 import json
 from collections.abc import Callable
@@ -272,13 +273,24 @@ def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[st
     if name not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {name!r}; there are {', '.join(ALGORITHMS)}")
     known = _read(name)
-    return name, dict(known.get(ENV_IDS.get(system.name, "default"), known["default"]))
+    settings = dict(known.get(ENV_IDS.get(system.name, "default"), known["default"]))
+    for key in ("env_kwargs", "env_wrapper"):  # what rl-zoo3 makes the task of
+        settings.pop(key, None)
+    if isinstance(settings["policy_kwargs"], str):
+        settings["policy_kwargs"] = _keywords(settings["policy_kwargs"])
+    return name, settings
 
 
 @cache
 def _read(name: str) -> dict[str, Any]:
     text = files("training.agents").joinpath("hyperparameters", f"{name}.yml").read_text()
     return dict(yaml.safe_load(text))
+
+
+def _keywords(call: str) -> dict[str, Any]:
+    """Arguments of ``dict(...)``, as rl-zoo3 needs it for a class, but for the activation: tanh everywhere here."""
+    tree: Any = ast.parse(call, mode="eval")
+    return {k.arg: ast.literal_eval(k.value) for k in tree.body.keywords if k.arg != "activation_fn"}
 
 
 class _Bar(BaseCallback):

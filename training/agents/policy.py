@@ -12,7 +12,7 @@ from torch import nn
 
 from observers import MLP
 
-_ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
+ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.SiLU: "silu"}
 
 
 def perceptron(model: BaseAlgorithm) -> MLP:
@@ -28,18 +28,33 @@ def perceptron(model: BaseAlgorithm) -> MLP:
     MLP
         Observations in; actions before they are bounded, or values of discrete ones, out.
     """
+    body = actor(model)
+    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
+    activation = next((ACTIVATIONS[type(layer)] for layer in body if type(layer) in ACTIVATIONS), "tanh")
+    return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
+
+
+def actor(model: BaseAlgorithm) -> list[nn.Module]:
+    """The modules of an agent's deterministic policy, linear ones and activations, in their order.
+
+    Parameters
+    ----------
+    model : stable_baselines3 algorithm
+        As for :func:`perceptron`.
+
+    Returns
+    -------
+    list of torch.nn.Module
+        From observations to actions before they are bounded, or to values of discrete ones.
+    """
     policy: Any = model.policy
     if isinstance(model, SAC | TQC):
-        body = [*model.actor.latent_pi, model.actor.mu]
-    elif isinstance(model, TD3):
-        body = list(model.actor.mu)
-    elif isinstance(model, DQN):
-        body = list(policy.q_net.q_net)
-    else:
-        body = [*policy.mlp_extractor.policy_net, policy.action_net]
-    layers = [layer for layer in body if isinstance(layer, nn.Linear)]
-    activation = next((_ACTIVATIONS[type(layer)] for layer in body if type(layer) in _ACTIVATIONS), "tanh")
-    return MLP([_array(layer.weight) for layer in layers], [_array(layer.bias) for layer in layers], activation)
+        return [*model.actor.latent_pi, model.actor.mu]
+    if isinstance(model, TD3):
+        return list(model.actor.mu)
+    if isinstance(model, DQN):
+        return list(policy.q_net.q_net)
+    return [*policy.mlp_extractor.policy_net, policy.action_net]
 
 
 def linear(start: float) -> Callable[[float], float]:

@@ -12,13 +12,13 @@ from training.systems import PROFILES, ControlTask, profile
 TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.items() if found.task}
 
 
-def get_task(name: str, measurement_noise: Level | None = None) -> ControlTask:
+def get_task(name: str | System, measurement_noise: Level | None = None) -> ControlTask:
     """The task of a system, with another noise level if one is given.
 
     Parameters
     ----------
-    name : str
-        A shipped system, or ``"script.py:Class"``.
+    name : str or System
+        A shipped system, ``"script.py:Class"``, or the system itself.
     measurement_noise : float or tuple of float, length ny, optional
         Standard deviation of the noise on each sample of y, of all outputs or each.
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,11 +13,12 @@ from rich.table import Table
 
 from kkl_gym import SYSTEMS, System, get_system
 from observers.storage import is_kind
-from training.agents.agent import Agent, AgentError
+from training.agents.agent import Agent
 from training.agents.any_environment.player import KEY, Player
 from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
+from training.commands.agent_files import Export, Import, find
 from training.commands.compare import Compare
 from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
 from training.commands.options import NoiseLevel
@@ -214,12 +214,14 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class AgentCommand:
-    """Train, evaluate and compare agents that act on what an observer shows."""
+    """Train, evaluate, compare and convert agents that act on what an observer shows."""
 
     command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Compare, tyro.conf.subcommand("compare")],
+        | Annotated[Compare, tyro.conf.subcommand("compare")]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Import, tyro.conf.subcommand("import")],
         tyro.conf.arg(name=""),
     ]
 
@@ -296,31 +298,3 @@ def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]
         return mean, np.nan, np.nan
     ends = scipy.stats.bootstrap((values,), np.mean, method="percentile", rng=0).confidence_interval
     return mean, float(ends.low), float(ends.high)
-
-
-def find(name: str) -> Path:
-    """Find the file of an agent.
-
-    Parameters
-    ----------
-    name : str
-        A system whose agent ships, or a path that ends in ``.safetensors``.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    AgentError
-        If no such agent ships.
-    """
-    if name.endswith(".safetensors"):
-        return Path(name)
-    folder = files("training.agents").joinpath("shipped")
-    names = sorted(entry.name for entry in folder.iterdir())
-    shipped = [entry.removesuffix(".safetensors") for entry in names if entry.endswith(".safetensors")]
-    if name not in shipped:
-        raise AgentError(f"no agent {name!r} ships; there are {', '.join(shipped)}; a file ends in .safetensors")
-    return Path(str(folder.joinpath(f"{name}.safetensors")))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
@@ -72,6 +73,16 @@ class ControlTask:
         """Actions in an episode."""
         return round(self.duration / self.period)
 
+    @property
+    def options(self) -> dict[str, Any]:
+        """What ``gym.make`` is told to make the system's environment as the task has it."""
+        return {
+            "dt": self.dt,
+            "measurement_noise": self.measurement_noise,
+            "start_box": self.start_box,
+            "max_episode_steps": self.steps * self.repeat,
+        }
+
     def make(
         self,
         num_envs: int,
@@ -95,13 +106,5 @@ class ControlTask:
         kkl_gym.VectorActionRepeat
             The environment.
         """
-        env: VectorEnv = KKLVectorEnv(
-            self.system,
-            num_envs,
-            dt=self.dt,
-            measurement_noise=self.measurement_noise,
-            start_box=self.start_box,
-            max_episode_steps=self.steps * self.repeat,
-            autoreset_mode=AutoresetMode.DISABLED,
-        )
+        env: VectorEnv = KKLVectorEnv(self.system, num_envs, **self.options, autoreset_mode=AutoresetMode.DISABLED)
         return VectorActionRepeat(env if wrap is None else wrap(env), self.repeat, autoreset_mode)

@@ -1,0 +1,104 @@
+"""PPO or SAC from RLlib on the estimate x_hat: two env runners, each with a batch of environments and one observer.
+
+It needs `pip install "ray[rllib]" torch tyro` beside kkl-gym, and no extra of kkl-gym.
+"""
+
+from typing import Any, Literal
+
+import gymnasium as gym
+import ray
+import tyro
+from ray.rllib.algorithms.algorithm_config import AlgorithmConfig
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.algorithms.sac import SACConfig
+from ray.rllib.connectors.env_to_module import MeanStdFilter
+from ray.tune.registry import register_env
+
+import kkl_gym
+
+
+def make_envs(config: dict[str, Any]) -> gym.vector.VectorEnv:
+    """Batched environments with their observer inside: 20 s long, an action every 0.05 s.
+
+    RLlib calls this in each env runner. So only names travel there: the runner itself imports kkl_gym and reads the
+    observer's file.
+    """
+    envs = gym.make_vec(
+        config["env_id"],
+        num_envs=config["num_envs"],
+        measurement_noise=0.2,
+        max_episode_steps=2000,
+        autoreset_mode="Disabled",
+    )
+    envs = kkl_gym.KKLVectorObservation(envs, config["observer"])  # sees every sample, 0.01 s apart
+    return kkl_gym.VectorActionRepeat(envs, 5)  # resets in the next step, as RLlib expects
+
+
+def configuration(algorithm: Literal["ppo", "sac"]) -> AlgorithmConfig:
+    """What differs between the two."""
+    if algorithm == "ppo":
+        return PPOConfig().training(
+            lr=1e-3, gamma=0.99, train_batch_size_per_learner=4096, minibatch_size=512, num_epochs=5
+        )
+    return (
+        SACConfig()
+        .training(
+            actor_lr=1e-3,
+            critic_lr=1e-3,
+            alpha_lr=1e-3,
+            gamma=0.98,
+            train_batch_size_per_learner=256,
+            training_intensity=16.0,  # samples learned from for each that is gathered
+            num_steps_sampled_before_learning_starts=1000,
+        )
+        .reporting(min_sample_timesteps_per_iteration=1000)
+    )
+
+
+def main(
+    algorithm: Literal["ppo", "sac"] = "ppo",
+    env_id: str = "KKLVanDerPol-v0",
+    observer: str = "van_der_pol",
+    steps: int = 20_000,
+    num_envs: int = 16,
+    runners: int = 2,
+    seed: int = 0,
+) -> tuple[int, float]:
+    """Train for a while; returns the actions taken and the mean episode reward of the last ones.
+
+    Args:
+        algorithm: what is trained.
+        env_id: one of the package's environments.
+        observer: a shipped map's name, or a .safetensors file that every runner can read.
+        steps: actions to learn from, in all environments together.
+        num_envs: environments side by side in each runner.
+        runners: processes that gather experience.
+        seed: of everything random.
+    """
+    register_env("estimated", make_envs)
+    config = (
+        configuration(algorithm)
+        .environment("estimated", env_config={"env_id": env_id, "observer": observer})
+        .env_runners(
+            num_env_runners=runners,
+            num_envs_per_env_runner=num_envs,
+            gym_env_vectorize_mode="vector_entry_point",  # one batch, not num_envs environments in a row
+            env_to_module_connector=lambda *_args, **_options: MeanStdFilter(),
+        )
+        .debugging(seed=seed)
+    )
+    taken, reward = 0, float("nan")
+    agent = config.build_algo()
+    try:
+        while taken < steps:
+            found = agent.train()["env_runners"]
+            taken, reward = int(found["num_env_steps_sampled_lifetime"]), found.get("episode_return_mean", reward)
+            print(f"{taken} actions: mean episode reward {reward:.1f} of at most {400 * 5}")
+    finally:
+        agent.stop()
+        ray.shutdown()
+    return taken, float(reward)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,21 @@
+"""The code in docs/guides/clients.md, each block where what it imports is installed."""
+
+import re
+from pathlib import Path
+
+import pytest
+from pages import Page
+
+pytestmark = pytest.mark.clients
+ROOT = Path(__file__).parent.parent.parent
+BLOCKS = [block for block in Page(ROOT / "docs" / "guides" / "clients.md").blocks if block.language == "python"]
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: re.findall(r"(?:from|import) (\w+)", block.text)[-1])
+def test_block(block, monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    try:
+        exec(compile(block.text, "<a block of clients.md>", "exec"), {"__name__": "__main__"})
+    except ModuleNotFoundError as error:
+        pytest.skip(f"{error.name} is not installed")

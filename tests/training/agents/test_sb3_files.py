@@ -1,0 +1,81 @@
+"""Agents to stable-baselines3's files and back: the same actions, and nothing unpickled."""
+
+import pickle
+import zipfile
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO, SAC
+
+from training.agents import OnTask
+from training.agents.agent import Agent, AgentError
+from training.agents.sb3_files import from_sb3
+from training.cli import main
+from training.commands.agent import find
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "lorenz"])  # SAC's and PPO's
+def test_there_and_back(name, tmp_path):
+    agent, path = Agent.read(find(name)), tmp_path / "agent.zip"
+    main(["agent", "export", name, "--out", str(path)])
+    played = (SAC if agent.squashed else PPO).load(path, device="cpu")
+    obs = np.random.default_rng(0).normal(size=(50, agent.network.inputs)).astype(np.float32)
+    np.testing.assert_allclose(played.predict(obs, deterministic=True)[0], agent(obs), atol=1e-5)
+    back = tmp_path / "agent.safetensors"
+    options = [] if agent.observer.endswith("closed-loop-v1") else ["--observer", agent.observer]
+    main(["agent", "import", str(path), name, "--out", str(back), *options])
+    again = Agent.read(back)
+    assert (again.task, again.observer, again.fingerprint) == (agent.task, agent.observer, agent.fingerprint)
+    assert again.network.activation == agent.network.activation
+    assert (again(obs) == agent(obs)).all()
+
+
+class _Bomb:
+    def __reduce__(self):
+        return exec, ("raise SystemExit('unpickled')",)
+
+
+def rewritten(path, **parts):
+    """The same zip with other parts."""
+    with zipfile.ZipFile(path) as files:
+        held = {name: files.read(name) for name in files.namelist()}
+    with zipfile.ZipFile(path, "w") as files:
+        for name, content in (held | parts).items():
+            if content is not None:
+                files.writestr(name, content)
+
+
+@pytest.fixture
+def trained(tmp_path):
+    """An untrained SAC agent on the task, in tmp_path, with the activation that SAC has by default."""
+    env = OnTask(gym.make("KKLRossler-v0"))
+    SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, buffer_size=1, device="cpu").save(tmp_path / "agent.zip")
+    return tmp_path / "agent.zip"
+
+
+def test_the_default_activation(trained):
+    assert from_sb3(trained, "rossler").network.activation == "relu"
+
+
+@pytest.mark.parametrize(("parts", "match"), [
+    ({"policy.pth": pickle.dumps(_Bomb())}, "no agent of stable-baselines3: Weights only load failed"),
+    ({"policy.pth": None}, r"no agent of stable-baselines3: .*policy.pth"),
+    ({"data": b'{"policy_kwargs": {"activation_fn": "<class \'torch.nn.ELU\'>"}}'}, "activation .*ELU.* is none of"),
+    ({"data": b"{"}, "agent.zip"),
+])  # fmt: skip
+def test_what_is_refused(parts, match, trained):
+    rewritten(trained, **parts)
+    with pytest.raises(AgentError, match=match):
+        from_sb3(trained, "rossler")
+
+
+def test_files_that_are_something_else(tmp_path, trained):
+    other = tmp_path / "other.zip"
+    other.write_bytes(b"PK")
+    with pytest.raises(AgentError, match="no agent of stable-baselines3"):
+        from_sb3(other, "rossler")
+    with pytest.raises(AgentError, match=r"missing\.zip: it cannot be read: No such file"):
+        from_sb3(tmp_path / "missing.zip", "rossler")
+    with pytest.raises(AgentError, match="the policy has 3 inputs and 1 outputs, the task"):
+        from_sb3(trained, "van_der_pol")
