@@ -6,7 +6,8 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clients docs clean help
+.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents \
+	environments speed clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -22,6 +23,9 @@ test-slow: $(VENV)/ready  ## the tests that train for minutes
 
 test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
+
+test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+	$(BIN)/pytest tests/browser -m browser
 
 lint: $(VENV)/ready  ## style, types and the contract of imports
 	$(BIN)/ruff check .
@@ -111,6 +115,7 @@ clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our enviro
 docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
 	$(BIN)/python docs/site/commands.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
+	$(BIN)/python docs/demo/build.py runs/site/demo
 
 clean:  ## remove environments and caches; what lies under runs/ stays
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*

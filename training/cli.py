@@ -52,11 +52,24 @@ MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
 # Modules that an extra of the package brings.
 EXTRAS = {
-    "train": {"filelock", "pandas", "pydantic", "pytorch_optimizer", "rich", "scipy", "sympy", "torch", "tyro"},
+    "train": {
+        "filelock",
+        "joblib",
+        "pandas",
+        "pydantic",
+        "pytorch_optimizer",
+        "rich",
+        "scipy",
+        "sympy",
+        "torch",
+        "tyro",
+    },
     "agents": {"sb3_contrib", "stable_baselines3", "yaml"},
     "plots": {"PIL", "matplotlib"},
     "parquet": {"pyarrow"},
     "envs": {"h5py", "minari"},
+    "dask": {"distributed"},
+    "ray": {"ray"},
     "onnx": {"onnx", "onnxruntime"},
 }
 

@@ -1,17 +1,11 @@
-"""Resumable jobs: a pool of worker processes, a lock on each folder, and what identifies the results in it."""
+"""Resumable jobs: a lock on each folder, and what identifies the results in it."""
 
 import hashlib
 import json
-import multiprocessing
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -19,88 +13,6 @@ from filelock import FileLock, Timeout
 from kkl_gym.equations import components, input_matrix
 from kkl_gym.system import System
 from observers.storage import clear_unfinished, write
-
-
-class Named(Protocol):
-    """What a job must have."""
-
-    @property
-    def name(self) -> str:
-        """For people."""
-        ...
-
-
-Job = TypeVar("Job", bound=Named)
-
-
-def run_all(
-    run: Callable[[Job], None], jobs: Sequence[Job], workers: int
-) -> Iterator[tuple[Job, Exception | None, list[str]]]:
-    """Run jobs in worker processes, whatever goes wrong in one of them.
-
-    An interruption ends the workers, and so does the end of this process, even if it is killed.
-
-    Parameters
-    ----------
-    run : callable
-        What to do with a job; a function of a module, so that other processes find it.
-    jobs : sequence of jobs
-        They are begun in this order, each in one process.
-    workers : int
-        Number of processes. With one, the jobs run in this process.
-
-    Yields
-    ------
-    job
-        One that has ended.
-    Exception or None
-        What went wrong in it.
-    list of str
-        Names of the jobs that run now.
-    """
-    if workers == 1:
-        for job in jobs:
-            yield job, _failure(lambda job=job: run(job)), []  # type: ignore[misc]
-        return
-    context = multiprocessing.get_context("spawn")
-    lifeline, held = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(lifeline,))
-    todo, running = list(jobs), dict[Future[None], Job]()
-    with lifeline, held, pool:
-        try:
-            while todo or running:
-                while todo and len(running) < workers:  # no more, so that none begins after an interruption
-                    job = todo.pop(0)
-                    running[pool.submit(run, job)] = job
-                finished, _ = wait(running, return_when=FIRST_COMPLETED)
-                for future in finished:
-                    job = running.pop(future)
-                    active = [*running.values(), *todo[: len(finished)]]
-                    yield job, _failure(future.result), [job.name for job in active]
-        except BaseException:
-            held.close()
-            raise
-
-
-def _prepare(lifeline: Connection) -> None:
-    """Leave interruptions to the parent, and end when it lets go of its end of the pipe, or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-    def watch() -> None:
-        try:
-            lifeline.poll(None)  # nothing is ever sent
-        finally:
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _failure(call: Callable[[], None]) -> Exception | None:
-    try:
-        call()
-    except Exception as error:  # whatever one job does wrong, the others go on
-        return error
-    return None
 
 
 def describe(system: System) -> dict[str, Any]:

@@ -1,117 +1,16 @@
-"""Jobs in worker processes, and who may work in a folder."""
+"""Who may work in a folder."""
 
 import json
-import multiprocessing
 import os
-import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
 from kkl_gym import get_system
 from observers.storage import UNFINISHED
-from training.jobs import check_identity, claimed_job, claimed_run, describe, locked, run_all
-
-WAIT = 120.0  # seconds, for processes that import torch on a busy machine
-
-
-@dataclass(frozen=True)
-class Sleep:
-    seconds: float
-    process: Path | None = None
-
-    @property
-    def name(self):
-        return f"{self.seconds} s"
-
-
-def sleep(job):
-    if job.seconds < 0:
-        raise ValueError("nobody sleeps backward")
-    if job.process:
-        job.process.write_text(str(os.getpid()))
-    time.sleep(job.seconds)
-
-
-def until(condition):
-    began = time.monotonic()
-    while not condition():
-        assert time.monotonic() - began < WAIT
-        time.sleep(0.05)
-
-
-def alive(process):
-    """Whether a process, by its number, runs (and not only waits to be buried)."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def begun(path):
-    """Whether a job has written its process's number."""
-    return path.exists() and path.read_text() != ""
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_every_job_is_run_and_failures_are_told(workers):
-    jobs = [Sleep(0.0), Sleep(-1.0), Sleep(0.01), Sleep(0.02)]
-    results = list(run_all(sleep, jobs, workers))
-    assert sorted(job.seconds for job, _, _ in results) == [-1.0, 0.0, 0.01, 0.02]
-    assert {job.seconds: str(failure) for job, failure, _ in results if failure} == {-1.0: "nobody sleeps backward"}
-    assert results[-1][2] == []
-
-
-@pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
-def test_an_interruption_ends_the_workers_and_nobody_else(tmp_path):
-    unrelated = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(600.0,))
-    unrelated.start()
-    try:
-        mine = [tmp_path / "first", tmp_path / "second"]
-        runs = run_all(sleep, [Sleep(0.0), *(Sleep(600.0, path) for path in mine)], 2)
-        next(runs)
-        until(lambda: begun(mine[0]))
-        with pytest.raises(KeyboardInterrupt):
-            runs.throw(KeyboardInterrupt)
-        workers = [int(path.read_text()) for path in mine if begun(path)]
-        assert not any(map(alive, workers))
-        assert unrelated.is_alive()
-    finally:
-        unrelated.kill()
-        unrelated.join()
-
-
-PARENT = """
-import sys
-from pathlib import Path
-
-from test_jobs import Sleep, sleep
-from training.jobs import run_all
-
-if __name__ == "__main__":
-    list(run_all(sleep, [Sleep(600.0, Path(path)) for path in sys.argv[1:]], 2))
-"""
-
-
-@pytest.mark.skipif(not Path("/proc").exists(), reason="looks processes up in /proc")
-def test_workers_do_not_outlive_a_parent_that_is_killed(tmp_path):
-    script, paths = tmp_path / "parent.py", [tmp_path / "first", tmp_path / "second"]
-    script.write_text(PARENT)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    parent = subprocess.Popen([sys.executable, script, *paths], env=environment)
-    try:
-        until(lambda: all(map(begun, paths)))
-    finally:
-        parent.send_signal(signal.SIGKILL)
-        parent.wait()
-    workers = [int(path.read_text()) for path in paths]
-    until(lambda: not any(map(alive, workers)))
-
+from training.jobs import check_identity, claimed_job, claimed_run, describe, locked
 
 HOLDER = """
 import sys

@@ -1,6 +1,6 @@
 """``kkl-gym benchmark``."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,7 +11,7 @@ from kkl_gym.systems import SYSTEMS, get_system
 from observers.checks import noise_levels
 from observers.storage import clear_unfinished
 from training.commands.options import NoiseLevels
-from training.commands.running import run_missing
+from training.commands.running import Workers, run_missing
 from training.evaluation.levels import multiple, show_level
 from training.progress import LOG, progress_bars
 from training.seeds import Stream, generator
@@ -26,15 +26,16 @@ class Benchmark:
 
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer. A run that was interrupted goes on where it stopped. Jobs may be spread over several runs by
-    --systems and --methods. What is missing from the full set is said in table and figure.
+    trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
+    work. What is missing from the full set is said in table and figure.
     """
 
     budget: Literal["short", "cpu", "paper"] = "cpu"
     """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s. paper: 8 million
     points, networks of 4 x 512, an hour each; wants a GPU."""
     quick: bool = False
-    """In place of the budget: short trainings, no search, few and short test trajectories; a matter of minutes."""
+    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of
+    minutes, with the same results each time."""
     systems: tuple[str, ...] = tuple(SYSTEMS)
     """Names, or classes of yours as script.py:Class or module:Class."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
@@ -45,8 +46,7 @@ class Benchmark:
     """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
     """Folder of results."""
-    jobs: int = 2
-    """Worker processes, of one thread each."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     seed: int = 0
     """Seed of the test trajectories; training's is always 0."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
@@ -85,7 +85,7 @@ class Benchmark:
             failures = list[str]()
             if not self.report:
                 jobs = self._jobs(name, out)
-                failures = run_missing(run_job, jobs, workers=self.jobs, what="observers", progress=progress)
+                failures = run_missing(run_job, jobs, workers=self.workers, what="observers", progress=progress)
                 trained = [job for job in jobs if job.done]
                 for job in progress.track(trained, description="timing steps"):
                     try:
@@ -112,8 +112,8 @@ class Benchmark:
         from training.methods import METHODS, WrongParameters, get_method
 
         methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
-        if self.jobs < 1 or not self.systems or not methods or levels == ():
-            raise ValueError("give at least one system, method, noise level and worker process")
+        if not self.systems or not methods or levels == ():
+            raise ValueError("give at least one system, method and noise level")
         generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
         named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
         for names in (*named, [show_level(level) for level in levels or ()]):

@@ -28,7 +28,7 @@ from training.agents.statistics import draw_panel, interval, middle, normalised
 from training.agents.tasks import TASKS
 from training.commands.compare_environments import compare_environments
 from training.commands.environment import EnvironmentOptions
-from training.commands.running import run_missing
+from training.commands.running import Workers, run_missing
 from training.evaluation.levels import as_name
 from training.progress import LOG, progress_bars
 
@@ -78,8 +78,7 @@ class Compare:
     """Compare also at noise 0.2 on Van der Pol and at noise 2 on Lorenz."""
     observers: tuple[str, ...] = ()
     """Observers for agents that know x_hat or z: a .safetensors file for each system of yours, or shipped maps."""
-    jobs: int = 2
-    """Number of worker processes, of one thread each."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Annotated[
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
     ] = None
@@ -104,10 +103,8 @@ class Compare:
         ValueError
             If an option makes no sense, the folder holds another comparison, or a training failed.
         """
-        if min(self.seeds, self.episodes, self.jobs) < 1:
-            raise ValueError(
-                f"seeds, episodes and jobs must be positive, got {self.seeds}, {self.episodes} and {self.jobs}"
-            )
+        if min(self.seeds, self.episodes) < 1:
+            raise ValueError(f"seeds and episodes must be positive, got {self.seeds} and {self.episodes}")
         known: tuple[Any, ...] = SHOWN if self.environments else COMPARED
         information = known if self.information is None else self.information
         for what, given in (
@@ -136,7 +133,7 @@ class Compare:
             episodes=self.episodes,
             timesteps=self.timesteps,
             aggregate=self.environment.aggregate,
-            jobs=self.jobs,
+            workers=self.workers,
         )
 
     def _on_systems(self, information: tuple[Compared, ...], out: Path, console: Console) -> None:
@@ -155,7 +152,7 @@ class Compare:
         failures = list[str]()
         try:
             with progress_bars(console, out / LOG) as progress:
-                failures = run_missing(run_case, cases, workers=self.jobs, what="agents", progress=progress)
+                failures = run_missing(run_case, cases, workers=self.workers, what="agents", progress=progress)
         finally:  # also after an interruption
             with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
                 own = [system for system in self.systems if system not in TASKS]

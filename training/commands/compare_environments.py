@@ -10,7 +10,7 @@ from training.agents.any_environment.comparison import MANY, RANDOM, collect, pl
 from training.agents.any_environment.information import SHOWN, Shown
 from training.agents.any_environment.tables import curves, draw_curves, draw_scores, write_table
 from training.agents.any_environment.task import HiddenTask
-from training.commands.running import run_missing
+from training.commands.running import Workers, run_missing
 from training.progress import LOG, progress_bars
 
 
@@ -24,7 +24,7 @@ def compare_environments(
     episodes: int,
     timesteps: int | None,
     aggregate: int,
-    jobs: int,
+    workers: Workers,
 ) -> None:
     """Run what is missing of a comparison, then report.
 
@@ -44,8 +44,8 @@ def compare_environments(
         Steps to learn from.
     aggregate : int
         How many times observers are fitted again.
-    jobs : int
-        Worker processes.
+    workers : Workers
+        Where agents are trained.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def compare_environments(
     failures = list[str]()
     try:
         with progress_bars(console, out / LOG) as progress:
-            failures = run_missing(run_case, cases, workers=jobs, what="agents", progress=progress)
+            failures = run_missing(run_case, cases, workers=workers, what="agents", progress=progress)
     finally:  # also after an interruption
         with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
             every = planned(tasks, out, seeds=MANY, episodes=episodes, timesteps=timesteps, aggregate=aggregate)

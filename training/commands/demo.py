@@ -43,8 +43,11 @@ class Demo:
     """Seed of the starts and the noise."""
     gif: bool = False
     """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
+    live: bool = False
+    """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
+    the sensor. Keys are shown there."""
 
-    def run(self, console: Console) -> Path:
+    def run(self, console: Console) -> Path | None:
         """Run.
 
         Parameters
@@ -54,20 +57,27 @@ class Demo:
 
         Returns
         -------
-        Path
-            The figure.
+        Path or None
+            The figure; None of a window.
 
         Raises
         ------
         ValueError
-            If an option makes no sense, or there is no observer for the system.
+            If an option makes no sense, there is no observer for the system, or no window can be opened.
         """
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        environments = shown(self.system, self.observer)
+        if self.live and (self.duration is not None or self.gif):
+            raise ValueError("a window stays open until it is closed: leave out --duration and --gif beside --live")
+        environments = shown(self.system or ("van_der_pol" if self.live else None), self.observer)
         for one in environments:
             if not one.observed:
                 raise ValueError(f"no observer ships for {one.system.name!r}: name a file, --observer FILE")
+        if self.live:
+            from training.commands.live import show  # which takes a second that others need not wait for
+
+            show(environments[0], self.measurement_noise, seed=self.seed)
+            return None
         with progress_bars(console) as progress:
             episodes = []
             for one in environments:

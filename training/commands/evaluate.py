@@ -54,9 +54,9 @@ class Evaluate:
 
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
     after the transient. That is the first fifth of a run, or 5 s where it is driven by random steps and sines (of
-    systems of another pace, 500 samples). A second table has the NRMSE of each state after the transient, the median over the
-    trajectories: its root mean square error in percent of its standard deviation over all of them. SMAPE is of one norm
-    of all states, which says little where their units differ.
+    systems of another pace, 500 samples). A second table has the NRMSE of each state after the transient, the median
+    over the trajectories: its root mean square error in percent of its standard deviation over all of them. SMAPE is of
+    one norm of all states, which says little where their units differ.
 
     2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
     told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is

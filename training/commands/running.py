@@ -1,10 +1,13 @@
-"""Running the jobs of a comparison, with a bar."""
+"""Running the jobs of a comparison, with a bar; and where they run."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
-from training.jobs import run_all
+import tyro
+
+from training.parallel import Backend, engine
 from training.progress import ProgressBars, under_way
 
 
@@ -30,8 +33,21 @@ class Kept(Protocol):
 Job = TypeVar("Job", bound=Kept)
 
 
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run; docs/guides/many_machines.md says more."""
+
+    jobs: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 2, or all cores of a cluster)")] = None
+    """Jobs at a time, each in a process of one thread."""
+    backend: Backend = "loky"
+    """loky: processes of this machine. dask, ray: a cluster that shares the folder of results
+    (docs/guides/many_machines.md)."""
+    address: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: none)")] = None
+    """Of the cluster: tcp://HOST:8786 for Dask's scheduler; auto or HOST:6379 for Ray's head."""
+
+
 def run_missing(
-    run: Callable[[Job], None], jobs: Sequence[Job], *, workers: int, what: str, progress: ProgressBars
+    run: Callable[[Job], None], jobs: Sequence[Job], *, workers: Workers, what: str, progress: ProgressBars
 ) -> list[str]:
     """Run the jobs that are not done.
 
@@ -41,8 +57,8 @@ def run_missing(
         What to do with a job; a function of a module.
     jobs : sequence of jobs
         All of them.
-    workers : int
-        Processes.
+    workers : Workers
+        Where they run.
     what : str
         What they make, for the bar.
     progress : ProgressBars
@@ -52,16 +68,21 @@ def run_missing(
     -------
     list of str
         Names of jobs that failed, each with what went wrong.
+
+    Raises
+    ------
+    ValueError
+        If there are no such workers.
     """
     todo, failures = [job for job in jobs if not job.done], list[str]()
-    workers = min(workers, max(1, len(todo)))
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
-    progress.update(bar, description=under_way(what, [job.name for job in todo[:workers]]))
-    for job, failure, running in run_all(run, todo, workers):
-        if failure:
-            failures.append(f"{job.name}: {failure}")
-            progress.say(f"failed {failures[-1]} (in {job.folder})")
-        else:
-            progress.say(f"finished {job.name}")
-        progress.update(bar, advance=1, description=under_way(what, running))
+    with engine(workers.jobs, backend=workers.backend, address=workers.address) as here:
+        progress.update(bar, description=under_way(what, [job.name for job in todo[: here.workers]]))
+        for job, failure, running in here.run(run, todo):
+            if failure:
+                failures.append(f"{job.name}: {failure}")
+                progress.say(f"failed {failures[-1]} (in {job.folder})")
+            else:
+                progress.say(f"finished {job.name}")
+            progress.update(bar, advance=1, description=under_way(what, running))
     return failures

@@ -13,6 +13,7 @@ from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.checks import noise_levels
 from training.commands.options import NoiseLevel, Parameters, Seconds, SystemName
+from training.commands.running import Workers, run_missing
 from training.config import Pipeline
 from training.evaluation.levels import Level, show_level
 from training.presets import preset
@@ -56,6 +57,7 @@ class Tune:
     what was predicted: check.csv."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/tuning/NAME-NOISE)")] = None
     """Folder for what is written."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
 
     def run(self, console: Console) -> Choice:
         """Choose, print and write.
@@ -165,27 +167,32 @@ class Tune:
 
     def _check(self, console: Console, found: "Found", runs: "_Runs", folder: Path) -> None:
         """Train observers for some of the spectra, and compare what they leave with what was predicted."""
-        import torch
-
-        from training.tuning.check import rank_correlation, trained_error
+        from training.tuning.check import Trial, rank_correlation, run_trial
         from training.tuning.found import write_csv
 
         assert self.check is not None
-        torch.set_num_threads(1)
         front = found.fronts[found.noise]
         choices = [front[(len(front) - 1) // 2], *([front[-1]] if len(front) > 1 else []), *found.others]
+        trials = [
+            Trial(
+                self.system,
+                self.parameters,
+                choice.spectrum,
+                measurement_noise=found.noise,
+                seconds=self.check,
+                dt=runs.dt,
+                duration=runs.duration,
+                out=folder / "check",
+            )
+            for choice in choices
+        ]
         with progress_bars(console) as progress:
-            measured = [
-                trained_error(
-                    found.system,
-                    choice.spectrum,
-                    measurement_noise=found.noise,
-                    seconds=self.check,
-                    dt=runs.dt,
-                    duration=runs.duration,
-                )
-                for choice in progress.track(choices, description=f"training observers of {found.system.name}")
-            ]
+            what = f"training observers of {found.system.name}"
+            once = list({trial.folder: trial for trial in trials}.values())  # some spectra are found twice
+            failures = run_missing(run_trial, once, workers=self.workers, what=what, progress=progress)
+        if failures:
+            raise ValueError(f"{len(failures)} of {len(once)} trainings failed; the first: {failures[0]}")
+        measured = [trial.error for trial in trials]
         table = Table("modes", "predicted error in %", "trained: median SMAPE in %", "", title=found.system.name)
         for choice, left in zip(choices, measured, strict=True):
             table.add_row(str(choice.spectrum.modes), f"{choice.error:.3g}", f"{left:.3g}", choice.kind)

@@ -28,7 +28,9 @@ LEAST_USED = 0.8  # share of the windows that the model must explain at a new le
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
-LEFT = 1.0  # standard errors that a fit may be from where its squares are least
+LEFT = (
+    1.0  # standard errors that a fit may be from where its squares are least, and from what another beginning leads to
+)
 MOST_SAMPLES = 6400  # of a window
 
 Starts = dict[tuple[int, int], np.ndarray]
@@ -51,7 +53,8 @@ def fit_windows(
     Long windows say more, short ones find their way from rougher guesses: the first are as long as the model can
     explain most of them, but for noise, from one of the guesses. Chaos and process noise set an end to their
     growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
-    scatter of windows fall no further.
+    scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
+    standard error of the shorter ones away, and count only if both fits end in one place.
 
     Parameters
     ----------
@@ -96,19 +99,31 @@ def fit_windows(
         if keep.mean() < LEAST_USED:
             break
         starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
-        fit = shoot(shooting, np.array(list(best.parameters.values())), windows(records, starts, length))
+        cut, told = windows(records, starts, length), told_directions(best.information)
+        before = best.errors(told, told)
+        theta, aside = np.array(list(best.parameters.values())), shooting.unit * (told @ np.minimum(before, 1.0))
+        fit = shoot(shooting, np.clip(theta + aside, shooting.low, shooting.high), cut)
         if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
             break
         if fit.left > LEFT:
             break
+        now = fit.errors(told, told)
+        other = shoot(shooting, np.clip(theta - aside, shooting.low, shooting.high), cut)
+        if (_apart(fit, other, told) > LEFT * now).any():
+            break  # so long windows have many minima, and their curvature says nothing of where the others are
         report(described(fit, length))
-        told = told_directions(best.information)
-        gain = fit.errors(told, told) / best.errors(told, told)
+        gain = now / before
         if (gain < 1).any():
-            best = fit
+            best = min(fit, other, key=lambda each: each.cost)
         if (gain > GAIN).all():
             break
     return best
+
+
+def _apart(one: Fit, other: Fit, directions: np.ndarray) -> np.ndarray:
+    """How far the parameters of two fits are from each other along directions, in their units."""
+    difference = np.subtract(list(one.parameters.values()), list(other.parameters.values()))
+    return np.asarray(np.abs(directions.T @ (difference / one.unit)))
 
 
 def _first_fit(

@@ -1,19 +1,26 @@
 """Whether predictions hold: observers trained for several spectra, on runs that nobody trained on."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.stats import spearmanr
 
+import kkl_gym
 from kkl_gym.system import System
+from kkl_gym.systems import get_system
 from observers.checks import noise_levels
+from observers.storage import explained, write
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.levels import Level, multiple
+from training.jobs import claimed_job, describe
 from training.pipeline import train
 from training.presets import preset
 from training.seeds import Stream
@@ -52,15 +59,16 @@ def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> di
     }
 
 
-def trained_error(
-    system: System, spectrum: Spectrum, *, measurement_noise: Level, seconds: float, dt: float, duration: float
-) -> float:
-    """Train an observer of free motion and measure what it leaves.
+@dataclass(frozen=True)
+class Trial:
+    """An observer of free motion, trained for a spectrum: a job.
 
     Parameters
     ----------
-    system : System
-        To be observed.
+    system : str
+        As for :func:`kkl_gym.systems.get_system`.
+    parameters : mapping of str to float
+        Physical parameters that differ from its defaults.
     spectrum : Spectrum
         Of the filter.
     measurement_noise : float or tuple of float, length ny
@@ -71,26 +79,85 @@ def trained_error(
         Sampling interval in seconds.
     duration : float
         Length of each run in seconds.
-
-    Returns
-    -------
-    float
-        Median SMAPE in percent, over all steps of runs that nobody trained on.
+    out : Path
+        Has a folder for it, which receives error.json.
     """
+
+    system: str
+    parameters: Mapping[str, float]
+    spectrum: Spectrum
+    measurement_noise: Level
+    seconds: float
+    dt: float
+    duration: float
+    out: Path
+
+    @cached_property
+    def identity(self) -> dict[str, Any]:
+        """What makes its result what it is."""
+        of = {key: value for key, value in asdict(self).items() if key not in ("system", "parameters", "out")}
+        system = describe(get_system(self.system, self.parameters))
+        return {**of, "system": system, "trajectories": TRAJECTORIES, "version": kkl_gym.__version__}
+
+    @property
+    def name(self) -> str:
+        """For people."""
+        return f"{self.spectrum.modes} modes"
+
+    @cached_property
+    def folder(self) -> Path:
+        """One of its own: a trial of anything else has another."""
+        return self.out / hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def done(self) -> bool:
+        """Whether its result lies there."""
+        return (self.folder / "error.json").exists()
+
+    @property
+    def error(self) -> float:
+        """Median SMAPE in percent, over all steps of runs that nobody trained on."""
+        path = self.folder / "error.json"
+        with explained(path, ValueError):
+            return float(json.loads(path.read_text()))
+
+
+def run_trial(trial: Trial) -> None:
+    """Train an observer and measure what it leaves, unless that is done; goes on where an earlier run stopped.
+
+    Parameters
+    ----------
+    trial : Trial
+        What is to be trained.
+
+    Raises
+    ------
+    ValueError
+        If another process is at work on it.
+    FloatingPointError
+        If its training blows up.
+    """
+    torch.set_num_threads(1)
+    system = get_system(trial.system, trial.parameters)
     config = replace(
         preset(system, "input-aware", "fast"),
-        **settings(system, spectrum, measurement_noise),
+        **settings(system, trial.spectrum, trial.measurement_noise),
         inputs=False,
         trajectories=TRAJECTORIES,
-        dt=dt,
-        duration=duration,
+        dt=trial.dt,
+        duration=trial.duration,
         inverse_steps=10**6,
-        cpu_seconds=seconds,
+        cpu_seconds=trial.seconds,
     )
-    with TemporaryDirectory() as folder:
-        artifact = train(system, config, Path(folder), device=torch.device("cpu")).artifact
-    runs = unseen_trajectories(system, dt, n=RUNS, duration=duration, seed=0, stream=Stream.VALIDATION)
-    return float(np.median(errors(artifact, system, runs, measurement_noise=measurement_noise, seed=0).full))
+    with claimed_job(trial.folder, trial.identity, "another trial"):
+        if trial.done:
+            return
+        training = trial.folder / "training"
+        artifact = train(system, config, training, device=torch.device("cpu"), resume=True).artifact
+        runs = unseen_trajectories(system, trial.dt, n=RUNS, duration=trial.duration, seed=0, stream=Stream.VALIDATION)
+        found = errors(artifact, system, runs, measurement_noise=trial.measurement_noise, seed=0).full
+        write(trial.folder / "error.json", json.dumps(float(np.median(found))) + "\n")
+        shutil.rmtree(training)
 
 
 def rank_correlation(predicted: Sequence[float], measured: Sequence[float]) -> float:

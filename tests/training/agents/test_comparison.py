@@ -14,7 +14,6 @@ from rich.console import Console
 
 import training.agents.comparison
 import training.agents.learn
-import training.commands.running
 from training.agents.comparison import (
     COMPARED,
     MORE_NOISE,
@@ -25,12 +24,21 @@ from training.agents.comparison import (
 )
 from training.agents.statistics import interval, middle, normalised
 from training.commands.compare import Compare, report
+from training.commands.running import Workers
 from training.jobs import claimed_job, locked
+from training.parallel import Engine
 from training.systems import PROFILES
 
 
 def toy(out, **options):
-    settings = {"systems": ("lorenz",), "seeds": 2, "episodes": 3, "timesteps": 1, "more_noise": False, "jobs": 1}
+    settings = {
+        "systems": ("lorenz",),
+        "seeds": 2,
+        "episodes": 3,
+        "timesteps": 1,
+        "more_noise": False,
+        "workers": Workers(1),
+    }
     return Compare(out=out, **{**settings, **options})
 
 
@@ -110,12 +118,12 @@ def test_scores_that_are_damaged_are_named(text, tmp_path):
 
 
 def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
-    def interrupted(run, jobs, workers):
+    def interrupted(engine, run, jobs):
         run(jobs[0])
         yield jobs[0], None, []
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.commands.running, "run_all", interrupted)
+    monkeypatch.setattr(Engine, "run", interrupted)
     with pytest.raises(KeyboardInterrupt):
         toy(tmp_path, information=("state", "y")).run(Console())
     assert len(pd.read_csv(tmp_path / "results.csv")) == 1

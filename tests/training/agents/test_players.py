@@ -26,6 +26,7 @@ from training.commands.agent import Evaluate, Train
 from training.commands.compare import Compare
 from training.commands.environment import EnvironmentOptions
 from training.commands.record import RecordCommand
+from training.commands.running import Workers
 from training.records import read_records
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
@@ -282,7 +283,7 @@ def test_algorithms_that_cannot_act_there_are_refused(tmp_path, task, algorithm,
 
 
 def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
-    options = {"environments": ("CartPole-v1",), "seeds": 3, "episodes": 4, "jobs": 1, "out": tmp_path}
+    options = {"environments": ("CartPole-v1",), "seeds": 3, "episodes": 4, "workers": Workers(1), "out": tmp_path}
     Compare(**options, information=("state", "y")).run(Console())
     results = pd.read_csv(tmp_path / "results.csv")
     assert sorted(results.shown) == ["random", *["state"] * 3, *["y"] * 3]

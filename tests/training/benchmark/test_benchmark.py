@@ -27,15 +27,23 @@ from training.benchmark.results import collect
 from training.benchmark.tables import _number, heatmap, summarise
 from training.cli import main
 from training.commands.benchmark import Benchmark
+from training.commands.running import Workers
 from training.evaluation.errors import starts, unseen_trajectories
 from training.evaluation.metrics import component_smape, nrmse, rmse, settling_time, smape
-from training.jobs import claimed_job, run_all
+from training.jobs import claimed_job
 from training.methods import METHODS, Budget, Method, get_method
+from training.parallel import engine
 from training.seeds import Stream
 
 TINY = Budget("tiny", trajectories=8, duration=20.0, samples=10, cpu_seconds=1e9, width=8, depth=1, dt=0.05, steps=3)
 SHORT = Protocol(trajectories=2, duration=2.0)
 RESULTS = Path(__file__).parents[3] / "docs" / "results"
+
+
+def run_all(jobs, workers):
+    with engine(workers) as here:
+        return list(here.run(run_job, jobs))
+
 
 TOY = '''
 from pathlib import Path
@@ -321,7 +329,9 @@ def test_step_time_is_that_of_the_fastest_round_and_of_whole_batches(monkeypatch
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
     name, trainings = toy
     out = tmp_path / "out"
-    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("van_der_pol", "lorenz"), methods=(name, "ekf-untuned"), out=out, workers=Workers(1)).run(
+        quiet()
+    )
     results = pd.read_csv(out / "results.csv")
     assert results.groupby(["system", "method"]).size().tolist() == [12] * 4
     expected = unseen_trajectories(get_system("lorenz"), TINY.dt, n=2, duration=2.0, seed=0).x
@@ -358,7 +368,7 @@ def test_a_run_goes_on_where_it_stopped(toy, tiny, tmp_path):
             '        return {"mean"',
         )
     )
-    benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, jobs=1)
+    benchmark = Benchmark(systems=("van_der_pol", "lorenz"), methods=(name,), out=out, workers=Workers(1))
     stop.touch()
     with pytest.raises(KeyboardInterrupt):
         benchmark.run(quiet())
@@ -379,8 +389,8 @@ def test_a_job_that_another_process_works_on_is_left_alone(toy, tmp_path):
     job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, None, SHORT)
     job.folder.mkdir()
     with FileLock(job.folder / ".lock"):
-        ((_, failure, _),) = run_all(run_job, [job], 1)
-    assert "another process is at work" in str(failure)
+        ((_, failure, _),) = run_all([job], 1)
+    assert "another process is at work" in failure
     assert not trainings.exists()
 
 
@@ -389,8 +399,8 @@ def test_a_training_that_blows_up_leaves_no_checkpoint(toy, tmp_path):
     script = Path(name.rpartition(":")[0])
     script.write_text(script.read_text() + EXPLOSIVE)
     job = Job("lorenz", f"{script}:Explosive", tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    ((_, failure, _),) = run_all(run_job, [job], 1)
-    assert isinstance(failure, FloatingPointError)
+    ((_, failure, _),) = run_all([job], 1)
+    assert "is not a number" in failure
     assert not any(path.is_dir() for path in job.folder.iterdir())
 
 
@@ -400,7 +410,7 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     with claimed_job(job.folder, job.identity, OTHER):
         pass
     (job.folder / "configuration-0.json").write_text('{"configuration": {"shift": 1.0}, "score": 1e-9}')
-    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
+    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
     # The others, what was settled in a short training of the best (its file is missing), and the full training.
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0", "lorenz", "1.0"]
 
@@ -411,19 +421,18 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
 ])  # fmt: skip
 def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
     job = Job("lorenz", toy[0], tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    assert [failure for _, failure, _ in run_all(run_job, [job], 1)] == [None]
+    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
     (job.folder / "errors.csv").unlink()
     (job.folder / file).write_text(text)
-    ((_, failure, _),) = run_all(run_job, [job], 1)
-    assert isinstance(failure, ValueError)
-    assert str(job.folder / file) in str(failure)
+    ((_, failure, _),) = run_all([job], 1)
+    assert str(job.folder / file) in failure
 
 
 @pytest.mark.parametrize(("file", "text"), [
     ("errors.csv", ""), ("info.json", "{"), ("info.json", "{}"), ("job.json", "[]"), ("speed.json", "[1]"),
 ])  # fmt: skip
 def test_results_that_are_damaged_are_named(file, text, toy, tiny, tmp_path):
-    out = Benchmark(systems=("lorenz",), methods=(toy[0],), out=tmp_path / "out", jobs=1).run(quiet())
+    out = Benchmark(systems=("lorenz",), methods=(toy[0],), out=tmp_path / "out", workers=Workers(1)).run(quiet())
     folder = out / "jobs" / "lorenz" / "constant"
     (folder / file).write_text(text)
     with pytest.raises(ValueError, match=re.escape(str(folder))):
@@ -436,7 +445,7 @@ def test_a_failure_leaves_the_others(toy, tiny, tmp_path):
     script.write_text(script.read_text() + BROKEN)
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="1 of 2 jobs failed; the first: lorenz/broken"):
-        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=(f"{script}:Broken", name), out=out, workers=Workers(1)).run(quiet())
     assert set(pd.read_csv(out / "methods.csv").method) == {"constant"}
     assert "in train" in (out / "jobs" / "lorenz" / "broken" / "failure.txt").read_text()
 
@@ -449,9 +458,9 @@ def test_wrong_methods_are_trained_on_another_system_than_they_see(toy, tiny, tm
     monkeypatch.setattr(
         training.benchmark.jobs, "measure", lambda *its, **how: measured.append(its[2].parameters) or seen(*its, **how)
     )
-    Benchmark(quick=True, systems=("van_der_pol",), methods=(f"{script}:Wrong",), out=tmp_path / "out", jobs=1).run(
-        quiet()
-    )
+    Benchmark(
+        quick=True, systems=("van_der_pol",), methods=(f"{script}:Wrong",), out=tmp_path / "out", workers=Workers(1)
+    ).run(quiet())
     assert trainings.read_text().splitlines() == ["{'mu': 3.3000000000000003}"]
     assert measured == [{"mu": 3.0}]
 
@@ -459,7 +468,7 @@ def test_wrong_methods_are_trained_on_another_system_than_they_see(toy, tiny, tm
 def test_wrong_methods_need_parameters(tiny, tmp_path):
     pendulum = tmp_path / "slow.py"
     pendulum.write_text(SLOW)
-    options = {"quick": True, "systems": (f"{pendulum}:Slow",), "out": tmp_path / "out", "jobs": 1}
+    options = {"quick": True, "systems": (f"{pendulum}:Slow",), "out": tmp_path / "out", "workers": Workers(1)}
     with pytest.raises(ValueError, match="slow has no parameters that could be off"):
         Benchmark(methods=("ekf", "ekf-wrong"), **options).run(quiet())
     assert not (tmp_path / "out" / "jobs").exists()
@@ -470,25 +479,25 @@ def test_wrong_methods_need_parameters(tiny, tmp_path):
 def test_results_of_another_benchmark_are_not_mixed_in(toy, tiny, tmp_path, monkeypatch):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, workers=Workers(1)).run(quiet())
     monkeypatch.setitem(sizes.BUDGETS, "cpu", Budget(**{**vars(TINY), "samples": 11}))
     with pytest.raises(ValueError, match="holds results of another benchmark: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned", name), out=out, workers=Workers(1)).run(quiet())
     assert not (out / "jobs" / "lorenz" / "ekf-untuned").exists()  # nothing was begun
     with pytest.raises(ValueError, match="holds jobs of several benchmarks: budget"):
-        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=out, workers=Workers(1)).run(quiet())
 
 
 def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_path):
     name, _ = toy
     script, out = Path(name.rpartition(":")[0]), tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, workers=Workers(1)).run(quiet())
     changed = script.with_name("changed.py")
     changed.write_text(
         script.read_text().replace("self.mean, (len(y0)", "2 * self.mean, (len(y0)").replace("x.mean", "x.max")
     )
     with pytest.raises(ValueError, match="another benchmark: code"):
-        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=(f"{changed}:Constant",), out=out, workers=Workers(1)).run(quiet())
 
 
 @pytest.mark.parametrize(
@@ -497,7 +506,9 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
         ({"systems": ("lorentz",)}, "unknown system 'lorentz'"),
         ({"methods": ("kalman",)}, "unknown method 'kalman'"),
         ({"methods": ()}, "at least one"),
-        ({"jobs": 0}, "at least one"),
+        ({"workers": Workers(0)}, "at least one worker"),
+        ({"workers": Workers(address="tcp://nowhere:8786")}, "add --backend dask"),
+        ({"workers": Workers(backend="dask")}, "needs the --address of its cluster, as in tcp"),
         ({"report": True}, "does not exist; run the benchmark first"),
         ({"measurement_noise": (-0.1,)}, "measurement_noise must be a finite number, not negative, got -0.1"),
         ({"measurement_noise": (math.inf,)}, "measurement_noise"),
@@ -509,7 +520,7 @@ def test_a_method_that_was_changed_is_not_taken_for_the_old_one(toy, tiny, tmp_p
 )
 def test_impossible_benchmarks(wrong, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        Benchmark(**{"out": tmp_path / "out", "jobs": 1, **wrong}).run(quiet())
+        Benchmark(**{"out": tmp_path / "out", "workers": Workers(1), **wrong}).run(quiet())
     assert not (tmp_path / "out").exists()
 
 
@@ -523,14 +534,14 @@ def test_worker_processes_do_what_one_process_does(toy, tmp_path):
         for workers in (1, 2)
     }
     for workers, mine in jobs.items():
-        assert [failure for _, failure, _ in run_all(run_job, mine, workers)] == [None, None]
+        assert [failure for _, failure, _ in run_all(mine, workers)] == [None, None]
     for alone, together in zip(*jobs.values(), strict=True):
         assert (alone.folder / "errors.csv").read_bytes() == (together.folder / "errors.csv").read_bytes()
 
 
 def test_every_method_at_toy_size(tiny, tmp_path):
     out = tmp_path / "out"
-    Benchmark(quick=True, systems=("reverse_duffing",), out=out, jobs=1).run(quiet())
+    Benchmark(quick=True, systems=("reverse_duffing",), out=out, workers=Workers(1)).run(quiet())
     methods = pd.read_csv(out / "methods.csv")
     assert set(methods.method) == set(METHODS)
     results = pd.read_csv(out / "results.csv")
@@ -562,7 +573,7 @@ def test_infinite_values_have_a_median_and_a_sign():
 def test_report_alone_gives_the_same_table_and_figure(toy, tiny, tmp_path):
     name, _ = toy
     out = tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=(name,), out=out, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=(name,), out=out, workers=Workers(1)).run(quiet())
     before = {file: (out / file).read_bytes() for file in ("table.md", "heatmap.png")}
     for file in before:
         (out / file).unlink()
@@ -641,12 +652,14 @@ def test_new_rows_stand_beside_those_of_an_earlier_run(toy, tiny, tmp_path):
     """As they were, digit by digit; what an observer's new job found takes the place of its old rows."""
     name, trainings = toy
     earlier, out = tmp_path / "earlier", tmp_path / "out"
-    Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=earlier, jobs=1).run(quiet())
+    Benchmark(systems=("lorenz",), methods=("ekf-untuned",), out=earlier, workers=Workers(1)).run(quiet())
     for file in ("results.csv", "methods.csv"):
         header, *rows = (earlier / file).read_text().splitlines(True)
         both = [row.replace("lorenz", system) for system in ("rossler", "van_der_pol") for row in rows]
         (earlier / file).write_text("".join([header, *both]))
-    Benchmark(systems=("rossler",), methods=("ekf-untuned", name), out=out, beside=earlier, jobs=1).run(quiet())
+    Benchmark(systems=("rossler",), methods=("ekf-untuned", name), out=out, beside=earlier, workers=Workers(1)).run(
+        quiet()
+    )
     methods, results = (pd.read_csv(out / file) for file in ("methods.csv", "results.csv"))
     expected = [("van_der_pol", "ekf-untuned"), ("rossler", "ekf-untuned"), ("rossler", "constant")]
     assert list(zip(methods.system, methods.method)) == expected
@@ -659,7 +672,7 @@ def test_new_rows_stand_beside_those_of_an_earlier_run(toy, tiny, tmp_path):
     with pytest.raises(ValueError, match=r"earlier.methods.csv: it is of another benchmark: budget tiny, seed 0 there"):
         collect(_of_seed_one(out), earlier)
     with pytest.raises(ValueError, match=r"results.csv does not exist; run the benchmark first"):
-        Benchmark(systems=("lorenz",), methods=(name,), out=out, beside=tmp_path, jobs=1).run(quiet())
+        Benchmark(systems=("lorenz",), methods=(name,), out=out, beside=tmp_path, workers=Workers(1)).run(quiet())
 
 
 def _of_seed_one(out):
@@ -703,7 +716,7 @@ def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeyp
     monkeypatch.setattr(training.benchmark.jobs, "step_time", lambda *_, **__: 1.0)
     out = tmp_path / "out"
     systems = ("van_der_pol", f"{script}:Slow", f"{script}:Two")
-    Benchmark(quick=True, systems=systems, methods=("ekf",), out=out, jobs=1).run(quiet())
+    Benchmark(quick=True, systems=systems, methods=("ekf",), out=out, workers=Workers(1)).run(quiet())
     jobs = [json.loads((out / "jobs" / name / "ekf" / "job.json").read_text()) for name in ("van_der_pol", "slow")]
     assert [job["budget"]["dt"] for job in jobs] == [0.01, 0.1]
     assert [job["budget"]["duration"] for job in jobs] == [20.0, 200.0]
@@ -721,7 +734,9 @@ def test_systems_of_ones_own_have_times_and_noise_of_their_own(tmp_path, monkeyp
 
 def test_results_lie_under_runs(toy, tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert Benchmark(systems=("lorenz",), methods=(toy[0],), jobs=1).run(quiet()) == Path("runs/benchmark/cpu")
+    assert Benchmark(systems=("lorenz",), methods=(toy[0],), workers=Workers(1)).run(quiet()) == Path(
+        "runs/benchmark/cpu"
+    )
     assert (tmp_path / "runs" / "benchmark" / "cpu" / "table.md").exists()
 
 

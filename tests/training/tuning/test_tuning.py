@@ -270,7 +270,7 @@ def test_what_is_written_begins_with_the_default(tmp_path):
 def test_predictions_are_compared_with_trained_observers(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(training.tuning.check, "TRAJECTORIES", 20)
     system = str(Path(linear_system.__file__)) + ":Oscillator"
-    main(["tune", system, "--duration", "4", "--modes", "5", "--check", "0.3", "--out", str(tmp_path)])
+    main(["tune", system, "--duration", "4", "--modes", "5", "--check", "0.3", "--jobs", "1", "--out", str(tmp_path)])
     rows = pd.read_csv(tmp_path / "check.csv")
     assert {"chosen", "paper's", "Bessel"} <= set(rows.kind)
     assert rows.trained.between(0.1, 150).all()
