@@ -5,6 +5,7 @@ from typing import Any, Self
 import numpy as np
 
 from observers.artifact import Artifact, InverseMap
+from observers.compiled import CompiledDecoder
 from observers.spread import Covariance
 
 # Which decoder is asked, in which rows (None for all), what its networks are given, and the age in seconds.
@@ -19,11 +20,19 @@ class Decoders:
 
     @classmethod
     def of(
-        cls, artifact: Artifact, outputs: slice, *, measurement_noise: float | tuple[float, ...], process_noise: float
+        cls,
+        artifact: Artifact,
+        outputs: slice,
+        *,
+        measurement_noise: float | tuple[float, ...],
+        process_noise: float,
+        compiled: bool = False,
     ) -> Self:
-        """Those of an artifact at levels of noise, for some of the maps' outputs."""
+        """Those of an artifact at levels of noise, for some of the maps' outputs; single samples compiled or not."""
         driven, free = (
-            None if inverse is None else Decoder(inverse.part(outputs), measurement_noise, process_noise)
+            None
+            if inverse is None
+            else Decoder(inverse.part(outputs), measurement_noise, process_noise, compiled=compiled)
             for inverse in (artifact.inverse, artifact.free_inverse)
         )
         assert driven is not None
@@ -31,11 +40,24 @@ class Decoders:
 
     def __call__(self, z: np.ndarray, age: Any) -> np.ndarray:
         """The estimates, (..., nx)."""
-        return self.mean(self.read(z, age))
+        return self.estimate(z, age)[1]
 
     def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Of what the estimates are off by, (..., nx, nx)."""
         return self.covariance(self.read(z, age))
+
+    def estimate(self, z: np.ndarray, age: Any) -> tuple[Read, np.ndarray]:
+        """What the networks are given, and the estimates."""
+        driven, free = self._driven, self._free
+        if z.ndim > 1 or driven.compiled is None:
+            read = self.read(z, age)
+            return read, self.mean(read)
+        decoder = driven
+        if free is not None and not z[-1] and not any(z[free.size :].tolist()):
+            decoder, z = free, z[: free.size]
+        assert decoder.compiled is not None
+        inputs, x_hat = decoder.compiled(z, age)
+        return [(decoder, None, inputs, age)], x_hat
 
     def read(self, z: np.ndarray, age: Any) -> Read:
         """What the networks are given for filter states, (..., size), of these ages in seconds."""
@@ -81,21 +103,34 @@ def _in_place(read: Read, found: list[np.ndarray]) -> np.ndarray:
 class Decoder:
     """An inverse map at given levels of noise: z, (..., size), and the age in seconds to x_hat, (..., nx)."""
 
-    def __init__(self, inverse: InverseMap, measurement_noise: float | tuple[float, ...], process_noise: float) -> None:
+    def __init__(
+        self,
+        inverse: InverseMap,
+        measurement_noise: float | tuple[float, ...],
+        process_noise: float,
+        *,
+        compiled: bool = False,
+    ) -> None:
         self._inverse, self.size = inverse, inverse.whiten.shape[1]
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
+        self._told_age = inverse.features[-1] == "age"
+        self.compiled: CompiledDecoder | None = None
+        if compiled:
+            network = inverse.mlp.compiled(inverse.x_offset, inverse.x_scale)
+            age = (inverse.age_unit, inverse.age_max) if self._told_age else None
+            self.compiled = CompiledDecoder(network, self._whiten, self._offset, conditions=self._conditions, age=age)
         if inverse.spread is not None:
             shares = inverse.shares(measurement_noise, process_noise)
-            self.covariance = Covariance(inverse.spread, shares, inverse.x_scale)
+            self.covariance = Covariance(inverse.spread, shares, inverse.x_scale, compiled=compiled)
 
     def read(self, z: np.ndarray, age: Any) -> np.ndarray:
         """What the network is given."""
         inverse, conditions = self._inverse, self._conditions
         modes = z @ self._whiten
         modes += self._offset
-        if inverse.features[-1] == "age":
+        if self._told_age:
             conditions = [*conditions, inverse.age_feature(age)]
         if modes.ndim == 1:  # a single sample: every call of numpy would be felt
             return np.array([*modes.tolist(), *conditions], dtype=np.float32)

@@ -1,11 +1,15 @@
-"""Multilayer perceptrons, evaluated with NumPy alone."""
+"""Multilayer perceptrons, evaluated with NumPy, and in large batches with Numba's help where it is installed."""
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from observers.checks import choice, real_array, shown
+from observers.compiled import CompiledNetwork
+from observers.sparse import MANY_ROWS
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
@@ -93,6 +97,9 @@ class MLP:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate the network.
 
+        A batch of many rows goes through :mod:`observers.compiled` where Numba is installed, which rounds a little
+        differently.
+
         Parameters
         ----------
         x : ndarray, shape (..., inputs)
@@ -108,13 +115,30 @@ class MLP:
         h: np.ndarray = x.astype(np.float32, copy=False)
         if h.ndim > 2:
             h = h.reshape(-1, h.shape[-1])
-        for w, b in hidden:
-            h = np.dot(h, w)
-            h += b
-            h = activation(h)
-        h = np.dot(h, weight)
-        h += bias
+        if h.ndim == 2 and len(h) >= MANY_ROWS and self._compiled is not None:
+            h = self._compiled.batch(h)
+        else:
+            for w, b in hidden:
+                h = np.dot(h, w)
+                h += b
+                h = activation(h)
+            h = np.dot(h, weight)
+            h += bias
         return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
+
+    def compiled(self, offset: np.ndarray, scale: np.ndarray) -> CompiledNetwork:
+        """The same network as machine code, in which single samples become offset + scale * outputs."""
+        return CompiledNetwork(self._layers, self.activation, offset=offset, scale=scale)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+
+    @functools.cached_property
+    def _compiled(self) -> CompiledNetwork | None:
+        try:
+            return CompiledNetwork(self._layers, self.activation)
+        except ImportError:
+            return None
 
 
 def _layer(name: str, values: np.ndarray) -> np.ndarray:
