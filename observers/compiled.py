@@ -6,12 +6,13 @@ NumPy's, which is BLAS at the machine's limit. A single sample is one call, wher
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-PIECE = 256  # rows of a batch at once: their activations fit into the second cache, and overhead is not yet felt
+PIECE = 2**15  # values of a layer that a batch computes at once: they fit into the second cache
 _UNROLLED = 4  # inputs that a single sample's loop takes at once
 _LINE = 16  # numbers of float32 in a line of the cache
 _FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
@@ -21,7 +22,7 @@ Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 
 
 class CompiledNetwork:
-    """A multilayer perceptron; the estimate is offset + scale * network.
+    """A multilayer perceptron.
 
     Parameters
     ----------
@@ -29,8 +30,6 @@ class CompiledNetwork:
         Weights (inputs, outputs) and biases (outputs,) in float32.
     activation : {"tanh", "silu", "relu"}
         After every layer but the last.
-    offset, scale : ndarray, shape (outputs,), optional
-        What single samples are put into units with; by default they stay as they are.
 
     Attributes
     ----------
@@ -38,14 +37,14 @@ class CompiledNetwork:
         As given.
     outputs : int
         Number of outputs.
+    bias : ndarray of float32, shape (outputs,)
+        Of the last layer.
     packed : ndarray of float32
         Biases and weights, layer by layer.
     widths : ndarray of int
         Of the inputs and of each layer.
     between : ndarray of float32
         Memory for a single sample.
-    offset, scale : ndarray, shape (outputs,)
-        Of single samples.
 
     Raises
     ------
@@ -53,22 +52,16 @@ class CompiledNetwork:
         If Numba is not installed.
     """
 
-    def __init__(
-        self, layers: Layers, activation: str, *, offset: np.ndarray | None = None, scale: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, layers: Layers, activation: str) -> None:
         _kernels(activation)  # or say now that there is no Numba
-        self._layers, self.activation = layers, activation
+        self._layers, self.activation, self.bias = layers, activation, layers[-1][1]
         widths = [len(layers[0][0]), *(len(bias) for _, bias in layers)]
-        self.outputs = outputs = widths[-1]
-        self.offset = np.zeros(outputs) if offset is None else np.array(offset, dtype=float)
-        self.scale = np.ones(outputs) if scale is None else np.array(scale, dtype=float)
-        self.widths = np.array(widths)
-        self._most = max(widths)
+        self.outputs, self.widths, self._most = widths[-1], np.array(widths), max(widths)
         self.packed = _aligned(
             np.concatenate([part.ravel() for weight, bias in layers for part in (bias, _padded(weight))])
         )
         row = -(-(self._most + _UNROLLED) // _LINE) * _LINE
-        self.between = _aligned(np.zeros(2 * row, np.float32)).reshape(2, row)  # no kernel lets another thread in
+        self.between = _aligned(np.zeros(3 * row, np.float32)).reshape(3, row)  # no kernel lets another thread in
         self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
 
     def single(self, x: np.ndarray) -> np.ndarray:
@@ -81,15 +74,15 @@ class CompiledNetwork:
 
         Returns
         -------
-        ndarray, shape (outputs,)
-            The estimate.
+        ndarray of float32, shape (outputs,)
+            Outputs.
         """
-        out = np.empty(self.outputs)
-        _kernels(self.activation)[1](x, self.packed, self.widths, self.between, self.offset, self.scale, out)
+        out = np.empty(self.outputs, np.float32)
+        _kernels(self.activation)[1](x, self.packed, self.widths, self.between, out)
         return out
 
     def batch(self, x: np.ndarray) -> np.ndarray:
-        """Evaluate for many samples, as the network has it: without offset and scale.
+        """Evaluate for many samples.
 
         Parameters
         ----------
@@ -101,32 +94,63 @@ class CompiledNetwork:
         ndarray of float32, shape (n, outputs)
             Outputs.
         """
-        *hidden, (last, offset) = self._layers
-        activate = _kernels(self.activation)[0]
-        out = np.empty((len(x), len(offset)), np.float32)
-        spare = self._spare
-        memory = spare.pop() if spare else np.empty((2, PIECE * self._most), np.float32)
-        for first in range(0, len(x), PIECE):
-            h = x[first : first + PIECE]
-            rows = len(h)
-            for i, (weight, bias) in enumerate(hidden):
-                width = len(bias)
-                into = memory[i % 2, : rows * width].reshape(rows, width)
-                h = np.matmul(h, weight, out=into)
-                activate(h, bias)
-            np.matmul(h, last, out=out[first : first + PIECE])
-        spare.append(memory)
-        out += offset
+        out = np.empty((len(x), self.outputs), np.float32)
+        with self.memory() as memory:
+            for here in self.pieces(len(x)):
+                self.piece(x[here], memory, out[here])
+        out += self.bias
         return out
+
+    def pieces(self, n: int) -> list[slice]:
+        """Rows of a batch that go through together."""
+        count = -(-n // self._rows)
+        return [slice(n * i // count, n * (i + 1) // count) for i in range(count)]
+
+    def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
+        """Evaluate for the rows of a piece, all but the last biases.
+
+        Parameters
+        ----------
+        h : ndarray of float32, shape (rows, inputs)
+            Inputs.
+        memory : ndarray of float32
+            What :meth:`memory` lends.
+        out : ndarray of float32, shape (rows, outputs)
+            Takes what the last weights make.
+        """
+        *hidden, (last, _) = self._layers
+        activate, rows = _kernels(self.activation)[0], len(h)
+        for i, (weight, bias) in enumerate(hidden):
+            into = memory[i % 2, : rows * len(bias)].reshape(rows, len(bias))
+            h = np.matmul(h, weight, out=into)
+            activate(h, bias)
+        np.matmul(h, last, out=out)
+
+    @contextmanager
+    def memory(self) -> Iterator[np.ndarray]:
+        """Lend memory for the layers of a piece, the same to one after another."""
+        spare = self._spare
+        memory = spare.pop() if spare else np.empty((2, self._rows * self._most), np.float32)
+        yield memory
+        spare.append(memory)
+
+    @property
+    def _rows(self) -> int:
+        return max(1, PIECE // self._most)
 
 
 class CompiledDecoder:
-    """From the filter's state to the estimate, for one sample at a time: coordinates, network and units in one call.
+    """From the filter's state to the estimate: one call for a single sample, a few for each piece of a batch.
+
+    The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in float64.
+    (The coordinates are differences of filter states that are much alike, of which float32 would leave little.)
 
     Parameters
     ----------
-    network : CompiledNetwork
-        With offset and scale of the states.
+    layers : sequence of (ndarray, ndarray)
+        Weights (inputs, outputs) and biases (outputs,) in float32, of two layers at least.
+    activation : {"tanh", "silu", "relu"}
+        After every layer but the last.
     whiten : ndarray, shape (size, modes)
         From z to the network's coordinates.
     offset : ndarray, shape (modes,)
@@ -135,6 +159,8 @@ class CompiledDecoder:
         What the network is given behind them.
     age : (float, float), optional
         Unit and end of the age in seconds, where the network is told that too.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Of the states.
 
     Raises
     ------
@@ -144,22 +170,28 @@ class CompiledDecoder:
 
     def __init__(
         self,
-        network: CompiledNetwork,
+        layers: Layers,
+        activation: str,
+        *,
         whiten: np.ndarray,
         offset: np.ndarray,
-        *,
         conditions: Sequence[float],
-        age: tuple[float, float] | None = None,
+        age: tuple[float, float] | None,
+        x_offset: np.ndarray,
+        x_scale: np.ndarray,
     ) -> None:
-        self._network = network
-        self._whiten, self._offset = np.array(whiten, order="C"), np.array(offset)
-        self._conditions = np.array(conditions, dtype=float)
+        self._network = CompiledNetwork(layers[1:], activation)
+        weight, bias = (part.astype(float) for part in layers[0])
+        modes, told = len(offset), len(offset) + len(conditions)
+        self._weight = whiten @ weight[:modes]
+        self._bias = bias + offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:told]
+        self._of_age = np.zeros_like(bias) if age is None else weight[told]
         self._age_unit, self._age_max = (1.0, 0.0) if age is None else age
-        self._modes = np.empty(len(offset))
-        self._inputs = len(offset) + len(conditions) + (age is not None)
+        self._first, self._entered = np.empty(len(bias)), np.empty(len(bias), np.float32)
+        self._x_offset, self._x_scale = np.array(x_offset, dtype=float), np.array(x_scale, dtype=float)
 
-    def __call__(self, z: np.ndarray, age: float) -> tuple[np.ndarray, np.ndarray]:
-        """Estimate.
+    def single(self, z: np.ndarray, age: float) -> np.ndarray:
+        """Estimate for one sample.
 
         Parameters
         ----------
@@ -170,29 +202,59 @@ class CompiledDecoder:
 
         Returns
         -------
-        inputs : ndarray of float32, shape (inputs,)
-            What the network was given.
-        x_hat : ndarray, shape (nx,)
+        ndarray, shape (nx,)
             The estimate.
         """
-        to, inputs = self._network, np.empty(self._inputs, np.float32)
-        x_hat = np.empty(to.outputs)
-        _decode(to.activation)(
+        network, x_hat = self._network, np.empty(len(self._x_offset))
+        _decode(network.activation)(
             z,
-            self._whiten,
-            self._offset,
-            self._conditions,
+            self._weight,
+            self._bias,
+            self._of_age,
             min(age, self._age_max) / self._age_unit,
-            self._modes,
-            inputs,
-            to.packed,
-            to.widths,
-            to.between,
-            to.offset,
-            to.scale,
+            self._first,
+            self._entered,
+            network.packed,
+            network.widths,
+            network.between,
+            self._x_offset,
+            self._x_scale,
             x_hat,
         )
-        return inputs, x_hat
+        return x_hat
+
+    def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
+        """Estimate for many samples.
+
+        Parameters
+        ----------
+        z : ndarray, shape (n, size)
+            The filter's states.
+        age : float or ndarray, shape (n,)
+            Seconds since reset.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            The estimates.
+        """
+        network, n, width = self._network, len(z), len(self._bias)
+        enter, finish = _batches(network.activation)
+        ages = np.broadcast_to(np.log1p(np.minimum(age, self._age_max) / self._age_unit), n)
+        x_hat = np.empty((n, network.outputs))
+        pieces = network.pieces(n)
+        most = max(piece.stop - piece.start for piece in pieces)
+        first = np.empty((most, width))
+        out = np.empty((most, network.outputs), np.float32)
+        with network.memory() as memory:
+            for here in pieces:
+                rows = here.stop - here.start
+                np.matmul(z[here], self._weight, out=first[:rows])
+                entered = memory[1, : rows * width].reshape(rows, width)  # which is free until the second layer
+                enter(first, self._bias, self._of_age, ages[here], entered)
+                network.piece(entered, memory, out[:rows])
+                finish(out, network.bias, self._x_offset, self._x_scale, x_hat[here])
+        return x_hat
 
 
 def available() -> bool:
@@ -219,20 +281,20 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def _decode(activation: str) -> Callable[..., None]:
-    """Coordinates and conditions, and the network behind them."""
+    """The first layer on z and age, and the network behind it, for one sample."""
     import numba
 
-    evaluate: Any = _kernels(activation)[1]
+    active, (_, evaluate) = _active(activation), _kernels(activation)
 
     @numba.njit(fastmath=_FAST, error_model="numpy")
     def decode(
         z: np.ndarray,
-        whiten: np.ndarray,
-        z_offset: np.ndarray,
-        conditions: np.ndarray,
+        weight: np.ndarray,
+        bias: np.ndarray,
+        of_age: np.ndarray,
         age: float,
-        modes: np.ndarray,
-        inputs: np.ndarray,
+        first: np.ndarray,
+        entered: np.ndarray,
         packed: np.ndarray,
         widths: np.ndarray,
         between: np.ndarray,
@@ -240,21 +302,55 @@ def _decode(activation: str) -> Callable[..., None]:
         scale: np.ndarray,
         out: np.ndarray,
     ) -> None:
-        n, told = len(z_offset), len(conditions)
-        for j in range(n):
-            modes[j] = z_offset[j]  # in loops: to compile an assignment of slices takes a second
-        for i in range(len(z)):
-            for j in range(n):
-                modes[j] += z[i] * whiten[i, j]
-        for j in range(n):
-            inputs[j] = modes[j]
-        for j in range(told):
-            inputs[n + j] = conditions[j]
-        if len(inputs) > n + told:
-            inputs[n + told] = math.log1p(age)
-        evaluate(inputs, packed, widths, between, offset, scale, out)
+        width, told, size = len(bias), math.log1p(age), len(z)
+        for j in range(width):
+            first[j] = bias[j] + told * of_age[j]
+        for i in range(0, size - 1, 2):
+            a, b = z[i], z[i + 1]
+            for j in range(width):
+                first[j] += a * weight[i, j] + b * weight[i + 1, j]
+        if size % 2:
+            for j in range(width):
+                first[j] += z[size - 1] * weight[size - 1, j]
+        for j in range(width):
+            entered[j] = active(np.float32(first[j]))
+        found = between[2, : len(out)]
+        evaluate(entered, packed, widths, between, found)
+        for j in range(len(out)):
+            out[j] = offset[j] + scale[j] * found[j]
 
     return decode
+
+
+@functools.cache
+def _batches(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
+    """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
+    import numba
+
+    active = _active(activation)
+
+    @numba.njit(fastmath=_FAST, error_model="numpy")
+    def enter(first: np.ndarray, bias: np.ndarray, of_age: np.ndarray, ages: np.ndarray, entered: np.ndarray) -> None:
+        for row in range(len(ages)):
+            age = ages[row]
+            for j in range(len(bias)):
+                entered[row, j] = active(np.float32(first[row, j] + bias[j] + age * of_age[j]))
+
+    @numba.njit
+    def finish(h: np.ndarray, bias: np.ndarray, offset: np.ndarray, scale: np.ndarray, out: np.ndarray) -> None:
+        for row in range(len(out)):
+            for j in range(len(bias)):
+                out[row, j] = offset[j] + scale[j] * (h[row, j] + bias[j])
+
+    return enter, finish
+
+
+@functools.cache
+def _active(activation: str) -> Any:
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
+    return compiled(_ACTIVATIONS[activation](compiled))
 
 
 @functools.cache
@@ -263,7 +359,7 @@ def _kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]
     import numba
 
     compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
-    active: Any = compiled(_ACTIVATIONS[activation](compiled))
+    active = _active(activation)
 
     @compiled
     def activate(h: np.ndarray, bias: np.ndarray) -> None:
@@ -278,8 +374,6 @@ def _kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]
         packed: np.ndarray,
         widths: np.ndarray,
         between: np.ndarray,
-        offset: np.ndarray,
-        scale: np.ndarray,
         out: np.ndarray,
     ) -> None:
         h, into, at = between[0], between[1], 0
@@ -304,7 +398,7 @@ def _kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]
                     into[j] = active(into[j])
             h, into = into, h
         for j in range(len(out)):
-            out[j] = offset[j] + scale[j] * h[j]
+            out[j] = h[j]
 
     return activate, evaluate
 

@@ -1,11 +1,13 @@
 """From the filter's state to the estimate, and to the covariance of what that is off by, at given levels of noise."""
 
+import functools
 from typing import Any, Self
 
 import numpy as np
 
 from observers.artifact import Artifact, InverseMap
 from observers.compiled import CompiledDecoder
+from observers.sparse import MANY_ROWS
 from observers.spread import Covariance
 
 # Which decoder is asked, in which rows (None for all), what its networks are given, and the age in seconds.
@@ -46,38 +48,45 @@ class Decoders:
         """Of what the estimates are off by, (..., nx, nx)."""
         return self.covariance(self.read(z, age))
 
-    def estimate(self, z: np.ndarray, age: Any) -> tuple[Read, np.ndarray]:
-        """What the networks are given, and the estimates."""
-        driven, free = self._driven, self._free
-        if z.ndim > 1 or driven.compiled is None:
-            read = self.read(z, age)
-            return read, self.mean(read)
-        decoder = driven
-        if free is not None and not z[-1] and not any(z[free.size :].tolist()):
-            decoder, z = free, z[: free.size]
-        assert decoder.compiled is not None
-        inputs, x_hat = decoder.compiled(z, age)
-        return [(decoder, None, inputs, age)], x_hat
+    def estimate(self, z: np.ndarray, age: Any) -> tuple[Read | None, np.ndarray]:
+        """The estimates, and what the networks are given where nobody has compiled it away."""
+        parts = self._parts(z, age)
+        if len(parts) == 1:  # most often
+            decoder, _, z, age = parts[0]
+            x_hat = decoder.compiled(z, age)
+            if x_hat is not None:
+                return None, x_hat
+        else:
+            found = [decoder.compiled(z, age) for decoder, _, z, age in parts]
+            if all(x_hat is not None for x_hat in found):
+                return None, _in_place(parts, found)
+        read = [(decoder, rows, decoder.read(z, age), age) for decoder, rows, z, age in parts]
+        return read, self.mean(read)
 
     def read(self, z: np.ndarray, age: Any) -> Read:
         """What the networks are given for filter states, (..., size), of these ages in seconds."""
+        return [(decoder, rows, decoder.read(z, age), age) for decoder, rows, z, age in self._parts(z, age)]
+
+    def _parts(self, z: np.ndarray, age: Any) -> Read:
+        """Which decoder is asked in which rows, with the filter states there in place of what networks are given."""
         driven, free = self._driven, self._free
         if free is None:
-            return [(driven, None, driven.read(z, age), age)]
+            return [(driven, None, z, age)]
         nz = free.size  # behind it lies z_u, exactly 0 until an input acts
         if z.ndim == 1:  # a single sample: every call of numpy would be felt
-            if any(z[nz:].tolist()):
-                return [(driven, None, driven.read(z, age), age)]
-            return [(free, None, free.read(z[:nz], age), age)]
-        moved = np.asarray(z[..., nz:].any(-1))
+            if z[-1] or any(z[nz:].tolist()):
+                return [(driven, None, z, age)]
+            return [(free, None, z[:nz], age)]
+        moved = z[..., -1] != 0  # most often
+        moved = moved if moved.all() else np.asarray(z[..., nz:].any(-1))
         if moved.all():
-            return [(driven, None, driven.read(z, age), age)]
+            return [(driven, None, z, age)]
         if not moved.any():
-            return [(free, None, free.read(z[..., :nz], age), age)]
+            return [(free, None, z[..., :nz], age)]
         age, still = np.broadcast_to(age, moved.shape), ~moved
         return [
-            (driven, moved, driven.read(z[moved], age[moved]), age[moved]),
-            (free, still, free.read(z[still][:, :nz], age[still]), age[still]),
+            (driven, moved, z[moved], age[moved]),
+            (free, still, z[still][:, :nz], age[still]),
         ]
 
     def mean(self, read: Read) -> np.ndarray:
@@ -115,15 +124,18 @@ class Decoder:
         self._whiten = np.ascontiguousarray((inverse.gain(measurement_noise)[:, None] * inverse.whiten).T)
         self._offset = -inverse.z_offset @ self._whiten
         self._conditions: list[Any] = [*inverse.noise_features(measurement_noise, process_noise)]
-        self._told_age = inverse.features[-1] == "age"
-        self.compiled: CompiledDecoder | None = None
-        if compiled:
-            network = inverse.mlp.compiled(inverse.x_offset, inverse.x_scale)
-            age = (inverse.age_unit, inverse.age_max) if self._told_age else None
-            self.compiled = CompiledDecoder(network, self._whiten, self._offset, conditions=self._conditions, age=age)
+        self._told_age, self._singly = inverse.features[-1] == "age", compiled
         if inverse.spread is not None:
             shares = inverse.shares(measurement_noise, process_noise)
             self.covariance = Covariance(inverse.spread, shares, inverse.x_scale, compiled=compiled)
+
+    def compiled(self, z: np.ndarray, age: Any) -> np.ndarray | None:
+        """The estimate by machine code, of a large batch or, if so asked, one sample; None where NumPy is to do it."""
+        if z.ndim == 1 and self._singly and self._compiled is not None:
+            return self._compiled.single(z, age)
+        if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
+            return self._compiled.batch(z, age)
+        return None
 
     def read(self, z: np.ndarray, age: Any) -> np.ndarray:
         """What the network is given."""
@@ -145,3 +157,25 @@ class Decoder:
         """The estimate, (..., nx)."""
         inverse = self._inverse
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+
+    @functools.cached_property
+    def _compiled(self) -> CompiledDecoder | None:
+        inverse, mlp = self._inverse, self._inverse.mlp
+        if len(mlp.layers) < 2:
+            return None
+        try:
+            return CompiledDecoder(
+                mlp.layers,
+                mlp.activation,
+                whiten=self._whiten,
+                offset=self._offset,
+                conditions=self._conditions,
+                age=(inverse.age_unit, inverse.age_max) if self._told_age else None,
+                x_offset=inverse.x_offset,
+                x_scale=inverse.x_scale,
+            )
+        except ImportError:
+            return None

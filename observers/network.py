@@ -52,7 +52,7 @@ class MLP:
     weights: Sequence[np.ndarray]
     biases: Sequence[np.ndarray]
     activation: str
-    _layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
+    layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         choice("the activation", self.activation, ACTIVATIONS)
@@ -76,7 +76,7 @@ class MLP:
             if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights or biases that are not finite")
             width = len(bias)
-        object.__setattr__(self, "_layers", layers)
+        object.__setattr__(self, "layers", layers)
 
     @property
     def inputs(self) -> int:
@@ -111,12 +111,12 @@ class MLP:
             Outputs.
         """
         activation = ACTIVATIONS[self.activation]
-        *hidden, (weight, bias) = self._layers
+        *hidden, (weight, bias) = self.layers
         h: np.ndarray = x.astype(np.float32, copy=False)
         if h.ndim > 2:
             h = h.reshape(-1, h.shape[-1])
-        if h.ndim == 2 and len(h) >= MANY_ROWS and self._compiled is not None:
-            h = self._compiled.batch(h)
+        if h.ndim == 2 and len(h) >= MANY_ROWS and self.compiled is not None:
+            h = self.compiled.batch(h)
         else:
             for w, b in hidden:
                 h = np.dot(h, w)
@@ -126,17 +126,14 @@ class MLP:
             h += bias
         return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
 
-    def compiled(self, offset: np.ndarray, scale: np.ndarray) -> CompiledNetwork:
-        """The same network as machine code, in which single samples become offset + scale * outputs."""
-        return CompiledNetwork(self._layers, self.activation, offset=offset, scale=scale)
-
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+        return {name: value for name, value in self.__dict__.items() if name != "compiled"}  # Numba is not everywhere
 
     @functools.cached_property
-    def _compiled(self) -> CompiledNetwork | None:
+    def compiled(self) -> CompiledNetwork | None:
+        """The same network as machine code; None without Numba."""
         try:
-            return CompiledNetwork(self._layers, self.activation)
+            return CompiledNetwork(self.layers, self.activation)
         except ImportError:
             return None
 

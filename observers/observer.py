@@ -153,12 +153,6 @@ class KKLObserver:
         y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
         self._states(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        if self._compiled and not available():  # Numba is not everywhere
-            self._compiled = False
-            self._tell()
-
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 

@@ -93,8 +93,7 @@ class Covariance:
         *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
         bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
         self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
-        ones = np.ones(len(bias))
-        self._single = self._mlp.compiled(0.0 * ones, ones).single if compiled else self._mlp
+        self._singly = compiled
         tables, (measurement, process) = np.log(spread.factors) / 2, levels
         if tables.ndim == 3:
             share = min(process, 1.0)
@@ -117,7 +116,9 @@ class Covariance:
         ndarray, shape (..., nx, nx)
             In units of the states.
         """
-        nx, out = self._nx, (self._single if inputs.ndim == 1 else self._mlp)(inputs)
+        nx, mlp = self._nx, self._mlp
+        singly = inputs.ndim == 1 and self._singly and mlp.compiled is not None
+        out = mlp.compiled.single(inputs) if singly else mlp(inputs)
         if out.ndim == 1:  # a single sample: every call of numpy would be felt
             values, factor = out.tolist(), self._log_factor(float(age))
             scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
