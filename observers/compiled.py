@@ -284,7 +284,7 @@ def _decode(activation: str) -> Callable[..., None]:
     """The first layer on z and age, and the network behind it, for one sample."""
     import numba
 
-    active, (_, evaluate) = _active(activation), _kernels(activation)
+    active, evaluate = _active(activation), _kernels(activation)[1]
 
     @numba.njit(fastmath=_FAST, error_model="numpy")
     def decode(
@@ -354,7 +354,7 @@ def _active(activation: str) -> Any:
 
 
 @functools.cache
-def _kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
+def _kernels(activation: str) -> tuple[Any, Any]:
     """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
     import numba
 

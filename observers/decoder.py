@@ -58,8 +58,9 @@ class Decoders:
                 return None, x_hat
         else:
             found = [decoder.compiled(z, age) for decoder, _, z, age in parts]
-            if all(x_hat is not None for x_hat in found):
-                return None, _in_place(parts, found)
+            whole = [x_hat for x_hat in found if x_hat is not None]
+            if len(whole) == len(parts):
+                return None, _in_place(parts, whole)
         read = [(decoder, rows, decoder.read(z, age), age) for decoder, rows, z, age in parts]
         return read, self.mean(read)
 

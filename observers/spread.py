@@ -116,9 +116,8 @@ class Covariance:
         ndarray, shape (..., nx, nx)
             In units of the states.
         """
-        nx, mlp = self._nx, self._mlp
-        singly = inputs.ndim == 1 and self._singly and mlp.compiled is not None
-        out = mlp.compiled.single(inputs) if singly else mlp(inputs)
+        nx, compiled = self._nx, self._mlp.compiled if self._singly and inputs.ndim == 1 else None
+        out = self._mlp(inputs) if compiled is None else compiled.single(inputs)
         if out.ndim == 1:  # a single sample: every call of numpy would be felt
             values, factor = out.tolist(), self._log_factor(float(age))
             scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
