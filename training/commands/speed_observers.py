@@ -61,7 +61,7 @@ def observer_tasks(
     each = [_Filterpy(FilterpyEKF, system, artifact.filter.dt, Q=Q, R=R) for _ in range(n)]
 
     def filterpy() -> float:
-        count = BATCHES if rows else steps
+        count = min(BATCHES, steps) if rows else steps
         began = time.process_time()
         for k in range(count):
             for row, one in enumerate(each):
