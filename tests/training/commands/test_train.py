@@ -6,6 +6,7 @@ import pytest
 
 from observers import Artifact, Expression, KKLObserver
 from training.cli import main
+from training.commands.train import Train
 
 
 def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monkeypatch):
@@ -94,7 +95,6 @@ def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(tmp_path, capsys, m
     path = tmp_path / "runs" / "van_der_pol-small" / "van_der_pol-small.safetensors"
     assert Artifact.read(path).inverse.mlp.weights[0].shape[0] == 40
     assert "width = 40" in capsys.readouterr().out
-    main(["train", "van_der_pol", "--size", "small", "--no-inputs", "--width", "8", "--out", "own", *sizes.split()])
-    assert Artifact.read("own/van_der_pol-small.safetensors").inverse.mlp.weights[0].shape[0] == 8
+    assert Train("van_der_pol", size="small", settings={"width": 8})._changes() == {"width": 8}
     with pytest.raises(SystemExit, match="--size is of no use with --data"):
         main(["train", "--data", "runs.csv", "--size", "small"])
