@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long lint format maps results benchmark ablation certificates agents environments speed clean help
+.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents environments speed docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -22,6 +22,9 @@ test-slow: $(VENV)/ready  ## the tests that train for minutes
 
 test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, half an hour; they print counts
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
+
+test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+	$(BIN)/pytest tests/browser -m browser
 
 lint: $(VENV)/ready  ## style, types and the contract of imports
 	$(BIN)/ruff check .
@@ -46,6 +49,11 @@ maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; 
 
 results: $(VENV)/ready  ## the figures and the accuracy in the README and in docs/
 	$(BIN)/kkl-gym demo --out docs/figures
+	$(BIN)/kkl-gym demo --gif --seed 7 --duration 12 --out runs/portraits
+	cp runs/portraits/estimates.gif docs/figures/portraits.gif
+	for system in $(SYSTEMS); do \
+		$(BIN)/kkl-gym demo $$system --gif --seed 7 --duration 12 --out runs/portraits || exit 1; \
+		cp runs/portraits/estimates-$$system.gif docs/figures/$$system.gif || exit 1; done
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
@@ -87,6 +95,11 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
+
+docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
+	$(BIN)/python docs/site/commands.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
+	$(BIN)/python docs/demo/build.py runs/site/demo
 
 clean:  ## remove environments and caches; what lies under runs/ stays
 	rm -rf .venv .venv-* .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.*

@@ -6,7 +6,7 @@ Every parameter of the plant is 10 % larger than the observer's model has it. Th
 
 Three observers are compared on the plant: the shipped one as it is, the one that :func:`training.identification.adapt`
 makes from it, and one that is trained on the true parameters by the same settings.
-docs/guides/identification.md has a table.
+docs/results/identification.md has a table.
 """
 
 import time

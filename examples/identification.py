@@ -4,7 +4,7 @@ The records hold t and y, nothing else. First guesses are 30 to 50 % off::
 
     python examples/identification.py lorenz --noise 0.5
 
-docs/guides/identification.md explains the method, and has a table of what this script prints.
+docs/guides/identification.md explains the method, docs/results/identification.md has a table of what this prints.
 """
 
 import time

@@ -9,7 +9,7 @@ that a control engineer would begin with::
 PATH is a folder with run01.csv to run12.csv, whose columns are alpha, theta (rad), alpha_dot, theta_dot (rad/s) and
 time (s): the twelve free runs that come with Buisson-Fenet, Bahr, Morgenthaler, Di Meglio, "Towards gain tuning for
 numerical KKL observers" (2023), repository Centre-automatique-et-systemes/learn_observe_KKL, MIT licence.
-docs/guides/data.md has the results.
+docs/results/qube.md has the results.
 
 What is said of the device beforehand, beside the records: left and right are alike, and the arm has no angle of its
 own. Each run is therefore learned from twice, once mirrored, with the signs of both angles changed; and the map sees

@@ -6,8 +6,7 @@ Plain arithmetic and comparisons already work on Python floats, NumPy arrays, to
     from kkl_gym.elementary import sin, where
 
 Numbers may stand beside arrays, tensors or expressions. Everywhere exp(1000) is infinite, log(0) minus infinite and
-sqrt(-1) not a number, without a warning. "Your own system" in ``docs/environments/index.md`` has a table of the
-functions.
+sqrt(-1) not a number, without a warning. ``docs/guides/your_system.md`` has a table of the functions.
 """
 
 import builtins

@@ -1,5 +1,6 @@
 """Gymnasium environments over the systems: process noise, measurement noise and a bounded input."""
 
+import itertools
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
@@ -9,11 +10,20 @@ import numpy as np
 
 from kkl_gym.equations import complex_motion, components, target_of
 from kkl_gym.plant import Plant
-from kkl_gym.rendering import TRAIL, Canvas, check_render_mode, render_metadata
+from kkl_gym.rendering import (
+    ARRAYS_AND_WINDOWS,
+    TRAIL,
+    Canvas,
+    Window,
+    check_render_mode,
+    render_metadata,
+    samples_a_frame,
+)
 from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, System
 from observers.checks import integer, mapping, real_array, shown
 
+_KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
 _INTEGER = np.dtype(np.int64)
 _ACTIONS = (np.dtype(np.float32), np.dtype(np.float64))  # that a step takes as they are
 
@@ -62,8 +72,9 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     start_box : tuple of (float, float), length nx, optional
         (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
         its starts.
-    render_mode : {None, "rgb_array"}
-        Whether :meth:`render` draws.
+    render_mode : {None, "rgb_array", "human"}
+        Whether :meth:`render` draws. With "human" a window shows the motion as fast as it is, from :meth:`reset` on
+        until :meth:`close`; it needs the extra ``human``. An observer around the environment shows its estimate there.
 
     Raises
     ------
@@ -84,7 +95,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     (array([5.]), array(1))
     """
 
-    metadata = render_metadata(0.01)
+    metadata = render_metadata(0.01, ARRAYS_AND_WINDOWS)
 
     def __init__(
         self,
@@ -107,8 +118,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             parameters=parameters,
             start_box=start_box,
         )
-        check_render_mode(render_mode)
-        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt)
+        check_render_mode(render_mode, ARRAYS_AND_WINDOWS)
+        self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS)
         self.system, self.dt, self.observe = self.plant.system, self.plant.dt, observe
         self.process_noise, self.measurement_noise = self.plant.process_noise, self.plant.measurement_noise
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
@@ -123,6 +134,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
         self._canvas: Canvas | None = None
+        self._window: Window | None = None
+        self.drawn_by = 0  # the observer around it, by number, that draws the window; 0 is the environment itself
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -166,6 +179,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._u = None
         self._trail.clear()
         self._trail.append(self._x)
+        if self.render_mode == "human" and not self.drawn_by:
+            self.animate()
         return self._observation(), self._info([0.0] * self._nu, False)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -212,6 +227,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         if self.render_mode is not None:
             self._trail.append(self._x)
             self._u = u
+            if self.render_mode == "human" and not self.drawn_by:
+                self.animate()
         cost = 0.0
         for xi, (target, weight) in zip(self._x, self._goal):
             cost += weight * (xi - target) * (xi - target)
@@ -223,14 +240,14 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         Returns
         -------
         ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``.
+            An RGB image; None without ``render_mode``, and where it is shown in a window.
 
         Raises
         ------
         gymnasium.error.ResetNeeded
             Before :meth:`reset`.
         ImportError
-            If matplotlib (the extra ``plots``) is not installed.
+            If matplotlib (the extra ``plots``) is not installed, or for a window pygame (the extra ``human``).
         """
         return self.draw()
 
@@ -253,10 +270,52 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset() before render()")
         if self._canvas is None or self._canvas.estimates != bool(estimates):
             self._canvas = Canvas(self.system, bool(estimates))
-        return self._canvas.draw(self._trail, estimates, self._u)
+        frame = self._canvas.draw(self._trail, estimates, self._u)
+        if self.render_mode != "human":
+            return frame
+        if self._window is None:
+            self._window = Window(self.system.name.replace("_", " "), self.dt)
+        self._window.show(frame)
+        return None
+
+    def animate(self, estimates: Collection[Sequence[float]] = ()) -> None:
+        """Draw the window's next frame, if one is due at this sample.
+
+        Parameters
+        ----------
+        estimates : collection of sequences of float, length nx
+            As for :meth:`draw`.
+        """
+        if self._sample % samples_a_frame(self.dt) == 0:
+            self.draw(estimates)
+
+    def close(self) -> None:
+        """Close the window, if there is one; the next frame opens another."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def get_keys_to_action(self) -> dict[tuple[int, ...], np.ndarray]:
+        """Keys for :func:`gymnasium.utils.play.play`: a and d are the ends of the first input, s and w of the second.
+
+        ``play`` wants ``noop=np.zeros(nu, np.float32)`` beside them, the action while no key is pressed.
+
+        Returns
+        -------
+        dict of tuple of int to ndarray, shape (nu,)
+            Actions by the codes of the keys that are pressed together.
+        """
+        found = {}
+        for pressed in itertools.product(*(((), (low,), (high,)) for low, high in _KEYS[: self._nu])):
+            action = np.zeros(self._nu, np.float32)
+            for i, keys in enumerate(pressed):
+                action[i] = sum(_KEYS[i].index(key) * 2 - 1 for key in keys)
+            found[tuple(ord(key) for keys in pressed for key in keys)] = action
+        del found[()]
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
+        return {**self.__dict__, "_canvas": None, "_window": None}  # they cannot be copied, and are made anew
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:

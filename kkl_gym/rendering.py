@@ -1,7 +1,8 @@
-"""The phase portrait that ``render_mode="rgb_array"`` shows."""
+"""The phase portrait that ``render_mode="rgb_array"`` returns and ``render_mode="human"`` shows in a window."""
 
+import math
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,40 +13,45 @@ from observers.checks import shown
 STATE, ESTIMATE, TARGET = "0.2", "C3", "C2"
 TRAIL = 1000  # samples that a phase portrait shows
 FRAMES = 100  # a second at most, about what players and screens keep up with
+DRAWN = 50  # frames a second at most that a window is drawn, whose time is that of the motion
+ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
-def render_metadata(dt: float) -> dict[str, Any]:
+def render_metadata(dt: float, modes: Collection[str]) -> dict[str, Any]:
     """What environments say of their rendering: the modes, and the frames a second that show a motion as it is.
 
     Parameters
     ----------
     dt : float
         Seconds between two frames.
+    modes : collection of str
+        The modes.
 
     Returns
     -------
     dict
         ``render_modes`` and ``render_fps``. Motions sampled faster than ``FRAMES`` times a second are shown slower.
     """
-    return {"render_modes": ["rgb_array"], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
+    return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
 
 
-def check_render_mode(render_mode: str | None) -> None:
+def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
     """Raise an error unless ``render_mode`` is one that environments offer.
 
     Parameters
     ----------
     render_mode : str, optional
         The mode, or None.
+    modes : collection of str
+        Those that there are.
 
     Raises
     ------
     ValueError
         If the mode is unknown.
     """
-    modes = render_metadata(1.0)["render_modes"]
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
-        raise ValueError(f"render_mode must be None or one of {modes}, got {shown(render_mode)}")
+        raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
 
 
 class Trails:
@@ -166,3 +172,59 @@ class Canvas:
             bar.set_width(share)
             bar.axes.draw_artist(bar)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+class Window:
+    """A window on the screen that shows a motion as fast as it is: frames that a screen could not show are left out.
+
+    Parameters
+    ----------
+    title : str
+        Its title.
+    dt : float
+        Sampling interval of the motion in seconds.
+
+    Raises
+    ------
+    ImportError
+        If pygame (the extra ``human``) is not installed.
+    """
+
+    def __init__(self, title: str, dt: float) -> None:
+        try:
+            import pygame
+        except ImportError as error:
+            raise ImportError('render_mode="human" needs pygame: pip install "kkl-gym[human]"') from error
+        self._pygame: Any = pygame
+        self._title, self._rate = title, 1.0 / (dt * samples_a_frame(dt))
+        self._screen: Any = None
+        self._clock = pygame.time.Clock()
+
+    def show(self, frame: np.ndarray) -> None:
+        """Show a frame, as soon as it is due; opens the window if there is none yet.
+
+        Parameters
+        ----------
+        frame : ndarray of uint8, shape (height, width, 3)
+            An RGB image.
+        """
+        pygame = self._pygame
+        if self._screen is None:
+            pygame.display.init()
+            self._screen = pygame.display.set_mode(frame.shape[1::-1])
+            pygame.display.set_caption(self._title)
+        pygame.surfarray.blit_array(self._screen, frame.swapaxes(0, 1))
+        pygame.event.pump()
+        self._clock.tick(self._rate)
+        pygame.display.flip()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._screen is not None:
+            self._pygame.display.quit()
+            self._screen = None
+
+
+def samples_a_frame(dt: float) -> int:
+    """How many sampling intervals of ``dt`` seconds there are from one frame of a window to the next."""
+    return max(1, math.ceil(1.0 / (dt * DRAWN) - 1e-9))

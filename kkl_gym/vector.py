@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from kkl_gym.compiled import batch_step
 from kkl_gym.equations import components, target_of
 from kkl_gym.plant import NOISE_BLOCK, Plant
-from kkl_gym.rendering import Canvas, Trails, check_render_mode, render_metadata
+from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
@@ -108,9 +108,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.num_envs = num_envs
         self.max_episode_steps = max_episode_steps
         self.autoreset_mode = autoreset_mode_of(autoreset_mode)
-        check_render_mode(render_mode)
+        check_render_mode(render_mode, ARRAYS)
         self.render_mode = render_mode
-        self.metadata = {**render_metadata(self.plant.dt), "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**render_metadata(self.plant.dt, ARRAYS), "autoreset_mode": self.autoreset_mode}
         self.single_observation_space = self.plant.observation_space
         self.single_action_space = self.plant.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)

@@ -1,5 +1,6 @@
 import os
 
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # windows of pygame that nobody sees
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy and torch: more threads than cores get in each other's way
 
 from itertools import pairwise

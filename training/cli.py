@@ -77,7 +77,9 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     with _noticing_interruptions() as interrupted:
         try:
-            _run(arguments)
+            from rich.console import Console
+
+            read(arguments).run(Console())
         except BaseException as error:
             if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
                 hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
@@ -121,18 +123,34 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def _run(arguments: list[str]) -> None:
+def read(arguments: list[str]) -> Any:
+    """Read a command line, and run nothing.
+
+    Parameters
+    ----------
+    arguments : list of str
+        What follows ``kkl-gym``.
+
+    Returns
+    -------
+    object
+        The command with its options; ``run(console)`` runs it.
+
+    Raises
+    ------
+    SystemExit
+        After help, and with one line that says what is wrong where the command or an option is unknown.
+    """
     import tyro
-    from rich.console import Console
 
     called = arguments[:1]
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
         called = list(COMMANDS)
-    commands = {name: (_load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
+    commands = {name: (load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            command: Any = tyro.extras.subcommand_cli_from_dict(
+            return tyro.extras.subcommand_cli_from_dict(
                 commands,
                 prog="kkl-gym",
                 description="Learned KKL observers for Gymnasium environments.",
@@ -143,7 +161,6 @@ def _run(arguments: list[str]) -> None:
         if end.code != MISUSED:
             raise
         _end(_without_box(said.getvalue()), MISUSED)
-    command.run(Console())
 
 
 def _end(message: str, code: int) -> NoReturn:
@@ -164,7 +181,21 @@ def _without_box(text: str) -> str:
     return "; ".join(part for part in kept if part and not part.startswith(("Argument helptext", "For full helptext")))
 
 
-def _load(module: str, name: str) -> Callable[..., Any]:
+def load(module: str, name: str) -> Callable[..., Any]:
+    """Import what is behind a command.
+
+    Parameters
+    ----------
+    module : str
+        Under ``training.commands``.
+    name : str
+        Of the class in it.
+
+    Returns
+    -------
+    type
+        The class, whose fields are the options.
+    """
     found: Callable[..., Any] = getattr(import_module(f"training.commands.{module}"), name)
     return found
 

@@ -183,6 +183,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
         self._rendering = env.render_mode is not None  # which every wrapper inside would be asked for at each step
+        self._draws = 0  # which of the observers around one environment it is; the outermost draws the window
+        if isinstance(base, KKLEnv):
+            base.drawn_by += 1
+            self._draws = base.drawn_by
         self.observation_space = self._estimator.space
 
     def reset(
@@ -264,16 +268,24 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Returns
         -------
         ndarray of uint8, shape (height, width, 3), or None
-            An RGB image; None without ``render_mode``.
+            An RGB image; None without ``render_mode``, and where it is shown in a window.
         """
         base = self.unwrapped
         return base.draw(self._trail) if isinstance(base, KKLEnv) else self.env.render()  # type: ignore[return-value]
+
+    def _animate(self) -> None:
+        """Draw the window of an environment of ours, unless another observer further out does."""
+        base = self.unwrapped
+        if isinstance(base, KKLEnv) and base.drawn_by == self._draws:
+            base.animate(self._trail)
 
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()
         info.update(report)
         if self._rendering and "x_hat" in report:
             self._trail.append(report["x_hat"].tolist())
+        if self._rendering and self.render_mode == "human":
+            self._animate()
         return observation(self._estimator.shown(report), self._estimator.space)
 
 

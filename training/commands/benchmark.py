@@ -26,7 +26,7 @@ class Benchmark:
 
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
-    trained observer; a run that was interrupted goes on where it stopped, and jobs may be spread over several runs by
+    trained observer. A run that was interrupted goes on where it stopped. Jobs may be spread over several runs by
     --systems and --methods. What is missing from the full set is said in table and figure.
     """
 

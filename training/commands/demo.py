@@ -16,6 +16,7 @@ from kkl_gym.simulate import check_duration
 from observers import load
 from observers.storage import replacing
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
+from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
 from training.progress import progress_bars
@@ -40,8 +41,13 @@ class Demo:
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
+    gif: bool = False
+    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
+    live: bool = False
+    """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
+    the sensor. Keys are shown there."""
 
-    def run(self, console: Console) -> Path:
+    def run(self, console: Console) -> Path | None:
         """Run.
 
         Parameters
@@ -51,20 +57,27 @@ class Demo:
 
         Returns
         -------
-        Path
-            The figure.
+        Path or None
+            The figure; None of a window.
 
         Raises
         ------
         ValueError
-            If an option makes no sense, or there is no observer for the system.
+            If an option makes no sense, there is no observer for the system, or no window can be opened.
         """
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
-        environments = shown(self.system, self.observer)
+        if self.live and (self.duration is not None or self.gif):
+            raise ValueError("a window stays open until it is closed: leave out --duration and --gif beside --live")
+        environments = shown(self.system or ("van_der_pol" if self.live else None), self.observer)
         for one in environments:
             if not one.observed:
                 raise ValueError(f"no observer ships for {one.system.name!r}: name a file, --observer FILE")
+        if self.live:
+            from training.commands.live import show  # which takes a second that others need not wait for
+
+            show(environments[0], self.measurement_noise, seed=self.seed)
+            return None
         with progress_bars(console) as progress:
             episodes = []
             for one in environments:
@@ -79,6 +92,11 @@ class Demo:
             with progress.phase("drawing"):
                 draw(path, episodes)
             progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
+            if self.gif:
+                moving = path.with_suffix(".gif")
+                with progress.phase("drawing the moving picture"):
+                    animate(moving, [episode.motion for episode in episodes])
+                progress.say(f"wrote {moving}: states in black, estimates in red, measured outputs below")
         return path
 
 
@@ -117,6 +135,12 @@ class Episode:
     def name(self) -> str:
         """The system's."""
         return self.env.unwrapped.system.name  # type: ignore[attr-defined]
+
+    @property
+    def motion(self) -> Motion:
+        """What a moving picture shows of it."""
+        env: Any = self.env.unwrapped
+        return Motion(env.system, env.dt, self.x, self.x_hat, self.y)
 
     @property
     def measurement_noise(self) -> str:

@@ -18,8 +18,8 @@ class ErrorBars:
     """Learn how far an observer's estimates are off: the covariance of its errors, at each sample.
 
     T_inv and all else in the file stay as they are, to the last bit. A small network beside it learns from motions like
-    those of the training, but others, and is calibrated on further ones: regions of 90 % then hold 90 % of the errors
-    at each level of measurement noise that the map is told, at each age and with or without process noise.
+    those of the training, but others, and is calibrated on further ones. Regions of 90 % then hold 90 % of the errors.
+    That is so at each level of measurement noise that the map is told, at each age, with or without process noise.
     """
 
     observer: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MAP")]

@@ -53,10 +53,10 @@ class Evaluate:
     """Print observers' errors on unseen trajectories: in X and in 2X without X, with and without noise.
 
     SMAPE in percent, median and interquartile range over the trajectories, over all steps (the paper's measure) and
-    after the transient: the first fifth of a run, or 5 s where it is driven by random steps and sines (of systems of
-    another pace, 500 samples). A second table has the NRMSE of each state after the transient, the median over the
-    trajectories: its root mean square error in percent of its standard deviation over all of them. SMAPE is of one norm
-    of all states, which says little where their units differ.
+    after the transient. That is the first fifth of a run, or 5 s where it is driven by random steps and sines (of
+    systems of another pace, 500 samples). A second table has the NRMSE of each state after the transient, the median
+    over the trajectories: its root mean square error in percent of its standard deviation over all of them. SMAPE is of
+    one norm of all states, which says little where their units differ.
 
     2X is cut at the system's declared bounds. Trajectories that leave these are counted, and left out. Observers are
     told the levels of noise if they can use them; a level beyond a map's range is left out. The column "driven" is

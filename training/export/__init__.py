@@ -1,7 +1,7 @@
-"""An observer's step for programs without Python: as an ONNX graph, and as C99.
+"""An observer's step for programs without Python: as an ONNX graph, as C99, and for JavaScript.
 
-Both are of :class:`Exported`, and hold what :meth:`observers.KKLObserver.reset` and :meth:`observers.KKLObserver.step`
-do with samples that are all there. What fills gaps and the monitor are left out.
+All are of :class:`Exported`, and hold what :meth:`observers.KKLObserver.reset` and :meth:`observers.KKLObserver.step`
+do with samples that are all there. What fills gaps, the monitor and error bars are in JavaScript alone.
 """
 
 from training.export.exported import PRECISIONS, Exported

@@ -4,6 +4,7 @@ import math
 import os
 import re
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -158,6 +159,26 @@ class Exported:
         """Names of the known inputs."""
         signals = self.artifact.signals
         return _numbered("u", self.artifact.nu) if signals is None else list(signals["inputs"])
+
+    @property
+    def described(self) -> dict[str, Any]:
+        """What a file says of it beside the numbers of a step, as JSON can hold it."""
+        described: dict[str, Any] = {
+            "name": self.name,
+            "artifact": self.source,
+            "sha256": self.checksum,
+            "system": self.artifact.system,
+            "parameters": dict(self.artifact.parameters),
+            "dt": self.artifact.filter.dt,
+            "y": self.outputs,
+            "u": self.inputs,
+            "x_hat": self.estimates,
+        }
+        if self.levels:
+            described["measurement_noise"] = list(self.levels)
+        if self.told_process_noise:
+            described["process_noise"] = self.process_noise
+        return described
 
 
 def identifier(name: str) -> str:

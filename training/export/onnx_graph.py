@@ -86,29 +86,10 @@ def onnx_model(exported: Exported) -> Any:
         producer_name="kkl-gym",
         producer_version=kkl_gym.__version__,
     )
-    helper.set_model_props(model, _described(exported))
+    texts = {key: told if isinstance(told, str) else json.dumps(told) for key, told in exported.described.items()}
+    helper.set_model_props(model, texts)
     checker.check_model(model, full_check=True)
     return model
-
-
-def _described(exported: Exported) -> dict[str, str]:
-    """The metadata: texts as they are, anything else as JSON."""
-    described: dict[str, Any] = {
-        "name": exported.name,
-        "artifact": exported.source,
-        "sha256": exported.checksum,
-        "system": exported.artifact.system,
-        "parameters": dict(exported.artifact.parameters),
-        "dt": exported.artifact.filter.dt,
-        "y": exported.outputs,
-        "u": exported.inputs,
-        "x_hat": exported.estimates,
-    }
-    if exported.levels:
-        described["measurement_noise"] = list(exported.levels)
-    if exported.told_process_noise:
-        described["process_noise"] = exported.process_noise
-    return {name: text if isinstance(text, str) else json.dumps(text) for name, text in described.items()}
 
 
 class _Graph:

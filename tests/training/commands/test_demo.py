@@ -1,9 +1,14 @@
 """``kkl-gym demo``."""
 
+from itertools import pairwise
+
 import linear_system
+import numpy as np
 import pytest
+from PIL import Image, ImageSequence
 
 from training.cli import main
+from training.commands import portraits
 
 OWN = f"{linear_system.__file__}:Oscillator"
 AUTONOMOUS = f"{linear_system.__file__}:Autonomous"
@@ -26,6 +31,16 @@ def test_a_system_of_ones_own(system, saved, tmp_path, capsys):
     assert f" {name} " in out
     assert "SPINN" not in out
     assert (tmp_path / f"estimates-{name}.png").stat().st_size > 10_000
+
+
+def test_a_moving_picture(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(portraits, "FRAMES", 4)
+    main(["demo", "lorenz", "--gif", "--out", str(tmp_path), "--duration", "2"])
+    assert f"wrote {tmp_path / 'estimates-lorenz.gif'}" in capsys.readouterr().out.replace("\n", "")
+    with Image.open(tmp_path / "estimates-lorenz.gif") as gif:
+        frames = [np.asarray(frame.convert("L"), int) for frame in ImageSequence.Iterator(gif)]
+    assert len(frames) == 4
+    assert all(abs(one - other).max() > 50 for one, other in pairwise(frames))
 
 
 def test_one_that_ships_with_another_observer(tmp_path, capsys):

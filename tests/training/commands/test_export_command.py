@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from observers import storage
 from training.cli import main
 
 
@@ -22,6 +23,15 @@ def test_without_a_compiler(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(shutil, "which", lambda name: None)
     main(["export", "lorenz-spinn", "--format", "c", "--out", str(tmp_path)])
     assert "there is no cc or no size here" in capsys.readouterr().out
+
+
+def test_javascript(tmp_path, capsys):
+    main(["export", "lorenz-spinn", "--format", "js", "--noise", "0.3", "--out", str(tmp_path)])
+    constants, module = tmp_path / "lorenz_spinn_step.safetensors", tmp_path / "kkl_observer.js"
+    assert "export class Observer" in module.read_text()
+    assert capsys.readouterr().out == f"wrote {constants}, {constants.stat().st_size / 1e3:.0f} kB, and {module}\n"
+    _, described = storage.read(constants, key="kkl_step", error=ValueError, what="a step")
+    assert described["measurement_noise"] == [0.3]
 
 
 def test_onnx(tmp_path, capsys):

@@ -1,0 +1,59 @@
+"""Build the demo in the browser: ``python docs/demo/build.py OUT`` makes a folder that any file server can show.
+
+It holds this folder's page, the module ``kkl_observer.js``, and the constants of the default observers as
+``kkl-gym export --format js`` writes them.
+"""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import kkl_gym
+from training.export import Exported
+from training.export.step_file import javascript, write_step
+
+HERE = Path(__file__).parent
+PAGE = ("index.html", "style.css", "main.js", "world.js", "systems.js", "drawing.js")
+
+
+def build(out: Path) -> None:
+    """Write the whole page to a folder.
+
+    Parameters
+    ----------
+    out : Path
+        The folder, which is made.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for name in PAGE:
+        if (out / name).resolve() != (HERE / name).resolve():  # a site's builder may have copied the page already
+            shutil.copyfile(HERE / name, out / name)
+    (out / "kkl_observer.js").write_text(javascript(), encoding="utf-8")
+    described = []
+    for name, cls in kkl_gym.SYSTEMS.items():
+        exported, system = Exported.read(name), cls()
+        write_step(out / f"{name}_step.safetensors", exported)
+        described.append(
+            {
+                "name": name,
+                "parameters": system.parameters,
+                "dt": exported.artifact.filter.dt,
+                "measured": int(np.argmax(exported.artifact.C)),  # each output is a state
+                "portrait": [i % system.nx for i in system.portrait],
+                "measurement_noise": system.measurement_noise,
+                "measurement_noise_max": exported.artifact.inverse.measurement_noise_max,
+                "process_noise": system.process_noise,
+                "process_noise_max": exported.artifact.process_noise_max,
+                **{key: getattr(system, key) for key in ("X", "bounds", "u_max", "G", "scale", "target")},
+            }
+        )
+    (out / "systems.json").write_text(json.dumps(described), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: python docs/demo/build.py OUT")
+    build(Path(sys.argv[1]))

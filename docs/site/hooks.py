@@ -1,0 +1,77 @@
+"""What the site does beyond mkdocs: pages for files of the root, and links that lead out of ``docs/``."""
+
+import posixpath
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import get_plugin_logger
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[2]
+BRANCH = "main"
+# Files of the root that are pages of the site, each with its place under docs/.
+SHOWN: Mapping[str, str] = {"CONTRIBUTING.md": "development/contributing.md", "CHANGELOG.md": "development/changes.md"}
+ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # of Sphinx, in docstrings
+# Code of both kinds, in which nothing is a link; then the target of a link or an image.
+LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
+
+log = get_plugin_logger(__name__)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that show files of the root."""
+    for source, page in SHOWN.items():
+        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Turn links that GitHub follows into links that hold in the site as well."""
+    at = page.file.src_uri
+    sources = {shown: source for source, shown in SHOWN.items()}
+    return relinked(markdown, sources.get(at, f"docs/{at}"), at, repository=(config.repo_url or "").rstrip("/"))
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Show as code what docstrings refer to by Sphinx's roles, which Markdown does not know."""
+    return ROLE.sub("<code>", html)
+
+
+def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
+    """Rewrite the links of a page.
+
+    Parameters
+    ----------
+    markdown : str
+        The page.
+    source : str
+        Where it lies in the repository.
+    page : str
+        Where it lies under docs/ for the site.
+    repository : str
+        Address for what is not in docs/.
+
+    Returns
+    -------
+    str
+        The page, in which a target outside docs/ is in the repository, unless the site shows it.
+    """
+
+    def rewrite(found: re.Match[str]) -> str:
+        link = found[1]
+        if link is None or link.startswith("#") or re.match(r"[a-z]+:", link):
+            return found[0]
+        name, mark, anchor = link.partition("#")
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(source), name))
+        inside = SHOWN.get(target) or (target.removeprefix("docs/") if target.startswith("docs/") else None)
+        if inside is not None and not (ROOT / target).is_dir():
+            return f"]({posixpath.relpath(inside, posixpath.dirname(page) or '.')}{mark}{anchor})"
+        if not (ROOT / target).exists():
+            log.warning(f"{source} links to {link}, and there is no {target}")
+        kind = "tree" if (ROOT / target).is_dir() else "blob"
+        return f"]({repository}/{kind}/{BRANCH}/{target}{mark}{anchor})"
+
+    return LINK.sub(rewrite, markdown)

@@ -1,0 +1,67 @@
+"""The pages of the four environments: their boxes are those of the systems, their figures those of the results."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+import kkl_gym
+
+DOCS = Path(__file__).parent.parent / "docs"
+CONDITIONS = [("X", 0.0), ("X", 0.5), ("2X \\ X", 0.0), ("2X \\ X", 0.5)]
+
+
+def page(name):
+    return (DOCS / "environments" / f"{name}.md").read_text()
+
+
+@cache
+def medians():
+    found = pd.read_csv(DOCS / "results" / "accuracy.csv")
+    return found[~found.driven].groupby(["observer", "starts", "measurement_noise"]).smape.median()
+
+
+def numbers(cell):
+    return [float(value) for value in re.findall(r"-?[\d.]+", cell.replace("−", "-"))]
+
+
+@pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
+def test_what_the_page_says_of_the_environment(name):
+    system, text = kkl_gym.get_system(name), page(name)
+    said = dict(re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE))
+
+    def of(start):
+        return numbers(next(cell for title, cell in said.items() if title.startswith(start)))
+
+    assert of("training box X") == np.ravel(system.X).tolist()
+    assert of("declared bounds") == np.ravel(system.bounds).tolist()
+    assert of("target")[-system.nx :] == pytest.approx(system.target, abs=5e-5)
+    assert of("scale") == list(system.scale)
+    assert of("input u")[-1:] == list(system.u_max)
+    assert (of("sampling interval"), of("measurement noise v")) == ([system.dt], [system.measurement_noise])
+    assert of("process noise")[0] == system.process_noise
+    defaults = dict(re.findall(r"^\| `(\w+)` \| ([\d./]+) \|", text, re.MULTILINE))
+    assert {key: eval(value) for key, value in defaults.items()} == system.parameters
+    assert f'gym.make("{kkl_gym.ENV_IDS[name]}"' in text
+
+
+@pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
+def test_accuracy_on_the_page_is_that_of_the_results(name):
+    rows = re.findall(rf"^\| `({name}[\w-]*)`[^|]* \|(.*) \|$", page(name), re.MULTILINE)
+    measured = {observer for observer, *_ in medians().index if re.fullmatch(rf"{name}(-.*)?", observer)}
+    assert {observer for observer, _ in rows} == measured
+    for observer, cells in rows:
+        assert cells.strip().split(" | ") == [f"{medians()[observer, *case]:.2f}" for case in CONDITIONS], observer
+
+
+@pytest.mark.parametrize("name", kkl_gym.ENV_IDS)
+def test_the_moving_picture_is_small(name):
+    path = DOCS / "figures" / f"{name}.gif"
+    assert path.stat().st_size < 400_000
+    with Image.open(path) as picture:
+        assert picture.n_frames > 100
+    assert f"../figures/{name}.gif" in page(name)

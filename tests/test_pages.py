@@ -1,0 +1,173 @@
+"""What the pages show works: code runs, commands and their options exist, links lead somewhere."""
+
+import ast
+import importlib
+import inspect
+import re
+import shutil
+import tomllib
+import types
+
+import pytest
+from pages import PAGES, ROOT, Page, name
+
+from training.cli import COMMANDS, EXTRAS, read
+
+# Commands of others, which are taken on trust.
+OF_OTHERS = {"cc", "cd", "cp", "printf", "tensorboard", "./van_der_pol"}
+
+
+def with_blocks(language):
+    return [page for page in PAGES if any(block.language == language for block in Page(page).blocks)]
+
+
+def own(page):
+    blocks = [] if Page(page).elsewhere else Page(page).blocks
+    return [block for block in blocks if block.language == "python"]
+
+
+def ids(page):
+    return name(page)
+
+
+@pytest.fixture
+def playground(tmp_path, monkeypatch):
+    """A folder in which blocks of code run, with the examples; agents learn for a few steps only."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    from sb3_contrib import RecurrentPPO
+    from stable_baselines3 import DQN, PPO, SAC
+
+    def briefly(learn):
+        def few_steps(agent, total_timesteps, *rest, **more):
+            agent.n_epochs = 1  # which off-policy agents have not, and do not ask for
+            return learn(agent, 2, *rest, **more)
+
+        return few_steps
+
+    for agent in (DQN, PPO, RecurrentPPO, SAC):
+        monkeypatch.setattr(agent, "learn", briefly(agent.learn))
+    return tmp_path
+
+
+def run(blocks, page):
+    """Run blocks one after the other, in one namespace."""
+    module = types.ModuleType("__main__")
+    for block in blocks:
+        for code in (block.said.get("first", ""), block.small):
+            try:
+                exec(compile(code, f"<a block of {name(page)}>", "exec"), module.__dict__)
+            except ModuleNotFoundError as error:
+                if error.name in {one for modules in EXTRAS.values() for one in modules}:
+                    pytest.skip(f"{error.name} is not installed")
+                raise
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if own(page)], ids=ids)
+def test_code_runs(page, playground):
+    """All blocks of a page in one namespace, but for those that train, of which the names are looked up."""
+    run([block for block in own(page) if not block.needs_training], page)
+    for block in own(page):
+        if block.needs_training:
+            look_up(block)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if any(b.needs_training for b in own(page))], ids=ids)
+def test_code_that_trains_runs(page, playground):
+    run(own(page), page)
+
+
+def look_up(block):
+    """Find what a block imports, the attributes of modules that it names, and the arguments by which it calls them."""
+    tree = ast.parse(block.text)
+    known = {package: importlib.import_module(package) for package in ("kkl_gym", "observers", "training")}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            exec(compile(ast.Module([node], []), "<imports>", "exec"), known)
+
+    def value(node):
+        if isinstance(node, ast.Name):
+            return known.get(node.id)
+        if isinstance(node, ast.Attribute) and (inspect.ismodule(base := value(node.value)) or inspect.isclass(base)):
+            return getattr(base, node.attr)
+        return None
+
+    for node in ast.walk(tree):
+        value(node)
+        if isinstance(node, ast.Call) and (called := value(node.func)) is not None:
+            accepted = inspect.signature(called).parameters.values()
+            if not any(one.kind is one.VAR_KEYWORD for one in accepted):
+                given = {keyword.arg for keyword in node.keywords} - {None}
+                assert given <= {one.name for one in accepted}, f"{name(block.page)}: {ast.unparse(node)}"
+
+
+def test_what_others_run_they_run():
+    for page in PAGES:
+        if test := Page(page).elsewhere:
+            assert page.name in (ROOT / test).read_text(), f"{test} never names {name(page)}"
+
+
+@pytest.mark.parametrize("page", with_blocks("sh"), ids=ids)
+def test_commands_exist(page):
+    """Every line is one that the parsers take; nothing is run."""
+    makefile = (ROOT / "Makefile").read_text()
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for words in Page(page).commands:
+        line, (command, *rest) = " ".join(words), words
+        for path in re.findall(r"(?<![\w/])examples/\w+\.py", line):
+            assert (ROOT / path).exists(), line
+        if command == "kkl-gym":
+            try:
+                read(rest)
+            except SystemExit as end:
+                pytest.fail(f"{line}\n{end}")
+        elif command == "make":
+            for word in rest:
+                variable = word.partition("=")[0]
+                target = rf"^{word}:" if variable == word else rf"\$\({variable}\)|\$\(if \$\({variable}\)"
+                assert re.search(target, makefile, re.MULTILINE), line
+        elif command == "pip":
+            assert rest[0] == "install", line
+            named = re.findall(r"(?:kkl-gym|\.)\[([\w,]+)\]", line)
+            assert {extra for one in named for extra in one.split(",")} <= set(extras), line
+        elif command == "python":
+            assert rest[0] == "-m" or (ROOT / rest[0]).exists(), line
+        else:
+            assert command in OF_OTHERS, f"{name(page)}: nobody knows {line}"
+
+
+@pytest.fixture(scope="module")
+def options():
+    """Options of each command, as its page of the reference says: that page is written from the parsers."""
+    page = Page(ROOT / "docs" / "reference" / "commands.md").text
+    sections = re.split(r"^##+ `kkl-gym (.*)`$", page, flags=re.MULTILINE)[1:]
+    found = {words: set(re.findall(r"`(--[\w-]+)`", text)) for words, text in zip(sections[::2], sections[1::2])}
+    assert set(found) >= set(COMMANDS)
+    return found
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if "`kkl-gym " in Page(page).prose], ids=ids)
+def test_commands_in_sentences_exist(page, options):
+    """There a command may lack what it needs, but has no option that there is not."""
+    for shown in re.findall(r"`kkl-gym ([^`]*)`", Page(page).prose):
+        command = re.match(r"agent [a-z]+|[a-z][\w-]*|", shown)[0]
+        if not command:  # an option of all, or a word in the place of any command
+            continue
+        assert command in options, f"{name(page)}: kkl-gym {shown}"
+        used = set(re.findall(r"(?<!\S)--[\w-]+", shown))
+        assert used - {"--help"} <= options[command], f"{name(page)}: kkl-gym {shown}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids)
+def test_links_lead_somewhere(page):
+    text = re.sub(r"`[^`\n]*`", "", Page(page).prose)
+    links = re.findall(r"\]\(([^)\s]+)\)|\b(?:href|src|srcset)=\"([^\"]+)\"", text)
+    for link in filter(None, (one for both in links for one in both)):
+        if re.match(r"[a-z]+:", link):
+            continue
+        target, _, anchor = link.partition("#")
+        found = page.parent / target if target else page
+        assert found.exists(), f"{name(page)}: {link}"
+        if anchor and found.suffix == ".md":
+            assert anchor in Page(found).anchors, f"{name(page)}: {link}"

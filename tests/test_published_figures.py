@@ -1,0 +1,62 @@
+"""Figures on pages are those of the files in docs/results."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+ROOT = Path(__file__).parent.parent
+RESULTS = ROOT / "docs" / "results"
+SYSTEMS = ("reverse_duffing", "van_der_pol", "rossler", "lorenz")
+LABELS = ("reverse Duffing", "Van der Pol", "Rössler", "Lorenz")
+
+
+def text(value):
+    """Three digits, and never more than two behind the point, as the tables have them."""
+    return f"{value:.2f}" if value < 10 else f"{value:.1f}"
+
+
+def test_the_readmes_table_is_the_benchmarks():
+    found = pd.read_csv(RESULTS / "benchmark" / "results.csv")
+    medians = found[found.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
+    columns = [(0.0, ("shipped", "ekf")), (0.5, ("shipped", "ekf")), (0.5, ("default-wrong", "ekf-wrong"))]
+    readme = (ROOT / "README.md").read_text()
+    for system, label in zip(SYSTEMS, LABELS, strict=True):
+        cells = [" / ".join(text(medians[system, method, noise]) for method in methods) for noise, methods in columns]
+        assert f"| {label} | {' | '.join(cells)} |" in readme
+
+
+@pytest.mark.parametrize(
+    ("title", "file", "suffix", "column", "chosen"),
+    [
+        ("default, no noise, all steps", "accuracy", "", "smape", ("X", False, 0.0)),
+        ("default, noise 0.5, all steps", "accuracy", "", "smape", ("X", False, 0.5)),
+        ("default, no noise, after 20 %", "accuracy", "", "smape_late", ("X", False, 0.0)),
+        ("default, noise 0.5, after 20 %", "accuracy", "", "smape_late", ("X", False, 0.5)),
+        ("default, no noise but w, after 20 %", "accuracy-process-noise", "", "smape_late", ("X", False, 0.0)),
+        ("default, noise 0.5 and w, after 20 %", "accuracy-process-noise", "", "smape_late", ("X", False, 0.5)),
+        ("default, driven, no noise, after 5 s", "accuracy", "", "smape_late", ("X", True, 0.0)),
+        ("default, driven, noise 0.5, after 5 s", "accuracy", "", "smape_late", ("X", True, 0.5)),
+        ("default, starts in 2X \\ X, no noise, all steps", "accuracy", "", "smape", ("2X \\ X", False, 0.0)),
+        ("default, starts in 2X \\ X, noise 0.5, all steps", "accuracy", "", "smape", ("2X \\ X", False, 0.5)),
+        ("SPINN, no noise, all steps", "accuracy", "-spinn", "smape", ("X", False, 0.0)),
+        ("SPINN, noise 0.5, all steps", "accuracy", "-spinn", "smape", ("X", False, 0.5)),
+        ("SPINN, no noise, after 20 %", "accuracy", "-spinn", "smape_late", ("X", False, 0.0)),
+        ("SPINN, starts in 2X \\ X, no noise, all steps", "accuracy", "-spinn", "smape", ("2X \\ X", False, 0.0)),
+        ("SPINN, starts in 2X \\ X, noise 0.5, all steps", "accuracy", "-spinn", "smape", ("2X \\ X", False, 0.5)),
+        ("default, plant 10 % off, no noise, all steps", "plant-error", "", "smape", ("X", False, 0.0)),
+        ("default, plant 10 % off, noise 0.5, all steps", "plant-error", "", "smape", ("X", False, 0.5)),
+    ],
+)
+def test_the_page_on_accuracy(title, file, suffix, column, chosen):
+    found = pd.read_csv(RESULTS / f"{file}.csv")
+    medians = found.groupby(["starts", "driven", "measurement_noise", "observer"])[column].median()
+    page = (RESULTS / "accuracy.md").read_text()
+    assert f"| {title} | {' | '.join(text(medians[(*chosen, system + suffix)]) for system in SYSTEMS)} |" in page
+
+
+def test_the_page_on_agents_has_the_commands_table():
+    page = (RESULTS / "agents.md").read_text()
+    rows = [line for line in (RESULTS / "agents" / "table.md").read_text().splitlines() if line.startswith("|")]
+    assert len(rows) == 10
+    assert all(row in page for row in rows)

@@ -1,0 +1,67 @@
+"""The site: its reference is whole and new, and its links hold where GitHub's do."""
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import kkl_gym
+import observers
+import training
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+REPOSITORY = "https://host/repository"
+
+
+def test_the_page_of_commands_is_new():
+    page = runpy.run_path(str(DOCS / "site" / "commands.py"))["page"]()
+    assert page == (DOCS / "reference" / "commands.md").read_text(), "make docs writes the page"
+    for option in ("--preset", "--measurement-noise", "`--ekf`, `--no-ekf`"):
+        assert option in page
+    assert "| fast 128, paper 512 |\n" in page
+    assert "### `kkl-gym agent compare`" in page
+
+
+@pytest.mark.parametrize("package", [kkl_gym, observers, training])
+def test_the_reference_has_every_public_name(package):
+    page = (DOCS / "reference" / f"{package.__name__}.md").read_text()
+    described = re.findall(rf"^::: {package.__name__}\.(\w+)$", page, re.MULTILINE)
+    assert len(described) == len(set(described))
+    assert set(described) >= set(package.__all__)
+
+
+@pytest.mark.parametrize(
+    ("source", "page", "link", "becomes"),
+    [
+        ("docs/guides/check.md", "guides/check.md", "data.md#records", "data.md#records"),
+        ("docs/guides/check.md", "guides/check.md", "../results/accuracy.csv", "../results/accuracy.csv"),
+        ("docs/guides/check.md", "guides/check.md", "../../Makefile", f"{REPOSITORY}/blob/main/Makefile"),
+        ("docs/guides/check.md", "guides/check.md", "../../training", f"{REPOSITORY}/tree/main/training"),
+        ("docs/guides/check.md", "guides/check.md", "../results/agents", f"{REPOSITORY}/tree/main/docs/results/agents"),
+        ("docs/guides/check.md", "guides/check.md", "../../CONTRIBUTING.md", "../development/contributing.md"),
+        ("CONTRIBUTING.md", "development/contributing.md", "docs/guides/check.md#a", "../guides/check.md#a"),
+        ("CHANGELOG.md", "development/changes.md", "README.md", f"{REPOSITORY}/blob/main/README.md"),
+        ("docs/guides/check.md", "guides/check.md", "https://arxiv.org", "https://arxiv.org"),
+        ("docs/guides/check.md", "guides/check.md", "#here", "#here"),
+    ],
+)  # fmt: skip
+def test_links_lead_to_the_same_place_in_the_site(source, page, link, becomes):
+    relinked = runpy.run_path(str(DOCS / "site" / "hooks.py"))["relinked"]
+    text = "See [`it`]({}), `[x]({})`.\n\n```python\nx[0]({})\n```\n"
+    assert relinked(text.format(link, link, link), source, page, repository=REPOSITORY) == text.format(
+        becomes, link, link
+    )
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(DOCS / "site" / "mkdocs.yml")]
+    done = subprocess.run([*command, "-d", str(tmp_path / "site")], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for path in (tmp_path / "site").rglob("*.html"):
+        outside = re.findall(r'<(?:script|link|img)[^>]+(?:src|href)="?(https?://[^" >]+)', path.read_text())
+        assert not outside, f"{path} asks another host for {outside[0]}"

@@ -1,0 +1,138 @@
+"""``kkl-gym demo --live``: what its window shows, on a canvas that nobody sees."""
+
+import time
+
+import linear_system
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.backend_bases import KeyEvent
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from training.cli import main
+from training.commands import live as module
+from training.commands.live import Live
+from training.commands.options import shown
+
+OWN = f"{linear_system.__file__}:Oscillator"
+
+
+def live_of(system, observer=None, noise=None):
+    figure = Figure(figsize=(12, 7.5))
+    FigureCanvasAgg(figure)
+    return Live(figure, shown(system, observer)[0], noise, seed=0), figure
+
+
+def pixels(live, figure):
+    """The figure with what moves on it."""
+    figure.draw_without_rendering()
+    live.draw()
+    for artist in live.artists:
+        artist.set_animated(False)
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba()).copy()
+
+
+def test_frames_follow_the_motion():
+    live, figure = live_of("lorenz", noise=0.1)
+    first = pixels(live, figure)
+    live.advance(700)
+    assert (pixels(live, figure) != first).any()
+    x, x_hat, y, score = live.history[-1]
+    assert np.abs(x_hat - x).max() < 1
+    assert 0 < score < 1
+    assert y.shape == (1,)
+    assert len(live.history) == 701
+    live.advance(1000)
+    assert len(live.history) == 1201  # twelve seconds
+
+
+def test_keys_and_sliders():
+    live, _ = live_of("van_der_pol")
+    live.advance(600)
+    assert live.env.observer.measurement_noise == live.sensor.level == 0.5
+    live.press("down")
+    assert live.env.observer.measurement_noise == live.sensor.level == pytest.approx(0.45)
+    live.press("right")
+    z_u = len(live.env.observer.artifact.filter.A)
+    assert not live.env.observer.z[z_u:].any()
+    live.advance(1)
+    assert live.env.observer.z[z_u:].any()
+    faults = []
+    for _ in range(4):
+        live.press("f")
+        faults.append(live.sensor.fault)
+        y = live.history[-1][2]
+        live.advance(2)
+        now = live.history[-1][2]
+        assert (now == (0 if faults[-1] == "drop-out" else y)).all() == (faults[-1] in ("drop-out", "freeze"))
+    assert faults == ["bias", "drop-out", "freeze", "none"]
+    live.press("n")
+    assert len(live.history) == 1
+    live.press("q")
+    live.press(None)
+
+
+def test_a_fault_raises_the_score():
+    live, _ = live_of("lorenz")
+    live.advance(600)
+    assert live.history[-1][3] < 1
+    live.press("f")
+    live.advance(200)
+    assert live.history[-1][3] > 1
+    live.draw()
+    assert live._said.get_text().endswith("a fault?")
+
+
+def test_a_system_of_ones_own(saved):
+    live, figure = live_of(OWN, saved(system=OWN, dt=0.02))
+    live.advance(10)
+    pixels(live, figure)
+    assert np.isnan(live.history[-1][3])  # its map has no limits
+    assert live._said.get_text() == ""
+
+
+def test_the_command(monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "show", lambda environment, level, *, seed: asked.append((environment, level, seed)))
+    main(["demo", "--live"])
+    main(["demo", "lorenz", "--live", "--noise", "0.2", "--seed", "3"])
+    assert [(environment.system.name, *rest) for environment, *rest in asked] == [
+        ("van_der_pol", None, 0),
+        ("lorenz", 0.2, 3),
+    ]
+
+
+def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
+    opened = []
+    monkeypatch.setattr(module, "Live", lambda *args, **options: opened.append(Live(*args, **options)) or opened[-1])
+    plt.switch_backend("agg")
+    monkeypatch.setattr(plt, "get_backend", lambda: "TkAgg")  # a window that nobody sees
+    animation = module.show(shown("rossler", None)[0], None, seed=0)
+    live, figure = opened[-1], animation._fig
+    figure.canvas.draw()  # starts it
+    before = len(live.history)
+    while len(live.history) < before + 5:
+        animation._step()
+    figure.canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", figure.canvas, " "))
+    assert live.paused
+    before = len(live.history)
+    time.sleep(0.05)
+    animation._step()
+    assert len(live.history) == before
+    plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--live needs a window, and matplotlib's backend here is 'agg'"),
+        (["--duration", "3"], "leave out --duration and --gif beside --live"),
+        ([OWN], "no observer ships for 'oscillator'"),
+    ],
+)
+def test_what_cannot_be_shown_live(arguments, message, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    with pytest.raises(SystemExit, match=message):
+        main(["demo", *arguments, "--live"])

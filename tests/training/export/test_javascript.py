@@ -1,0 +1,118 @@
+"""The step in JavaScript, run by Node, against the same in Python."""
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from error_bars import with_error_bars
+from exported_steps import apart, exported_of, motion, noise
+
+from observers import KKLObserver, Limits, load
+from training.export import Exported
+from training.export.step_file import javascript, write_step
+
+REPLAY = Path(__file__).parents[2] / "helpers" / "replay.mjs"
+pytestmark = pytest.mark.skipif(shutil.which("node") is None, reason="there is no Node.js, node")
+
+
+def replayed(exported, folder, y, u, told=None):
+    """What JavaScript makes of a record, in which NaN is missing."""
+    write_step(folder / "step.safetensors", exported)
+    (folder / "kkl_observer.mjs").write_text(javascript(), encoding="utf-8")
+    rows = [None if np.isnan(row).all() else [None if np.isnan(value) else value for value in row] for row in y]
+    done = subprocess.run(
+        ["node", REPLAY, folder / "kkl_observer.mjs", folder / "step.safetensors"],
+        input=json.dumps({"y": rows, "u": u.tolist(), "noise": told}),
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"inputs": False, "noise": False, "age": False},
+        {"pair": True, "outputs": 2, "process": True, "free_inverse": True},
+        {"estimated": True, "process": True},
+        {"pair": True, "activation": "relu"},
+    ],
+)
+def test_every_kind_of_map(options, make_artifact, tmp_path):
+    artifact = make_artifact(**{name: value for name, value in options.items() if name != "activation"})
+    mlp = replace(artifact.inverse.mlp, activation=options.get("activation", "silu"))
+    artifact = replace(artifact, inverse=replace(artifact.inverse, mlp=mlp))
+    exported = exported_of(artifact, tmp_path, precision="double")  # compared with a step in doubles
+    y, u = noise(artifact, 400)
+    x_hat = np.array(replayed(exported, tmp_path, y, u)["x_hat"])
+    assert np.ptp(x_hat, axis=0).min() > 0.01
+    assert apart(exported, x_hat, y, u) < 1e-10
+
+
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+def test_what_ships_with_its_monitor(name, tmp_path):
+    exported = Exported.read(name)
+    artifact = exported.artifact
+    y, u = motion(artifact, 900)
+    y = y + np.random.default_rng(0).normal(scale=0.2, size=y.shape)
+    y[700:] = y[700]  # frozen
+    found = replayed(exported, tmp_path, y, u, told=[0.2, 0.01])
+    observer = KKLObserver(artifact, 0.2, process_noise=0.01, monitor=True)
+    x_hat, score = [observer.reset(y[0])], [0.0]
+    for k in range(1, len(y)):
+        x_hat.append(observer.step(y[k], u[k - 1]))
+        score.append(float(observer.score))
+    assert (abs(np.array(found["x_hat"]) - x_hat) / artifact.inverse.x_scale).max() < 1e-4
+    assert 0 < max(score[:700]) < 1
+    assert score[-1] > 1
+    assert np.allclose(found["score"], score, rtol=1e-3, atol=1e-4)
+
+
+def test_samples_that_are_missing(tmp_path):
+    exported = Exported.read("van_der_pol")
+    y, u = motion(exported.artifact, 600)
+    y[300:350] = np.nan
+    found = np.array(replayed(exported, tmp_path, y, u)["x_hat"])
+    observer = load("van_der_pol")
+    x_hat = [observer.reset(y[0]), *(observer.step(None if np.isnan(a).any() else a, b) for a, b in zip(y[1:], u))]
+    assert (abs(found - x_hat) / exported.artifact.inverse.x_scale).max() < 1e-4
+
+
+@pytest.mark.parametrize("seen", [0, 1])
+def test_several_outputs_of_which_one_is_missing(seen, make_artifact, tmp_path):
+    artifact = make_artifact(outputs=2, pair=True)
+    tables = np.array([[1.0, 2.0], [2.0, 3.0], [3.0, 8.0]])
+    levels = np.array([[0.0, 0.0], [0.5, 1.0], [1.0, 2.0]])
+    limits = Limits(levels, tables, 0.01 * tables, 5 * tables, 0.5, 0.1, 0.01, 9.0)
+    artifact = replace(artifact, C=np.array([[1.0, 0.5], [0.0, 2.0]]), limits=limits)
+    exported = exported_of(artifact, tmp_path)
+    y, u = noise(artifact, 200)
+    y[100:120, 1 - seen] = np.nan
+    found = replayed(exported, tmp_path, y, u, told=[[0.3, 0.9]])
+    observer = KKLObserver(artifact, (0.3, 0.9), monitor=True)
+    x_hat, score = [observer.reset(y[0])], [0.0]
+    for k in range(1, len(y)):
+        x_hat.append(observer.step(y[k], u[k - 1]))
+        score.append(float(observer.score))
+    assert np.abs(np.array(found["x_hat"]) - x_hat).max() < 1e-3
+    assert np.allclose(found["score"], score, rtol=1e-4)
+
+
+@pytest.mark.parametrize("process", [False, True])
+def test_error_bars(process, make_artifact, tmp_path):
+    artifact = with_error_bars(make_artifact(process=process, system="lorenz", free_inverse=True))
+    exported = exported_of(artifact, tmp_path)
+    y, u = noise(artifact, 120)
+    levels = (0.7, 0.05) if process else (0.7,)
+    found = np.array(replayed(exported, tmp_path, y, u, told=levels)["covariance"])
+    observer = KKLObserver(artifact, levels[0], process_noise=levels[1] if process else None)
+    covariances = []
+    for k in range(len(y)):
+        observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
+        covariances.append(observer.covariance)
+    assert np.allclose(found, covariances, rtol=1e-3, atol=1e-5 * np.abs(covariances).max())

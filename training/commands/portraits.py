@@ -1,0 +1,150 @@
+"""The moving picture of ``kkl-gym demo``: phase portraits side by side, and below each what its observer sees."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from kkl_gym.rendering import ESTIMATE, STATE
+from kkl_gym.system import System
+from observers.storage import replacing
+
+SECONDS = 12.0  # of motion at the pace of the systems that ship, where it plays as fast as the motion
+FRAMES = 144  # at most
+TRAIL = 0.35  # of what is shown: older points would hide the new ones
+COLOURS = 32
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What is shown of an episode.
+
+    Parameters
+    ----------
+    system : System
+        What moves.
+    dt : float
+        Sampling interval in seconds.
+    x, x_hat : ndarray, shape (steps + 1, nx)
+        States and their estimates.
+    y : ndarray, shape (steps + 1, ny)
+        Measured outputs.
+    """
+
+    system: System
+    dt: float
+    x: np.ndarray
+    x_hat: np.ndarray
+    y: np.ndarray
+
+
+def animate(path: Path, motions: Sequence[Motion]) -> None:
+    """Draw states and estimates as they move, a column for each motion.
+
+    Parameters
+    ----------
+    path : Path
+        Of the GIF; its folder is made.
+    motions : sequence of Motion
+        The beginning of each is shown, which is where estimates converge.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    side = 2.4 if len(motions) > 1 else 4.8  # one alone must have room for the legend
+    figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120, layout="constrained")
+    canvas: Any = FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(motions), squeeze=False, height_ratios=[4, 1])
+    columns = [Column(motion, *pair) for motion, pair in zip(motions, axes.T, strict=True)]
+    columns[0].name_lines(figure)
+    canvas.draw()
+    still = canvas.copy_from_bbox(figure.bbox)
+    frames: list[Image.Image] = []
+    for share in np.arange(1, FRAMES + 1) / FRAMES:
+        canvas.restore_region(still)
+        for column in columns:
+            column.show(share)
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+        frames.append(image.quantize(palette=frames[0], dither=Image.Dither.NONE) if frames else reduced(image))
+    with replacing(path) as temporary:
+        frames[0].save(
+            temporary,
+            format="GIF",
+            save_all=True,
+            append_images=frames[1:],
+            duration=round(1000 * SECONDS / FRAMES),
+            loop=0,
+        )
+
+
+def reduced(image: Image.Image) -> Image.Image:
+    """Return the first frame with few colours, which the others share: what stays the same then costs nothing."""
+    return image.quantize(COLOURS, dither=Image.Dither.NONE)
+
+
+class Column:
+    """A phase portrait, and the measured outputs below it.
+
+    Parameters
+    ----------
+    motion : Motion
+        Whose beginning is shown.
+    portrait, strip : matplotlib Axes
+        Where both are drawn.
+    """
+
+    def __init__(self, motion: Motion, portrait: Any, strip: Any) -> None:
+        system, shown = motion.system, list(motion.system.portrait)
+        self.samples = min(len(motion.x), 1 + round(SECONDS * system.pace / motion.dt))
+        self.x, self.x_hat = (states[: self.samples, shown] for states in (motion.x, motion.x_hat))
+        self.y, self.t = motion.y[: self.samples], np.arange(self.samples) * motion.dt
+        low, high = self.x.min(0), self.x.max(0)
+        margin = 0.2 * np.where(high > low, high - low, 1.0)  # the first estimates may be far off
+        (left, bottom), (right, top) = low - margin, high + margin
+        names = [system.state_names[i] for i in shown]
+        portrait.set(xlim=(left, right), ylim=(bottom, top), title=system.name.replace("_", " "), xticks=[], yticks=[])
+        portrait.set_xlabel(names[0], labelpad=2)
+        portrait.set_ylabel(names[1], labelpad=2)
+        strip.set(xlim=(0.0, self.t[-1]), ylim=(self.y.min(), self.y.max()), yticks=[], xticks=[0, int(self.t[-1])])
+        strip.set_xlabel("t in s", labelpad=-8)
+        strip.set_ylabel("y", labelpad=2)
+        self.trails = [
+            (
+                portrait.plot([], [], style, color=color, lw=width, animated=True)[0],
+                portrait.plot([], [], "o", color=color, markersize=size, animated=True)[0],
+            )
+            for style, color, width, size in (("-", STATE, 1.4, 7), ("-", ESTIMATE, 1.2, 4))
+        ]
+        self.outputs = [strip.plot([], [], color="0.6", lw=0.6, animated=True)[0] for _ in self.y.T]
+
+    def name_lines(self, figure: Any) -> None:
+        """Put the legend of all columns above them.
+
+        Parameters
+        ----------
+        figure : matplotlib Figure
+            Where it goes.
+        """
+        lines = [*(trail for trail, _ in self.trails), self.outputs[0]]
+        figure.legend(lines, ["state", "estimate", "what the observer sees"], loc="outside upper center", ncols=3)
+
+    def show(self, share: float) -> None:
+        """Draw a frame.
+
+        Parameters
+        ----------
+        share : float
+            How much of the motion has passed.
+        """
+        now = max(1, round(share * self.samples))
+        first = max(0, now - round(TRAIL * self.samples))
+        for (trail, head), states in zip(self.trails, (self.x, self.x_hat), strict=True):
+            trail.set_data(*states[first:now].T)
+            head.set_data(*states[now - 1 : now].T)
+        for line, output in zip(self.outputs, self.y.T, strict=True):
+            line.set_data(self.t[:now], output[:now])
+        for artist in (*(artist for pair in self.trails for artist in pair), *self.outputs):
+            artist.axes.draw_artist(artist)

@@ -1,0 +1,310 @@
+// A learned KKL observer in plain JavaScript, for browsers and Node: no dependencies.
+//
+//   const observer = new Observer(await (await fetch("lorenz_step.safetensors")).arrayBuffer());
+//   let xHat = observer.reset([y0]);     // the first sample
+//   xHat = observer.step([y], [u]);      // every dt seconds: the sample, and the input that was held before it
+//
+// `kkl-gym export MAP --format js` writes the file. The filter and the whitening are of doubles, the weights of floats.
+
+/** The arrays of a safetensors file by name, and its metadata. */
+export function readTensors(buffer) {
+  const length = Number(new DataView(buffer).getBigUint64(0, true));
+  const { __metadata__: metadata, ...entries } = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, length)));
+  const types = { F32: Float32Array, F64: Float64Array };
+  const tensors = {};
+  for (const [name, { dtype, shape, data_offsets: [begin, end] }] of Object.entries(entries)) {
+    tensors[name] = { data: new types[dtype](buffer.slice(8 + length + begin, 8 + length + end)), shape };
+  }
+  return { tensors, metadata };
+}
+
+const ACTIVATIONS = {
+  tanh: (h) => h.forEach((value, i) => (h[i] = Math.tanh(value))),
+  silu: (h) => h.forEach((value, i) => (h[i] = 0.5 * value + 0.5 * value * Math.tanh(0.5 * value))), // cannot overflow
+  relu: (h) => h.forEach((value, i) => (h[i] = Math.max(value, 0))),
+};
+
+/** out = weights h + biases. */
+function product(weights, biases, inputs, outputs, h, out) {
+  for (let i = 0, w = 0; i < outputs; i++) {
+    let a = biases[i], b = 0, c = 0, d = 0, j = 0; // several sums: none waits for the one before
+    for (; j + 3 < inputs; j += 4, w += 4) {
+      a += weights[w] * h[j];
+      b += weights[w + 1] * h[j + 1];
+      c += weights[w + 2] * h[j + 2];
+      d += weights[w + 3] * h[j + 3];
+    }
+    for (; j < inputs; j++) a += weights[w++] * h[j];
+    out[i] = a + b + (c + d);
+  }
+}
+
+class Network {
+  constructor(tensors, prefix, activation) {
+    this.activate = ACTIVATIONS[activation];
+    this.layers = [];
+    for (let i = 0; tensors[`${prefix}${i}.weight`]; i++) {
+      const weights = tensors[`${prefix}${i}.weight`];
+      const [outputs, inputs] = weights.shape;
+      const biases = tensors[`${prefix}${i}.bias`].data;
+      this.layers.push({ weights: weights.data, biases, outputs, inputs, out: new Float64Array(outputs) });
+    }
+  }
+
+  /** The outputs, in an array that the next call writes into. */
+  run(given) {
+    let h = given;
+    for (let depth = 0; depth < this.layers.length; depth++) {
+      const { weights, biases, outputs, inputs, out } = this.layers[depth];
+      product(weights, biases, inputs, outputs, h, out);
+      if (depth < this.layers.length - 1) this.activate(out);
+      h = out;
+    }
+    return h;
+  }
+}
+
+/** Linear between points, as numpy.interp. */
+function interpolate(x, xs, values) {
+  let i = 0;
+  while (i < xs.length && xs[i] <= x) i++;
+  if (i === 0) return values[0];
+  if (i === xs.length) return values[i - 1];
+  return values[i - 1] + ((x - xs[i - 1]) / (xs[i] - xs[i - 1])) * (values[i] - values[i - 1]);
+}
+
+/** T_inv: the filter's state, the age and the levels of noise to an estimate. */
+class InverseMap {
+  constructor(tensors, prefix, described) {
+    Object.assign(this, described);
+    for (const name of ["z_offset", "whiten", "noise_gain", "x_offset", "x_scale"]) this[name] = tensors[prefix + name];
+    [this.modes, this.size] = this.whiten.shape;
+    this.network = new Network(tensors, prefix, this.activation);
+    this.inputs = new Float64Array(this.network.layers[0].inputs);
+    if (this.spread) {
+      this.spreadNetwork = new Network(tensors, `${prefix}spread.`, this.spread.activation);
+      for (const name of ["levels", "ages", "factors"]) this.spread[name] = tensors[`${prefix}spread.${name}`];
+    }
+  }
+
+  /** What is assumed of noise; measured is a level for each output. */
+  tell(measured, process) {
+    const gains = this.noise_gain, rows = gains.shape.length === 2 ? gains.shape[0] : 1;
+    this.gain = Float64Array.from({ length: this.modes }, (_, i) => {
+      let variance = 0;
+      for (let row = 0; row < rows; row++) variance += (measured[row] * gains.data[row * this.modes + i]) ** 2;
+      return 1 / (1 + variance);
+    });
+    const of = (values, i) => (Array.isArray(values) ? values[i] : values);
+    let at = this.modes;
+    if (this.features.includes("measurement_noise")) {
+      const told = Array.isArray(this.measurement_noise_unit) ? measured : measured.slice(0, 1);
+      told.forEach((level, i) => (this.inputs[at++] = Math.log1p(level / of(this.measurement_noise_unit, i))));
+    }
+    if (this.features.includes("process_noise")) {
+      this.inputs[at++] = Math.log1p(Math.min(process, this.process_noise_max) / this.process_noise_unit);
+    }
+    this.ageInput = at;
+    if (this.spread) this.#tellSpread(measured, process, of);
+  }
+
+  #tellSpread(measured, process, of) {
+    const { levels, ages, factors } = this.spread;
+    const count = levels.data.length, m = ages.data.length;
+    const ends = this.measurement_noise_max;
+    const share = ends == null ? 0 : Math.max(...measured.map((level, i) => level / of(ends, i)));
+    const processShare = factors.shape.length === 3 ? Math.min(process / this.process_noise_max, 1) : 0;
+    this.logFactors = Float64Array.from(ages.data, (_, j) => {
+      const column = (table) =>
+        interpolate(share, levels.data, Array.from(levels.data, (_, k) => Math.log(factors.data[(table * count + k) * m + j]) / 2));
+      return processShare ? (1 - processShare) * column(0) + processShare * column(1) : column(0);
+    });
+  }
+
+  read(z, age) {
+    const { whiten: { data }, z_offset: { data: offset }, size, inputs } = this;
+    for (let i = 0, w = 0; i < this.modes; i++) {
+      let mode = 0;
+      for (let j = 0; j < size; j++) mode += data[w++] * (z[j] - offset[j]);
+      inputs[i] = this.gain[i] * mode;
+    }
+    if (this.features.includes("age")) inputs[this.ageInput] = Math.log1p(Math.min(age, this.age_max ?? Infinity) / this.age_unit);
+    return inputs;
+  }
+
+  mean(z, age) {
+    const h = this.network.run(this.read(z, age));
+    return Array.from(h, (value, i) => this.x_offset.data[i] + this.x_scale.data[i] * value);
+  }
+
+  covariance(z, age) {
+    const out = this.spreadNetwork.run(this.read(z, age));
+    const nx = (Math.sqrt(8 * out.length + 1) - 1) / 2;
+    const factor = interpolate(age, this.spread.ages.data, this.logFactors);
+    const rows = [];
+    for (let i = 0, k = nx; i < nx; i++) {
+      const scale = Math.abs(this.x_scale.data[i]) * Math.exp(Math.min(out[i], 100) + factor);
+      rows.push([...Array.from({ length: i }, () => scale * out[k++]), scale]);
+    }
+    const entry = (a, b) => a.reduce((sum, value, m) => sum + value * (b[m] ?? 0), 0);
+    return rows.map((row) => rows.map((other) => entry(row, other)));
+  }
+}
+
+/** Whether samples still fit the estimates: running mean and mean square of y - C x_hat over their limits. */
+class Monitor {
+  constructor(tensors, { window, warm_up: warmUp }, measured, dt) {
+    const [levels, mean, low, high] = ["levels", "mean", "low", "high"].map((name) => tensors[`limits.${name}`]);
+    const ny = mean.shape[1], count = levels.shape[0];
+    const column = (array, i) => Array.from({ length: count }, (_, k) => array.data[array.shape.length === 2 ? k * ny + i : k]);
+    const last = measured.map((_, i) => column(levels, i)[count - 1]);
+    const part = measured.map((level, i) => (last[i] > 0 ? level / last[i] : 0));
+    const highest = Math.max(...part);
+    this.limits = measured.map((own, i) => {
+      const noisiest = part[i] === highest ? own : highest * last[i];
+      const squares = column(levels, i).map((level) => level ** 2);
+      const between = (level, limits) => interpolate(level ** 2, squares, limits); // as variances add up
+      const limit = Math.sqrt(between(noisiest, column(mean, i).map((value) => value ** 2)));
+      return { mean: limit, low: between(own, column(low, i)), high: between(noisiest, column(high, i)) };
+    });
+    this.share = -Math.expm1(-dt / window);
+    this.silent = Math.round(warmUp / dt);
+    this.sound = this.limits.map(({ low: least }, i) => Math.max(measured[i] ** 2, least));
+    this.reset();
+  }
+
+  reset() {
+    this.mean = this.sound.map(() => 0);
+    this.square = [...this.sound];
+    this.age = 0;
+  }
+
+  update(residual, seen) {
+    residual.forEach((value, i) => {
+      if (!seen[i]) return;
+      this.mean[i] += this.share * (value - this.mean[i]);
+      this.square[i] += this.share * (value ** 2 - this.square[i]);
+    });
+    this.age += Number(seen.includes(true));
+  }
+
+  get score() {
+    if (this.age <= this.silent) return 0;
+    const scores = this.limits.map(({ mean, low, high }, i) =>
+      Math.max(Math.abs(this.mean[i]) / mean, this.square[i] / high, low / Math.max(this.square[i], 1e-300)));
+    return Math.max(...scores);
+  }
+}
+
+export class Observer {
+  /**
+   * @param {ArrayBuffer} buffer what `kkl-gym export MAP --format js` wrote
+   */
+  constructor(buffer) {
+    const { tensors, metadata } = readTensors(buffer);
+    this.described = JSON.parse(metadata.kkl_step);
+    this.tensors = tensors;
+    const { diagonal, early_y: early } = tensors;
+    this.nz = diagonal.shape[0];
+    this.ny = early.shape[1];
+    this.nu = this.described.u.length;
+    this.dt = this.described.dt;
+    this.C = tensors.C;
+    const { driven, free } = this.described.maps;
+    this.driven = new InverseMap(tensors, "driven.", driven);
+    this.free = free && new InverseMap(tensors, "free.", free);
+    this.tell(this.described.measurement_noise, this.described.process_noise);
+  }
+
+  /** The levels of noise that are assumed: of all outputs or each, and of the state. The monitor begins anew. */
+  tell(measurementNoise = 0, processNoise = 0) {
+    const ends = this.driven.measurement_noise_max ?? Infinity;
+    const each = Array.from({ length: this.ny }, (_, i) => {
+      const [level, end] = [measurementNoise, ends].map((values) => (Array.isArray(values) ? values[i] ?? values[0] : values));
+      return Math.min(level, end);
+    });
+    this.driven.tell(each, processNoise);
+    this.free?.tell(each, processNoise);
+    const { limits } = this.described;
+    this.monitor = limits && this.C ? new Monitor(this.tensors, limits, each, this.dt) : null;
+  }
+
+  /** Forget the past and take in the first sample; returns the estimate. */
+  reset(y0) {
+    const { equilibrium } = this.tensors;
+    this.z = new Float64Array(this.nz * (1 + this.nu));
+    for (let i = 0; i < this.nz; i++) this.z[i] = this.#dot(equilibrium.data, i, y0);
+    this.y = [...y0];
+    this.age = 0;
+    this.monitor?.reset();
+    return (this.xHat = this.#estimate(this.z, 0));
+  }
+
+  /**
+   * Take in the next sample, null where there is none, and the input that was held before it; returns the estimate.
+   *
+   * Outputs that are missing, NaN among several, are predicted, which needs a map with a linear output.
+   */
+  step(y, u = new Array(this.nu).fill(0)) {
+    const missing = this.y.map((_, i) => y === null || Number.isNaN(y[i]));
+    let now = y;
+    if (missing.includes(true)) {
+      if (!this.C) throw new Error("this map holds no linear output y = C x to predict with: pass the last sample again");
+      const filled = (xHat) => this.y.map((_, i) => (missing[i] ? this.#dot(this.C.data, i, xHat) : y[i]));
+      const guess = this.#advanced(filled(this.#estimate(this.z, this.age * this.dt)), u);
+      now = filled(this.#estimate(guess, (this.age + 1) * this.dt));
+    }
+    this.z = this.#advanced(now, u);
+    this.y = [...now];
+    this.age++;
+    this.xHat = this.#estimate(this.z, this.age * this.dt);
+    if (this.monitor && y !== null) {
+      this.monitor.update(this.y.map((value, i) => value - this.#dot(this.C.data, i, this.xHat)), missing.map((gap) => !gap));
+    }
+    return this.xHat;
+  }
+
+  /** Above 1 the samples do not fit the estimates; null without limits to judge by. */
+  get score() {
+    return this.monitor ? this.monitor.score : null;
+  }
+
+  /** Covariance of the estimate's error, rows of numbers; null where the map holds no error bars. */
+  get covariance() {
+    const map = this.#map(this.z);
+    return map.spread ? map.covariance(this.z, this.age * this.dt) : null;
+  }
+
+  /** Row i of a matrix times a vector. */
+  #dot(matrix, i, vector) {
+    let sum = 0;
+    for (let j = 0; j < vector.length; j++) sum += matrix[i * vector.length + j] * vector[j];
+    return sum;
+  }
+
+  #map(z) {
+    return this.free && !z.some((value, i) => i >= this.nz && value !== 0) ? this.free : this.driven;
+  }
+
+  #estimate(z, age) {
+    return this.#map(z).mean(z, age);
+  }
+
+  /** z one sample later. */
+  #advanced(y, u) {
+    const { diagonal, mixing, mixing_at: at, early_y: early, late_y: late, held_u: held } = this.tensors;
+    const next = new Float64Array(this.z.length);
+    for (let block = 0; block <= this.nu; block++) {
+      const first = block * this.nz;
+      for (let i = 0; i < this.nz; i++) {
+        next[first + i] = diagonal.data[i] * this.z[first + i];
+        if (block === 0) next[i] += this.#dot(early.data, i, this.y) + this.#dot(late.data, i, y);
+        else next[first + i] += held.data[i] * u[block - 1];
+      }
+      for (let k = 0; mixing && k < mixing.data.length; k++) {
+        next[first + at.data[2 * k]] += mixing.data[k] * this.z[first + at.data[2 * k + 1]];
+      }
+    }
+    return next;
+  }
+}

@@ -1,0 +1,75 @@
+"""The step as a file of constants, which ``kkl_observer.js`` runs in browsers and in Node."""
+
+import os
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from observers import storage
+from observers.artifact import InverseMap
+from training.export.exported import Exported
+
+KEY = "kkl_step"  # of the metadata
+_MAP_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
+_MAP_SCALARS = tuple(
+    f"{name}_{end}" for name in ("measurement_noise", "process_noise", "age") for end in ("unit", "max")
+)
+_LIMIT_ARRAYS = ("levels", "mean", "low", "high")
+
+
+def javascript() -> str:
+    """The module ``kkl_observer.js``, the same for every observer."""
+    return files("training.export").joinpath("kkl_observer.js").read_text(encoding="utf-8")
+
+
+def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
+    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, limits of the monitor.
+
+    Parameters
+    ----------
+    path : str or PathLike
+        The file.
+    exported : Exported
+        The observer. Its levels of noise are those that are assumed until ``Observer.tell`` is told others.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be written.
+    """
+    artifact, linear = exported.artifact, exported.artifact.filter
+    nz = len(linear.A)
+    block = linear.transition[:nz, :nz]
+    at = np.argwhere(block - np.diag(block.diagonal()))
+    tensors = {"diagonal": block.diagonal()}
+    tensors |= {name: getattr(linear, name)[:nz] for name in ("early_y", "late_y", "equilibrium")}
+    if len(at):
+        tensors |= {"mixing": block[tuple(at.T)], "mixing_at": at.astype(float)}
+    if linear.nu:
+        tensors["held_u"] = linear.held_u[nz : 2 * nz, 0]
+    described = exported.described | {"maps": {}}
+    for label, inverse in exported.maps.items():
+        described["maps"][label] = _described_map(tensors, f"{label}.", inverse)
+    if artifact.C is not None:
+        tensors["C"] = np.asarray(artifact.C, dtype=float)
+    if artifact.limits is not None:
+        tensors |= {f"limits.{name}": getattr(artifact.limits, name) for name in _LIMIT_ARRAYS}
+        described["limits"] = {name: getattr(artifact.limits, name) for name in ("window", "warm_up")}
+    storage.save(path, tensors, key=KEY, described=described)
+
+
+def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: InverseMap) -> dict[str, Any]:
+    """Add a map's arrays; returns what else there is to say of it."""
+    tensors |= {f"{prefix}{name}": getattr(inverse, name) for name in _MAP_ARRAYS}
+    storage.put_mlp(tensors, prefix, inverse.mlp)
+    described: dict[str, Any] = {"activation": inverse.mlp.activation, "features": list(inverse.features)}
+    for name in _MAP_SCALARS:
+        value = getattr(inverse, name)
+        if np.isfinite(value).all():  # JSON knows no infinity
+            described[name] = value
+    if inverse.spread is not None:
+        storage.put_mlp(tensors, f"{prefix}spread.", inverse.spread.mlp)
+        tensors |= {f"{prefix}spread.{name}": getattr(inverse.spread, name) for name in ("levels", "ages", "factors")}
+        described["spread"] = {"activation": inverse.spread.mlp.activation}
+    return described
