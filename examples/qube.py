@@ -61,7 +61,7 @@ ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
 # In 1/s, evenly spaced on a logarithmic scale, but for 55.79, that of the recorded velocities.
 RATES = (2.5, 3.245, 4.212, 5.467, 7.096, 9.21, 11.95, 15.52, 20.14, 26.14, 33.93, 44.04, 55.79, 74.2, 96.3, 125.0)
 
-# Chosen by --cross-validate, among the training runs alone.
+# Judged by --cross-validate, among the training runs alone.
 SETTINGS = {
     "eigenvalues": tuple(-rate for rate in RATES),
     "arbitrary_zero": ("theta",),
@@ -111,7 +111,7 @@ class Qube(kkl_gym.System):
     arm_inertia: float = 5.72e-5  # kg m^2, 0.095 kg (0.085 m)^2 / 12
     arm_damping: float = 0.00027  # N m s
     arm_friction: float = 0.0  # N m
-    arm_spring: float = 0.0  # N m
+    arm_spring: float = 0.0  # N m/rad
     pendulum_mass: float = 0.024  # kg
     pendulum_length: float = 0.129  # m
     pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
