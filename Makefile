@@ -100,22 +100,21 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
 
-# RLlib pins Gymnasium, so that it has an environment of its own.
-CLIENTS := rl-zoo3 torchrl "tianshou[eval]>=2" "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
-RLLIB := "ray[rllib]>=2.40" torch tyro
+# RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.
+CLIENTS_zoo := --editable ".[agents]" rl-zoo3 torchrl "minari[create,hdf5]>=0.5.3" moviepy pygame-ce tensorboard
+CLIENTS_rllib := --editable . "ray[rllib]>=2.40" "torch<2.14" tyro
+CLIENTS_tianshou := --editable . "tianshou[eval]>=2" "torch<2.14"
+CLIENTS := zoo rllib tianshou
 
-clients: .venv-clients/ready .venv-rllib/ready  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
-	CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" .venv-clients/bin/pytest -W default -m clients \
-		tests/clients/test_clients.py tests/clients/test_guide.py
-	RAY_worker_niceness=0 .venv-rllib/bin/pytest -W default -m clients \
-		tests/clients/test_rllib.py tests/clients/test_guide.py
-	@cat runs/clients/table.md
+clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our environments, as they are; CLEANRL=FILE.py adds one
+	status=0; for name in $(CLIENTS); do CLEANRL="$(if $(CLEANRL),$(abspath $(CLEANRL)))" RAY_worker_niceness=0 \
+		.venv-clients-$$name/bin/pytest -W default -m clients tests/clients || status=1; done; \
+		cat runs/clients/table.md; exit $$status
 
-.venv-clients/ready .venv-rllib/ready: pyproject.toml Makefile
+.venv-clients-%/ready: pyproject.toml Makefile
 	$(PYTHON) -m venv $(@D)
 	$(@D)/bin/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(@D)/bin/python -m pip install --quiet pytest \
-		$(if $(findstring rllib,$@),--editable . $(RLLIB),--editable ".[agents]" $(CLIENTS))
+	$(@D)/bin/python -m pip install --quiet pytest $(CLIENTS_$*)
 	touch $@
 
 docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
