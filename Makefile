@@ -25,6 +25,7 @@ test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, hal
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
 
 test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+	$(BIN)/python -m pip install --quiet --group browser
 	$(BIN)/pytest tests/browser -m browser
 
 lint: $(VENV)/ready  ## style, types and the contract of imports
