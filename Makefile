@@ -25,6 +25,7 @@ test-long: $(VENV)/ready  ## campaigns of kills, flipped bits and bad input, hal
 	OMP_NUM_THREADS=1 $(BIN)/pytest -m long -s
 
 test-browser: $(VENV)/ready  ## the demo in headless Chromium; it says what to install
+	$(BIN)/python -m pip install --quiet --group browser
 	$(BIN)/pytest tests/browser -m browser
 
 lint: $(VENV)/ready  ## style, types and the contract of imports
@@ -37,10 +38,12 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/. A new version ships as observers/maps/NAME-vN.safetensors, beside the old ones.
+# Into runs/; those with error bars, which ship, into runs/errorbars. A new version ships as observers/maps/NAME-vN.safetensors, beside the old ones.
 maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \
+		$(BIN)/kkl-gym errorbars runs/$$system/$$system.safetensors || exit 1; \
+		$(BIN)/kkl-gym train $$system --size small --resume || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
 	for system in $(CLOSED); do \
 		$(BIN)/kkl-gym train $$system --closed-loop --config training/version1.json --threads 2 --resume || exit 1; done
@@ -57,6 +60,9 @@ results: $(VENV)/ready  ## the figures and the accuracy in the README and in doc
 	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system --calibration --ekf \
+		--csv docs/results/error_bars/$$system.csv || exit 1; done
+	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
 

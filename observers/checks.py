@@ -46,7 +46,10 @@ def is_finite(value: object) -> bool:
 def all_finite(values: np.ndarray) -> bool:
     """Whether outputs or inputs are numbers, none of them beyond 1e15."""
     if values.ndim == 1:  # a single sample: numpy's own overhead would be felt
-        return all(-LARGEST <= value <= LARGEST for value in values.tolist())  # false for NaN too
+        for value in values.tolist():  # noqa: SIM110 - and a generator's too
+            if not -LARGEST <= value <= LARGEST:  # false for NaN too
+                return False
+        return True
     return bool((np.abs(values) <= LARGEST).all())
 
 

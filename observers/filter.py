@@ -150,6 +150,10 @@ class LinearFilter:
             return self._sparse(z, y, u, y_next)
         return np.concatenate((z, y, u, y_next), axis=-1) @ self._update
 
+    def advance_single(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
+        """As :meth:`advance` for a single sample, by Numba where it is installed and the modes hardly mix."""
+        return self.advance(z, y, u, y_next) if self._sparse is None else self._sparse.single(z, y, u, y_next)
+
     def run(self, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> np.ndarray:
         """Return the states at some samples of a record.
 

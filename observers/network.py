@@ -1,11 +1,15 @@
-"""Multilayer perceptrons, evaluated with NumPy alone."""
+"""Multilayer perceptrons, evaluated with NumPy, and in large batches with Numba's help where it is installed."""
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from observers.checks import choice, real_array, shown
+from observers.compiled import CompiledNetwork
+from observers.sparse import MANY_ROWS
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:
@@ -48,7 +52,7 @@ class MLP:
     weights: Sequence[np.ndarray]
     biases: Sequence[np.ndarray]
     activation: str
-    _layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
+    layers: list[tuple[np.ndarray, np.ndarray]] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         choice("the activation", self.activation, ACTIVATIONS)
@@ -72,7 +76,7 @@ class MLP:
             if not all(np.isfinite(values).all() for values in layers[-1]):
                 raise ValueError("the network holds weights or biases that are not finite")
             width = len(bias)
-        object.__setattr__(self, "_layers", layers)
+        object.__setattr__(self, "layers", layers)
 
     @property
     def inputs(self) -> int:
@@ -93,6 +97,9 @@ class MLP:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate the network.
 
+        A batch of many rows goes through :mod:`observers.compiled` where Numba is installed, which rounds a little
+        differently.
+
         Parameters
         ----------
         x : ndarray, shape (..., inputs)
@@ -104,17 +111,31 @@ class MLP:
             Outputs.
         """
         activation = ACTIVATIONS[self.activation]
-        *hidden, (weight, bias) = self._layers
+        *hidden, (weight, bias) = self.layers
         h: np.ndarray = x.astype(np.float32, copy=False)
         if h.ndim > 2:
             h = h.reshape(-1, h.shape[-1])
-        for w, b in hidden:
-            h = np.dot(h, w)
-            h += b
-            h = activation(h)
-        h = np.dot(h, weight)
-        h += bias
+        if h.ndim == 2 and len(h) >= MANY_ROWS and self.compiled is not None:
+            h = self.compiled.batch(h)
+        else:
+            for w, b in hidden:
+                h = np.dot(h, w)
+                h += b
+                h = activation(h)
+            h = np.dot(h, weight)
+            h += bias
         return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "compiled"}  # Numba is not everywhere
+
+    @functools.cached_property
+    def compiled(self) -> CompiledNetwork | None:
+        """The same network as machine code; None without Numba."""
+        try:
+            return CompiledNetwork(self.layers, self.activation)
+        except ImportError:
+            return None
 
 
 def _layer(name: str, values: np.ndarray) -> np.ndarray:

@@ -9,11 +9,13 @@ import numpy as np
 
 from observers.artifact import Artifact, ArtifactError, resolve
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.compiled import available
 from observers.decoder import Decoders, Read
 from observers.monitor import Monitor
 from observers.replacement import check_replacement
 from observers.spread import deviations
 
+SOON = 1000  # single samples after which a simulation will go on for long enough to wait a second for the compiler
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
@@ -41,13 +43,20 @@ class KKLObserver:
         the system's own level, which is also that of the environments and of the monitor's limits.
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
+    compiled : bool, optional
+        Whether single samples go through machine code, which takes two seconds to make, and then a third of the time.
+        True makes it here, such as before a loop in real time; it needs Numba, the extra ``fast``. False leaves them to
+        NumPy. None is NumPy until a :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is
+        held up in its midst. The two agree to rounding. Batches of 128 rows or more take Numba wherever it is.
 
     Raises
     ------
+    ImportError
+        If ``compiled`` is True and Numba is not installed.
     ValueError
-        If ``artifact`` is none or ``monitor`` no bool, a noise level is no number, negative or beyond 1e12, the
-        measurement noise is beyond what the map was trained for or differs between outputs where the map is told one
-        level for all, or the artifact holds no limits for a monitor.
+        If ``artifact`` is none or ``monitor`` or ``compiled`` no bool, a noise level is no number, negative or
+        beyond 1e12, the measurement noise is beyond what the map was trained for or differs between outputs where the
+        map is told one level for all, or the artifact holds no limits for a monitor.
     """
 
     def __init__(
@@ -57,6 +66,7 @@ class KKLObserver:
         *,
         process_noise: float | None = None,
         monitor: bool = False,
+        compiled: bool | None = None,
     ) -> None:
         if not isinstance(artifact, Artifact):
             raise ValueError(
@@ -68,14 +78,20 @@ class KKLObserver:
                 f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
                 f"system) finds {found}, and returns an artifact that does"
             )
+        if compiled is not None and flag("compiled", compiled) and not available():
+            raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
         self.artifact = artifact
         self._monitored = bool(monitor)
+        self._compile, self._compiled = compiled, bool(compiled)
+        self._samples = 0  # single ones
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._read: Read | None  # what the networks were given for the last estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
+        if self._compiled:
+            self._warm_up()
 
     @property
     def measurement_noise(self) -> float | tuple[float, ...]:
@@ -123,7 +139,19 @@ class KKLObserver:
     def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
         level, process_noise = self._measurement_noise, self._process_noise
-        return Decoders.of(self.artifact, outputs, measurement_noise=level, process_noise=process_noise)
+        return Decoders.of(
+            self.artifact,
+            outputs,
+            measurement_noise=level,
+            process_noise=process_noise,
+            compiled=self._compiled,
+        )
+
+    def _warm_up(self) -> None:
+        """Make the machine code for single samples now, by a sample that is forgotten."""
+        linear = self.artifact.filter
+        y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
+        self._states(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
@@ -143,8 +171,13 @@ class KKLObserver:
         """
         check_replacement(self.artifact, artifact)
         other = KKLObserver(
-            artifact, self._measurement_noise, process_noise=self._process_noise, monitor=self._monitored
+            artifact,
+            self._measurement_noise,
+            process_noise=self._process_noise,
+            monitor=self._monitored,
+            compiled=self._compiled or self._compile,
         )
+        other._compile, other._samples = self._compile, self._samples
         if self._z is not None:
             other._z, other._y, other._age = self._z, self._y, self._age
             if other._monitor is not None:
@@ -184,6 +217,10 @@ class KKLObserver:
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1], first=True)
         z0, age = self._start(y0, x0)
+        if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
+            self._compiled = True
+            self._tell()
+            self._warm_up()
         self._z, self._y, self._age, self._x_hat, self._read = z0, y0, age, None, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
@@ -326,7 +363,13 @@ class KKLObserver:
             gaps = self._check_output(y, batch)
         if gaps is not None:
             y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
-        z = self.artifact.filter.advance(self._z, self._y, u, y)
+        linear = self.artifact.filter
+        if y.ndim == 1:
+            self._samples += 1
+        if y.ndim == 1 and self._compiled:
+            z = linear.advance_single(self._z, self._y, u, y)
+        else:
+            z = linear.advance(self._z, self._y, u, y)
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
         else:
@@ -365,10 +408,10 @@ class KKLObserver:
         z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        read = self._states.read(z, age)
+        read, x_hat = self._states.estimate(z, age)
         if rows is None:
             self._read = read
-        return self._states.mean(read)
+        return x_hat
 
     @property
     def parameters_hat(self) -> np.ndarray:
@@ -644,6 +687,7 @@ def load(
     *,
     process_noise: float | None = None,
     monitor: bool = False,
+    compiled: bool | None = None,
 ) -> KKLObserver:
     """Return the observer behind a name.
 
@@ -658,6 +702,8 @@ def load(
         As for :class:`KKLObserver`.
     monitor : bool, default False
         As for :class:`KKLObserver`.
+    compiled : bool, optional
+        As for :class:`KKLObserver`.
 
     Returns
     -------
@@ -668,11 +714,17 @@ def load(
     ------
     ArtifactError
         If there is no such name or file, or the file is damaged or foreign. It is a ValueError.
+    ImportError
+        If ``compiled`` is True and Numba is not installed.
     ValueError
         If a noise level is out of range, or a monitor is asked for and the file holds no limits.
     """
     return KKLObserver(
-        Artifact.read(resolve(name_or_path)), measurement_noise, process_noise=process_noise, monitor=monitor
+        Artifact.read(resolve(name_or_path)),
+        measurement_noise,
+        process_noise=process_noise,
+        monitor=monitor,
+        compiled=compiled,
     )
 
 

@@ -81,14 +81,19 @@ class Covariance:
         Of measurement noise and process noise, in multiples of the highest that the map is told.
     scale : ndarray, shape (nx,)
         Of the states.
+    compiled : bool, default False
+        Whether single samples go through Numba.
     """
 
-    def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
+    def __init__(
+        self, spread: Spread, levels: tuple[float, float], scale: np.ndarray, *, compiled: bool = False
+    ) -> None:
         nx = self._nx = spread.nx
         *weights, last = spread.mlp.weights
         *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
         bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
         self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
+        self._singly = compiled
         tables, (measurement, process) = np.log(spread.factors) / 2, levels
         if tables.ndim == 3:
             share = min(process, 1.0)
@@ -111,7 +116,8 @@ class Covariance:
         ndarray, shape (..., nx, nx)
             In units of the states.
         """
-        nx, out = self._nx, self._mlp(inputs)
+        nx, compiled = self._nx, self._mlp.compiled if self._singly and inputs.ndim == 1 else None
+        out = self._mlp(inputs) if compiled is None else compiled.single(inputs)
         if out.ndim == 1:  # a single sample: every call of numpy would be felt
             values, factor = out.tolist(), self._log_factor(float(age))
             scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]

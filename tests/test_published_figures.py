@@ -60,3 +60,28 @@ def test_the_page_on_agents_has_the_commands_table():
     rows = [line for line in (RESULTS / "agents" / "table.md").read_text().splitlines() if line.startswith("|")]
     assert len(rows) == 10
     assert all(row in page for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("title", "observer", "starts", "driven", "span"),
+    [
+        (f"{label}, starts in {starts}{', driven' if driven else ''}, {span}", who, starts, driven, span)
+        for label, who, starts, driven in [
+            ("observer", "KKL", "X", False),
+            ("observer", "KKL", "X", True),
+            ("observer", "KKL", "2X \\ X", False),
+            ("EKF", "EKF", "X", False),
+        ]
+        for span in ("first 2 s", "after 5 s")
+    ],
+)
+def test_the_page_on_error_bars(title, observer, starts, driven, span):
+    cells = []
+    for system in SYSTEMS:
+        found = pd.read_csv(RESULTS / "error_bars" / f"{system}.csv").set_index(
+            ["observer", "starts", "driven", "span"]
+        )
+        shares = found.loc[[(observer, starts, driven, span)], "90"]
+        assert len(shares) == 6
+        cells.append(f"{shares.min():.1f} to {shares.max():.1f}")
+    assert f"| {title} | {' | '.join(cells)} |" in (RESULTS / "error_bars.md").read_text()

@@ -32,12 +32,17 @@ def test_the_model_keeps_its_energy_and_hangs():
     assert hanging[1] == pytest.approx(np.pi, abs=0.05)
 
 
-def write_runs(folder):
-    """Runs of the model, in files as the device's."""
+MODEL = QUBE["BothAngles"](
+    **{**QUBE["GUESSES"], "arm_damping": 0.0004, "arm_friction": 2e-4, "pendulum_friction": 3e-5}
+)
+
+
+def write_runs(folder, model):
+    """Runs of a model, in files as the device's."""
     rng = np.random.default_rng(0)
     runs = range(1, 13)
     x0 = np.stack([np.zeros(12), rng.uniform(1, 5, 12), rng.uniform(-2, 2, 12), rng.uniform(-5, 5, 12)], -1)
-    x = simulate(QUBE["Qube"](), x0, 700, 0.004)
+    x = simulate(model, x0, 700, 0.004)
     for i, run in enumerate(runs):
         alpha = np.angle(np.exp(1j * x[:, i, 1]))
         velocities = [QUBE["recorded_velocity"](x[:, i, column]) for column in (1, 0)]
@@ -47,13 +52,48 @@ def write_runs(folder):
         np.savetxt(folder / f"run{run:02d}.csv", columns, delimiter=",", header=header, comments="")
 
 
+def test_dry_friction_holds_the_arm_and_the_spring_turns_it():
+    at_rest = np.array([[0.02, np.pi, 0.0, 0.0]])
+    held = simulate(QUBE["Qube"](arm_friction=2e-4, arm_spring=5e-4), at_rest, 250, 0.004)[-1, 0]
+    assert held[0] == pytest.approx(0.02, abs=0.006)  # smooth friction creeps
+    turned = simulate(QUBE["Qube"](arm_spring=5e-4), at_rest, 250, 0.004)[-1, 0]
+    assert turned[0] < 0.01
+
+
+def test_parameters_are_found_again(tmp_path):
+    write_runs(tmp_path, MODEL)
+    found = QUBE["fitted"](QUBE["read"](tmp_path, (1, 2, 4, 5))).parameters
+    for name in ("arm_length", "arm_inertia", "pendulum_inertia", "arm_damping", "arm_friction", "pendulum_friction"):
+        assert found[name] == pytest.approx(getattr(MODEL, name), rel=0.02), name
+
+
+def test_simulated_runs_are_as_the_device_records(monkeypatch):
+    monkeypatch.setitem(QUBE["simulated"].__globals__, "SIMULATED", 5)
+    runs, again = QUBE["simulated"](MODEL), QUBE["simulated"](MODEL)
+    assert [run.fingerprint for run in runs] == [run.fingerprint for run in again]
+    assert len({run.fingerprint for run in runs}) == 5
+    for run in runs:
+        assert run.duration == pytest.approx(QUBE["SECONDS"] - QUBE["RELEASED"])
+        steps = np.diff(run.y[:, 0]) / QUBE["ENCODER"]
+        np.testing.assert_allclose(steps, steps.round(), atol=1e-6)
+        recorded = QUBE["recorded_velocity"](run.y[:, 0])[50:]
+        # An encoder's step moves the recorded velocity by 0.15 rad/s.
+        np.testing.assert_allclose(recorded, run.x[50:, 3], atol=0.3)
+        np.testing.assert_allclose(np.hypot(run.x[:, 0], run.x[:, 1]), 1.0)
+
+
 def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
     for setting, small in {"windows": 500, "samples": 10, "members": 1, "width": 16}.items():
         monkeypatch.setitem(QUBE["SETTINGS"], setting, small)
-    write_runs(tmp_path)
+    monkeypatch.setitem(QUBE["simulated"].__globals__, "SIMULATED", 10)
+    monkeypatch.setitem(QUBE["fitted"].__globals__, "fitted", lambda records: MODEL)
+    write_runs(tmp_path, QUBE["Qube"]())
     found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=60)
-    assert np.isfinite(found["KKL from recorded states"]).all()
-    assert (found["extended Kalman filter"] < 0.6).all()
+    assert np.isfinite(found["KKL"]).all()
+    of_filters = [found[f"extended Kalman filter, {kind} model"] for kind in ("published", "fitted")]
+    assert (of_filters[0] < 0.6).all()  # of the model that made the runs
+    assert np.isfinite(of_filters[1]).all()
+    assert not np.allclose(*of_filters)
     assert found["finite differences"][3] < 0.01
     assert np.isnan(found["finite differences"][:3]).all()
     assert "| finite differences | - | - | - | 0.00" in (tmp_path / "out" / "table.md").read_text()
@@ -68,4 +108,4 @@ def test_on_the_device(tmp_path):
     if path is None:
         pytest.skip("REAL DATA NOT TESTED: set KKL_GYM_QUBE to the folder of the Qube's runs, see examples/qube.py")
     found = QUBE["main"](Path(path), out=tmp_path)
-    assert (found["KKL from recorded states"] <= 0.04).all()
+    assert (found["KKL"] <= 0.04).all()

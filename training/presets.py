@@ -16,6 +16,9 @@ from training.spectrum import evenly_spaced, papers_spectrum
 from training.systems import profile
 
 Preset = Literal["fast", "paper"]
+Size = Literal["default", "small"]
+SMALL = "small"  # what names of small maps end in
+SMALL_WIDTH = 40  # of their hidden layers: an eighth of the multiplications
 LARGE: dict[str, Any] = {
     "width": 512,
     "depth": 4,

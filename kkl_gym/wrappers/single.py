@@ -182,6 +182,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         self.observer = self._estimator.observer
         self.estimate = estimate
         self._trail: deque[list[float]] = deque(maxlen=TRAIL)  # of estimates
+        self._rendering = env.render_mode is not None  # which every wrapper inside would be asked for at each step
         self._draws = 0  # which of the observers around one environment it is; the outermost draws the window
         if isinstance(base, KKLEnv):
             base.drawn_by += 1
@@ -281,9 +282,9 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     def _show(self, info: dict[str, Any]) -> np.ndarray:
         report = self._estimator.report()
         info.update(report)
-        if self.render_mode is not None and "x_hat" in report:
+        if self._rendering and "x_hat" in report:
             self._trail.append(report["x_hat"].tolist())
-        if self.render_mode == "human":
+        if self._rendering and self.render_mode == "human":
             self._animate()
         return observation(self._estimator.shown(report), self._estimator.space)
 

@@ -440,6 +440,7 @@ def test_all_but_the_measurement_noise_goes_by_name(call, saved, make_artifact):
         ("measurement_noise", "POSITIONAL_OR_KEYWORD", None),
         ("process_noise", "KEYWORD_ONLY", None),
         ("monitor", "KEYWORD_ONLY", False),
+        ("compiled", "KEYWORD_ONLY", None),
     ]
 
 

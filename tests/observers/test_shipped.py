@@ -56,3 +56,28 @@ def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
         observers.load(name, measurement_noise=limit)
         with pytest.raises(ValueError, match=str(limit)):
             observers.load(name, measurement_noise=limit + 0.1)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_small_maps_are_small_and_nearly_as_good(name):
+    """On 30 runs of 20 s; `kkl-gym evaluate` says it for more."""
+    large, small = (observers.load(which, 0.5, process_noise=0.0) for which in (name, f"{name}-small"))
+    system = get_system(name)
+    small.artifact.check(name, system.parameters, dt=0.01, ny=system.ny, nu=system.nu)
+    for inverse in ("inverse", "free_inverse"):
+        multiplications = [
+            sum(weight.size for weight in getattr(one.artifact, inverse).mlp.weights) for one in (small, large)
+        ]
+        assert 0.1 < multiplications[0] / multiplications[1] < 0.25
+    rng = np.random.default_rng(0)
+    x = simulate(system, rng.uniform(*system.box(), (30, system.nx)), 2000, 0.01)
+    y = system.output(x)
+    noisy = y + 0.5 * rng.standard_normal(y.shape)
+
+    def error(observer, y):
+        apart = np.linalg.norm(observer.estimate(y) - x, axis=-1)[400:]
+        return np.median(apart.mean(0) / np.linalg.norm(x, axis=-1).mean(0))
+
+    assert error(small, noisy) < 1.5 * error(large, noisy)
+    small.measurement_noise = 0.0
+    assert error(small, y) < 0.005

@@ -87,7 +87,7 @@ def _cells(found: Coverage, system: System) -> dict[str, float]:
     return {**cells, "nees": found.nees, "nees_low": low, "nees_high": high}
 
 
-def coverage_table(title: str, rows: "pd.DataFrame", system: System) -> Table:
+def coverage_table(title: str, rows: "pd.DataFrame") -> Table:
     """Show rows of :func:`judged`.
 
     Parameters
@@ -96,8 +96,6 @@ def coverage_table(title: str, rows: "pd.DataFrame", system: System) -> Table:
         Of the table.
     rows : DataFrame
         Rows with the columns "starts" and "driven" beside theirs.
-    system : System
-        What is estimated.
 
     Returns
     -------
@@ -105,22 +103,21 @@ def coverage_table(title: str, rows: "pd.DataFrame", system: System) -> Table:
         To be printed.
     """
     regions = [f"{100 * region:g}" for region in REGIONS]
-    shown = Table(title=title)
-    columns = ["observer", "starts", "driven", "span", "noise\non y", *(f"{region} %" for region in regions)]
-    for column in [*columns, *(f"90 %\n{name}" for name in system.state_names), "NEES\n(95 % limits)"]:
-        shown.add_column(column, justify="left" if column in columns[:4] else "right")
+    limits = f"{rows.nees_low.min():.2f} to {rows.nees_high.max():.2f}"
+    shown = Table(title=title, caption=f"NEES lies from {limits} with probability 95 % where covariances are true")
+    columns = ["observer", "starts", "span", "noise", *(f"{region} %" for region in regions), "NEES"]
+    for column in columns:
+        shown.add_column(column, justify="left" if column in columns[:3] else "right", no_wrap=True)
     for row in rows.to_dict("records"):
-        values = [row[name] for name in (*regions, *(f"90 {name}" for name in system.state_names))]
         shown.add_row(
             row["observer"],
-            row["starts"],
-            "yes" if row["driven"] else "no",
+            f"{row['starts']}{', driven' if row['driven'] else ''}",
             row["span"],
             str(row["measurement_noise"])
             if isinstance(row["measurement_noise"], str)
             else show_level(row["measurement_noise"]),
-            *(f"{value:.1f}" for value in values),
-            f"{row['nees']:.2f} ({row['nees_low']:.2f} – {row['nees_high']:.2f})",
+            *(f"{row[region]:.1f}" for region in regions),
+            f"{row['nees']:.2f}",
         )
     return shown
 

@@ -239,7 +239,7 @@ class Evaluate:
         if not rows:
             return []
         title = f"{name}: errors in regions, %, {self.trajectories} runs of {duration:g} s{on}"
-        progress.console.print(coverage_table(title, pd.DataFrame(rows), system))
+        progress.console.print(coverage_table(title, pd.DataFrame(rows)))
         return [pd.DataFrame(rows)]
 
     def _parameters(

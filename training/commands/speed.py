@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,12 @@ from rich.table import Column, Table
 
 import kkl_gym
 from kkl_gym.compiled import batch_step
+from observers import Artifact, KKLObserver
+from observers import shipped as shipped_maps
+from observers.artifact import resolve
 from training.commands.options import OneObserver, OneSystem, Shown, shown
+from training.commands.speed_observers import limit, observer_tasks, table_rows
+from training.presets import SMALL
 from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
@@ -28,6 +34,11 @@ class Speed:
     Actions are drawn beforehand. The environments take turns, several times over, and each ratio is the median of
     those to the reference in the same turn, because a shared machine's speed drifts. A system of yours has rows with an
     observer if one is named; without one, what `kkl_gym.KKLMemory` takes is timed too.
+
+    Times are this process's CPU time, in which others on the machine take no part: run it with one thread. The third
+    table has observers without any environment, beside extended Kalman filters on the same samples. Its last columns
+    are the additions and multiplications of the batch's network per second, those that its matrix products reach by
+    themselves, and the one as a share of the other.
     """
 
     system: OneSystem = None
@@ -60,6 +71,7 @@ class Speed:
         environments = shown(self.system, self.observer)
         with progress_bars(console) as progress:
             ratios = self._single(environments, progress) | self._vector(environments, progress)
+            self._observers(environments, progress)
             if self.system is None:
                 self._memory(progress)
         return ratios
@@ -71,6 +83,8 @@ class Speed:
             if one.observed:
                 made = gym.make(one.env_id, **one.options)
                 envs[f"{one.label}, x_hat"] = kkl_gym.KKLObservation(made, one.observer)
+            if small := _small(one):
+                envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLObservation(gym.make(one.env_id, **one.options), small)
         actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
         seconds = self._in_turns(tasks, progress.bar("timing single environments", self._runs(tasks)))
@@ -95,6 +109,9 @@ class Speed:
                 inner = [make(one.env_id, **one.options) for _ in range(2)]
                 envs[f"{one.label}, z"] = kkl_gym.KKLVectorObservation(inner[0], one.observer, estimate="z")
                 envs[f"{one.label}, x_hat"] = kkl_gym.KKLVectorObservation(inner[1], one.observer)
+            if small := _small(one):
+                made = make(one.env_id, **one.options)
+                envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLVectorObservation(made, small)
         actions = {name: _drawn(env.action_space, self.vector_steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed_vector(env, actions[name]) for name, env in envs.items()}
         report = progress.bar(f"timing {self.num_envs} environments at once", self._runs(tasks))
@@ -111,6 +128,37 @@ class Speed:
             table.add_row(name, whole, parts[name]["simulation"], parts[name]["network"], f"{ratio:.2f}")
         progress.console.print(table)
         return {f"{name}, {self.num_envs} rows": ratio for name, ratio in ratios.items()}
+
+    def _observers(self, environments: Sequence[Shown], progress: ProgressBars) -> None:
+        """Observers without environments, beside Kalman filters."""
+        n, steps, vector_steps = self.num_envs, -(-self.steps // 10), -(-self.vector_steps // 10)
+        title = Column("observers alone", no_wrap=True)
+        table = Table(title, "µs per step", f"µs per step, {n} rows", "GFLOP/s", "GFLOP/s of its products", "share")
+        observed = [one for one in environments if one.observed]
+        for one in observed:
+            for name in filter(None, (one.observer or one.system.name, _small(one))):
+                artifact = Artifact.read(resolve(name))
+                tasks = observer_tasks(artifact, one.system, rows=None, steps=steps)
+                batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
+                many = KKLObserver(artifact)
+                many.reset(np.zeros((n, artifact.ny)))
+                many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
+                products, operations = limit(artifact.inverse, n)
+                tasks |= {f"{n}, {key}": task for key, task in batch.items()}
+                tasks |= {"network": partial(_repeated, many.decode), "products": products}
+                report = progress.bar(f"timing {name} alone", self._runs(tasks))
+                seconds = {key: float(np.median(of)) for key, of in self._in_turns(tasks, report).items()}
+                rows = table_rows(
+                    {key: value for key, value in seconds.items() if key.startswith(("KKL", "EKF"))},
+                    {key: seconds[f"{n}, {key}"] for key in batch},
+                    network=seconds["network"],
+                    products=seconds["products"],
+                    operations=operations,
+                )
+                for first, *others in rows:
+                    table.add_row(f"{name}, {first}", *others)
+        if observed:
+            progress.console.print(table)
 
     def _memory(self, progress: ProgressBars) -> None:
         """What a memory takes, around environments that take next to nothing."""
@@ -205,12 +253,12 @@ def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
         Seconds, resets of ended episodes included.
     """
     env.reset(seed=0)
-    started = time.perf_counter()
+    started = time.process_time()
     for action in actions:
         _, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
             env.reset()
-    return time.perf_counter() - started
+    return time.process_time() - started
 
 
 def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
@@ -229,10 +277,10 @@ def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
         Seconds.
     """
     env.reset(seed=0)
-    started = time.perf_counter()
+    started = time.process_time()
     for action in actions:
         env.step(action)
-    return time.perf_counter() - started
+    return time.process_time() - started
 
 
 def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> dict[str, str]:
@@ -248,12 +296,26 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
     return shares
 
 
+def _small(one: Shown) -> str | None:
+    """The small map that ships for a system, beside what ships by default."""
+    name = f"{one.system.name}-{SMALL}"
+    return name if one.observer is None and one.observed and name in shipped_maps() else None
+
+
+def _repeated(task: Callable[[], object], repeats: int = 10) -> float:
+    """CPU seconds that a task takes."""
+    began = time.process_time()
+    for _ in range(repeats):
+        task()
+    return (time.process_time() - began) / repeats
+
+
 def _share(task: Callable[[], object], whole: float, repeats: int = 50) -> str:
     times = []
     for _ in range(repeats):
-        started = time.perf_counter()
+        started = time.process_time()
         task()
-        times.append(time.perf_counter() - started)
+        times.append(time.process_time() - started)
     return f"{100 * np.median(times) / whole:.0f} %"
 
 

@@ -16,7 +16,7 @@ from training.commands.data import DataOptions
 from training.commands.options import HalfWidths, Parameters
 from training.commands.settings import RecordedSettings, Settings
 from training.config import Config, Pipeline, read_changes
-from training.presets import CLOSED_LOOP, Preset, preset
+from training.presets import CLOSED_LOOP, SMALL, SMALL_WIDTH, Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
@@ -53,6 +53,9 @@ class Train:
     """input-aware: fitted along noisy trajectories, driven and free. spinn: the paper's pipeline, without inputs."""
     preset: Preset = "fast"
     """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""
+    size: Size = "default"
+    """small: hidden layers of 40, which are an eighth of the multiplications, for fast simulations and
+    microcontrollers. Writes NAME-small."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None
@@ -129,6 +132,7 @@ class Train:
             return None
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
         name += "-closed-loop" if config.closed_loop_trajectories else ""
+        name += "" if self.size == "default" else f"-{self.size}"
         folder = self.out or Path("runs") / name
         path = folder / f"{name}.safetensors"
         with progress_bars(console, folder / LOG) as progress:
@@ -155,7 +159,7 @@ class Train:
             if not self.system:
                 raise ValueError("name a system, or recorded data (--data)")
             return False
-        for option in ("pipeline", "preset", "closed_loop", "uncertain", "parameters", "dry_run"):
+        for option in ("pipeline", "preset", "size", "closed_loop", "uncertain", "parameters", "dry_run"):
             if getattr(self, option) != getattr(plain, option):
                 raise ValueError(f"--{option.replace('_', '-')} is of no use with --data, where nothing is simulated")
         return True
@@ -176,6 +180,8 @@ class Train:
     def _changes(self) -> dict[str, Any]:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
         changes = (read_changes(self.config) if self.config else {}) | self.settings
+        if self.size == SMALL:
+            changes.setdefault("width", SMALL_WIDTH)
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:

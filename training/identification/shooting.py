@@ -16,6 +16,7 @@ NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off fr
 WORSE = 1.0  # times the mean square of before, from which on a window's start is looked for again
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
 CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
+SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that is no headway, and for how many steps in a row
 SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
 EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which less is no better
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
@@ -357,7 +358,7 @@ def shoot(
     UnexplainedError
         If the motions of all windows leave the system's bounds.
     """
-    problem, nx, damping = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING
+    problem, nx, damping, slow = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING, 0
     at = problem.follow(theta, windows.x0, problem.rows)
     problem.settle(theta, at, problem.rows, SETTLING)
     for _ in range(rounds):
@@ -389,8 +390,10 @@ def shoot(
         if not better:
             break
         theta, at = new, tried
-        if fall * len(windows.y) < precision**2 * cost:
-            break  # rounding leaves no more; the fit says how far off it is
+        gained = fall * len(windows.y) / cost
+        slow = slow + 1 if gained < SLOW else 0
+        if gained < precision**2 or slow == PATIENCE:
+            break  # rounding, or chaos, leaves no more; the fit says how far off it is
     return _fit(problem, theta, at)
 
 

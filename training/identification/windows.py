@@ -99,16 +99,16 @@ def fit_windows(
         if keep.mean() < LEAST_USED:
             break
         starts = {key: x for key, x, kept in zip(starts, longer.x0, keep, strict=True) if kept}
-        cut, told = windows(records, starts, length), told_directions(best.information)
+        told = told_directions(best.information)
         before = best.errors(told, told)
         theta, aside = np.array(list(best.parameters.values())), shooting.unit * (told @ np.minimum(before, 1.0))
-        fit = shoot(shooting, np.clip(theta + aside, shooting.low, shooting.high), cut)
+        fit = _longer_fit(shooting, theta + aside, records, starts, length)
         if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
             break
         if fit.left > LEFT:
             break
         now = fit.errors(told, told)
-        other = shoot(shooting, np.clip(theta - aside, shooting.low, shooting.high), cut)
+        other = _longer_fit(shooting, theta - aside, records, starts, length)
         if (_apart(fit, other, told) > LEFT * now).any():
             break  # so long windows have many minima, and their curvature says nothing of where the others are
         report(described(fit, length))
@@ -118,6 +118,13 @@ def fit_windows(
         if (gain > GAIN).all():
             break
     return best
+
+
+def _longer_fit(shooting: Shooting, theta: np.ndarray, records: Sequence[Record], starts: Starts, length: int) -> Fit:
+    """A fit to windows twice as long as those before, if they had led to these parameters."""
+    theta = np.clip(theta, shooting.low, shooting.high)
+    x0 = settled(shooting, theta, windows(records, starts, length // 2))
+    return shoot(shooting, theta, windows(records, dict(zip(starts, x0, strict=True)), length))
 
 
 def _apart(one: Fit, other: Fit, directions: np.ndarray) -> np.ndarray:

@@ -1,15 +1,23 @@
 """kkl-gym speed."""
 
 import re
+import sys
 
 import linear_system
 import numpy as np
 import pytest
+from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from rich.console import Console
 
 import kkl_gym
-from training.commands import speed
+import observers
+from kkl_gym import get_system
+from kkl_gym.simulate import simulate
+from training.benchmark.protocol import run
+from training.commands import speed, speed_observers
 from training.commands.speed import Speed, timed, timed_vector
+from training.commands.speed_observers import limit, observer_tasks, table_rows
+from training.kalman import ExtendedKalmanFilter
 from training.progress import progress_bars
 
 
@@ -19,7 +27,7 @@ class Clock:
     def __init__(self):
         self.now = 100.0
 
-    def perf_counter(self):
+    def process_time(self):
         return self.now
 
 
@@ -71,8 +79,10 @@ def test_environments_take_turns_and_the_first_turn_does_not_count():
 def test_speed_measures_every_environment(capsys):
     """The printed times, of a single turn, are those that the ratios are made of."""
     ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
-    single = {"Pendulum-v1"} | {f"{env}{what}" for env in kkl_gym.ENV_IDS.values() for what in ("", ", x_hat")}
-    batched = {"CartPole-v1"} | {f"{env}{what}" for env in kkl_gym.ENV_IDS.values() for what in ("", ", z", ", x_hat")}
+    parts = {"": "", "x_hat": ", x_hat", "small": ", x_hat, small", "z": ", z"}
+    names = {what: {f"{env}{part}" for env in kkl_gym.ENV_IDS.values()} for what, part in parts.items()}
+    single = {"Pendulum-v1"} | names[""] | names["x_hat"] | names["small"]
+    batched = {"CartPole-v1"} | (single - {"Pendulum-v1"}) | names["z"]
     assert set(ratios) == single | {f"{name}, 8 rows" for name in batched}
     assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 8 rows"]) == (1.0, 1.0)
     lines = [line.split("│")[1:-1] for line in capsys.readouterr().out.splitlines() if "│" in line]
@@ -86,7 +96,17 @@ def test_speed_measures_every_environment(capsys):
             if rows:
                 simulated, network = ("%" in part for part in parts)
                 assert simulated == (name != reference)
-                assert network == name.endswith("x_hat")
+                assert network == (name in names["x_hat"] | names["small"])
+    alone = [[cell.strip() for cell in cells] for cells in lines if len(cells) == 6]
+    assert len(alone) == 4 * 2 * 4
+    for name, one, many, *speeds in alone:
+        assert float(one) > 0
+        assert bool(many) == (not name.endswith("NumPy"))
+        if any(speeds):
+            reached, most, share = (float(speed.rstrip(" %")) for speed in speeds)
+            assert name.endswith("KKL")
+            assert share == pytest.approx(100 * reached / most, rel=0.5, abs=5)
+    assert sum(any(speeds) for _, _, _, *speeds in alone) == 4 * 2
 
 
 def test_what_a_memory_takes_is_the_difference_to_the_bare_environment(monkeypatch):
@@ -118,3 +138,45 @@ def test_a_system_of_ones_own_alone(saved, capsys):
         "oscillator, z, 4 rows",
         "oscillator, x_hat, 4 rows",
     }
+
+
+def test_the_table_says_what_share_of_the_products_speed_a_network_reaches():
+    seconds = {"KKL, NumPy": 20e-6, "KKL": 10e-6, "EKF": 400e-6}
+    rows = table_rows(seconds, {"KKL": 2e-3, "EKF": 3e-3}, network=2e-3, products=1e-3, operations=1e8)
+    assert rows == [
+        ["KKL, NumPy", "20.0", "", "", "", ""],
+        ["KKL", "10.0", "2,000", "50", "100", "50 %"],
+        ["EKF", "400.0", "3,000", "", "", ""],
+    ]
+
+
+def test_products_are_those_of_the_network(saved):
+    inverse = observers.load("lorenz").artifact.inverse
+    task, operations = limit(inverse, 7)
+    assert operations == 2 * 7 * (28 * 128 + 2 * 128 * 128 + 128 * 3)
+    assert task() >= 0.0
+
+
+def test_all_filters_follow_the_same_samples():
+    """Those of filterpy, of which there is one for each row, have moved; none is timed without it."""
+    artifact, system = observers.load("lorenz").artifact, get_system("lorenz")
+    assert list(observer_tasks(artifact, system, rows=3, steps=4)) == ["KKL", "EKF", "EKF of filterpy"]
+    tasks = observer_tasks(artifact, system, rows=None, steps=4)
+    assert {task() >= 0.0 for task in tasks.values()} == {True}
+
+
+def test_filterpys_filter_is_like_ours():
+    system, dt = get_system("van_der_pol"), 0.01
+    Q, R = 0.01 * np.eye(2), 0.01 * np.eye(1)
+    one, ours = speed_observers._Filterpy(FilterpyEKF, system, dt, Q=Q, R=R), ExtendedKalmanFilter(system, dt, Q=Q, R=R)
+    y = simulate(system, np.array([[1.0, 1.0]]), 300, dt)[..., :1]
+    found = run(ours, y)
+    for k in range(301):
+        one.step(y[k, 0], np.zeros(1))
+    assert np.allclose(one._filter.x, found[-1, 0], atol=0.05)
+
+
+def test_without_filterpy(monkeypatch):
+    monkeypatch.setitem(sys.modules, "filterpy.kalman", None)
+    tasks = observer_tasks(observers.load("lorenz").artifact, get_system("lorenz"), rows=2, steps=2)
+    assert list(tasks) == ["KKL", "EKF"]

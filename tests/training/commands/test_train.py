@@ -6,6 +6,7 @@ import pytest
 
 from observers import Artifact, Expression, KKLObserver
 from training.cli import main
+from training.commands.train import Train
 
 
 def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monkeypatch):
@@ -85,3 +86,15 @@ def test_outputs_that_are_not_linear_are_written_down_or_it_is_said_why_not(tmp_
     assert artifact.h == Expression([["sin", ["x", 0]]])
     with pytest.raises(ValueError, match=r"holds no limits .* training\.calibrate\(artifact, system\) finds them"):
         KKLObserver(artifact, monitor=True)
+
+
+def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sizes = "--trajectories 20 --duration 2 --samples 30 --depth 1 --batch 64 --inverse-steps 2 --no-monitor"
+    main(["train", "van_der_pol", "--size", "small", "--no-inputs", *sizes.split()])
+    path = tmp_path / "runs" / "van_der_pol-small" / "van_der_pol-small.safetensors"
+    assert Artifact.read(path).inverse.mlp.weights[0].shape[0] == 40
+    assert "width = 40" in capsys.readouterr().out
+    assert Train("van_der_pol", size="small", settings={"width": 8})._changes() == {"width": 8}
+    with pytest.raises(SystemExit, match="--size is of no use with --data"):
+        main(["train", "--data", "runs.csv", "--size", "small"])

@@ -1,0 +1,444 @@
+"""Networks as machine code, where Numba is installed: what lies between a batch's matrix products, or a whole sample.
+
+A batch goes through in pieces that stay in the processor's cache, into memory that is there already. Its products are
+NumPy's, which is BLAS at the machine's limit. A single sample is one call, where NumPy's own overhead would be most.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+PIECE = 2**15  # values of a layer that a batch computes at once: they fit into the second cache
+_UNROLLED = 4  # inputs that a single sample's loop takes at once
+_LINE = 16  # numbers of float32 in a line of the cache
+_FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
+
+Layers = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Weights (inputs, outputs) and biases (outputs,) in float32."""
+
+
+class CompiledNetwork:
+    """A multilayer perceptron.
+
+    Parameters
+    ----------
+    layers : sequence of (ndarray, ndarray)
+        Weights (inputs, outputs) and biases (outputs,) in float32.
+    activation : {"tanh", "silu", "relu"}
+        After every layer but the last.
+
+    Attributes
+    ----------
+    activation : str
+        As given.
+    outputs : int
+        Number of outputs.
+    bias : ndarray of float32, shape (outputs,)
+        Of the last layer.
+    packed : ndarray of float32
+        Biases and weights, layer by layer.
+    widths : ndarray of int
+        Of the inputs and of each layer.
+    between : ndarray of float32
+        Memory for a single sample.
+
+    Raises
+    ------
+    ImportError
+        If Numba is not installed.
+    """
+
+    def __init__(self, layers: Layers, activation: str) -> None:
+        _kernels(activation)  # or say now that there is no Numba
+        self._layers, self.activation, self.bias = layers, activation, layers[-1][1]
+        widths = [len(layers[0][0]), *(len(bias) for _, bias in layers)]
+        self.outputs, self.widths, self._most = widths[-1], np.array(widths), max(widths)
+        self.packed = _aligned(
+            np.concatenate([part.ravel() for weight, bias in layers for part in (bias, _padded(weight))])
+        )
+        row = -(-(self._most + _UNROLLED) // _LINE) * _LINE
+        self.between = _aligned(np.zeros(3 * row, np.float32)).reshape(3, row)  # no kernel lets another thread in
+        self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
+
+    def single(self, x: np.ndarray) -> np.ndarray:
+        """Evaluate for one sample.
+
+        Parameters
+        ----------
+        x : ndarray of float32, shape (inputs,)
+            Inputs.
+
+        Returns
+        -------
+        ndarray of float32, shape (outputs,)
+            Outputs.
+        """
+        out = np.empty(self.outputs, np.float32)
+        _kernels(self.activation)[1](x, self.packed, self.widths, self.between, out)
+        return out
+
+    def batch(self, x: np.ndarray) -> np.ndarray:
+        """Evaluate for many samples.
+
+        Parameters
+        ----------
+        x : ndarray of float32, shape (n, inputs)
+            Inputs.
+
+        Returns
+        -------
+        ndarray of float32, shape (n, outputs)
+            Outputs.
+        """
+        out = np.empty((len(x), self.outputs), np.float32)
+        with self.memory() as memory:
+            for here in self.pieces(len(x)):
+                self.piece(x[here], memory, out[here])
+        out += self.bias
+        return out
+
+    def pieces(self, n: int) -> list[slice]:
+        """Rows of a batch that go through together."""
+        count = -(-n // self._rows)
+        return [slice(n * i // count, n * (i + 1) // count) for i in range(count)]
+
+    def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
+        """Evaluate for the rows of a piece, all but the last biases.
+
+        Parameters
+        ----------
+        h : ndarray of float32, shape (rows, inputs)
+            Inputs.
+        memory : ndarray of float32
+            What :meth:`memory` lends.
+        out : ndarray of float32, shape (rows, outputs)
+            Takes what the last weights make.
+        """
+        *hidden, (last, _) = self._layers
+        activate, rows = _kernels(self.activation)[0], len(h)
+        for i, (weight, bias) in enumerate(hidden):
+            into = memory[i % 2, : rows * len(bias)].reshape(rows, len(bias))
+            h = np.matmul(h, weight, out=into)
+            activate(h, bias)
+        np.matmul(h, last, out=out)
+
+    @contextmanager
+    def memory(self) -> Iterator[np.ndarray]:
+        """Lend memory for the layers of a piece, the same to one after another."""
+        spare = self._spare
+        memory = spare.pop() if spare else np.empty((2, self._rows * self._most), np.float32)
+        yield memory
+        spare.append(memory)
+
+    @property
+    def _rows(self) -> int:
+        return max(1, PIECE // self._most)
+
+
+class CompiledDecoder:
+    """From the filter's state to the estimate: one call for a single sample, a few for each piece of a batch.
+
+    The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in float64.
+    (The coordinates are differences of filter states that are much alike, of which float32 would leave little.)
+
+    Parameters
+    ----------
+    layers : sequence of (ndarray, ndarray)
+        Weights (inputs, outputs) and biases (outputs,) in float32, of two layers at least.
+    activation : {"tanh", "silu", "relu"}
+        After every layer but the last.
+    whiten : ndarray, shape (size, modes)
+        From z to the network's coordinates.
+    offset : ndarray, shape (modes,)
+        Added to them.
+    conditions : sequence of float
+        What the network is given behind them.
+    age : (float, float), optional
+        Unit and end of the age in seconds, where the network is told that too.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Of the states.
+
+    Raises
+    ------
+    ImportError
+        If Numba is not installed.
+    """
+
+    def __init__(
+        self,
+        layers: Layers,
+        activation: str,
+        *,
+        whiten: np.ndarray,
+        offset: np.ndarray,
+        conditions: Sequence[float],
+        age: tuple[float, float] | None,
+        x_offset: np.ndarray,
+        x_scale: np.ndarray,
+    ) -> None:
+        self._network = CompiledNetwork(layers[1:], activation)
+        weight, bias = (part.astype(float) for part in layers[0])
+        modes, told = len(offset), len(offset) + len(conditions)
+        self._weight = whiten @ weight[:modes]
+        self._bias = bias + offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:told]
+        self._of_age = np.zeros_like(bias) if age is None else weight[told]
+        self._age_unit, self._age_max = (1.0, 0.0) if age is None else age
+        self._first, self._entered = np.empty(len(bias)), np.empty(len(bias), np.float32)
+        self._x_offset, self._x_scale = np.array(x_offset, dtype=float), np.array(x_scale, dtype=float)
+
+    def single(self, z: np.ndarray, age: float) -> np.ndarray:
+        """Estimate for one sample.
+
+        Parameters
+        ----------
+        z : ndarray, shape (size,)
+            The filter's state.
+        age : float
+            Seconds since reset.
+
+        Returns
+        -------
+        ndarray, shape (nx,)
+            The estimate.
+        """
+        network, x_hat = self._network, np.empty(len(self._x_offset))
+        _decode(network.activation)(
+            z,
+            self._weight,
+            self._bias,
+            self._of_age,
+            min(age, self._age_max) / self._age_unit,
+            self._first,
+            self._entered,
+            network.packed,
+            network.widths,
+            network.between,
+            self._x_offset,
+            self._x_scale,
+            x_hat,
+        )
+        return x_hat
+
+    def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
+        """Estimate for many samples.
+
+        Parameters
+        ----------
+        z : ndarray, shape (n, size)
+            The filter's states.
+        age : float or ndarray, shape (n,)
+            Seconds since reset.
+
+        Returns
+        -------
+        ndarray, shape (n, nx)
+            The estimates.
+        """
+        network, n, width = self._network, len(z), len(self._bias)
+        enter, finish = _batches(network.activation)
+        ages = np.broadcast_to(np.log1p(np.minimum(age, self._age_max) / self._age_unit), n)
+        x_hat = np.empty((n, network.outputs))
+        pieces = network.pieces(n)
+        most = max(piece.stop - piece.start for piece in pieces)
+        first = np.empty((most, width))
+        out = np.empty((most, network.outputs), np.float32)
+        with network.memory() as memory:
+            for here in pieces:
+                rows = here.stop - here.start
+                np.matmul(z[here], self._weight, out=first[:rows])
+                entered = memory[1, : rows * width].reshape(rows, width)  # which is free until the second layer
+                enter(first, self._bias, self._of_age, ages[here], entered)
+                network.piece(entered, memory, out[:rows])
+                finish(out, network.bias, self._x_offset, self._x_scale, x_hat[here])
+        return x_hat
+
+
+def available() -> bool:
+    """Whether Numba is installed."""
+    try:
+        import numba  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """A copy that begins with a line of the cache: one that lies across two costs a single sample a quarter."""
+    memory = np.empty(len(values) + _LINE, np.float32)
+    first = -memory.ctypes.data % (4 * _LINE) // 4
+    memory[first : first + len(values)] = values
+    return memory[first : first + len(values)]
+
+
+def _padded(weight: np.ndarray) -> np.ndarray:
+    """Weights with rows of zeros, for as many inputs as the loop takes at once."""
+    return np.pad(weight, ((0, -len(weight) % _UNROLLED), (0, 0)))
+
+
+@functools.cache
+def _decode(activation: str) -> Callable[..., None]:
+    """The first layer on z and age, and the network behind it, for one sample."""
+    import numba
+
+    active, evaluate = _active(activation), _kernels(activation)[1]
+
+    @numba.njit(fastmath=_FAST, error_model="numpy")
+    def decode(
+        z: np.ndarray,
+        weight: np.ndarray,
+        bias: np.ndarray,
+        of_age: np.ndarray,
+        age: float,
+        first: np.ndarray,
+        entered: np.ndarray,
+        packed: np.ndarray,
+        widths: np.ndarray,
+        between: np.ndarray,
+        offset: np.ndarray,
+        scale: np.ndarray,
+        out: np.ndarray,
+    ) -> None:
+        width, told, size = len(bias), math.log1p(age), len(z)
+        for j in range(width):
+            first[j] = bias[j] + told * of_age[j]
+        for i in range(0, size - 1, 2):
+            a, b = z[i], z[i + 1]
+            for j in range(width):
+                first[j] += a * weight[i, j] + b * weight[i + 1, j]
+        if size % 2:
+            for j in range(width):
+                first[j] += z[size - 1] * weight[size - 1, j]
+        for j in range(width):
+            entered[j] = active(np.float32(first[j]))
+        found = between[2, : len(out)]
+        evaluate(entered, packed, widths, between, found)
+        for j in range(len(out)):
+            out[j] = offset[j] + scale[j] * found[j]
+
+    return decode
+
+
+@functools.cache
+def _batches(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
+    """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
+    import numba
+
+    active = _active(activation)
+
+    @numba.njit(fastmath=_FAST, error_model="numpy")
+    def enter(first: np.ndarray, bias: np.ndarray, of_age: np.ndarray, ages: np.ndarray, entered: np.ndarray) -> None:
+        for row in range(len(ages)):
+            age = ages[row]
+            for j in range(len(bias)):
+                entered[row, j] = active(np.float32(first[row, j] + bias[j] + age * of_age[j]))
+
+    @numba.njit
+    def finish(h: np.ndarray, bias: np.ndarray, offset: np.ndarray, scale: np.ndarray, out: np.ndarray) -> None:
+        for row in range(len(out)):
+            for j in range(len(bias)):
+                out[row, j] = offset[j] + scale[j] * (h[row, j] + bias[j])
+
+    return enter, finish
+
+
+@functools.cache
+def _active(activation: str) -> Any:
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
+    return compiled(_ACTIVATIONS[activation](compiled))
+
+
+@functools.cache
+def _kernels(activation: str) -> tuple[Any, Any]:
+    """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
+    active = _active(activation)
+
+    @compiled
+    def activate(h: np.ndarray, bias: np.ndarray) -> None:
+        rows, width = h.shape
+        for row in range(rows):
+            for j in range(width):
+                h[row, j] = active(h[row, j] + bias[j])
+
+    @compiled
+    def evaluate(
+        x: np.ndarray,
+        packed: np.ndarray,
+        widths: np.ndarray,
+        between: np.ndarray,
+        out: np.ndarray,
+    ) -> None:
+        h, into, at = between[0], between[1], 0
+        for j in range(len(x)):
+            h[j] = x[j]
+        for layer in range(len(widths) - 1):
+            inputs, width = widths[layer], widths[layer + 1]
+            for j in range(inputs, inputs + _UNROLLED):
+                h[j] = 0.0  # beside the rows of zeros
+            for j in range(width):
+                into[j] = packed[at + j]
+            at += width
+            for i in range(0, inputs, _UNROLLED):
+                a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
+                first, second = packed[at : at + width], packed[at + width : at + 2 * width]
+                third, fourth = packed[at + 2 * width : at + 3 * width], packed[at + 3 * width : at + 4 * width]
+                for j in range(width):
+                    into[j] += a * first[j] + b * second[j] + c * third[j] + d * fourth[j]
+                at += 4 * width
+            if layer < len(widths) - 2:
+                for j in range(width):
+                    into[j] = active(into[j])
+            h, into = into, h
+        for j in range(len(out)):
+            out[j] = h[j]
+
+    return activate, evaluate
+
+
+def _tanh(compiled: Any) -> Callable[[Any], Any]:
+    """A quotient of polynomials, to 3e-7: that of Eigen. Loops take many values of it at a time."""
+    f = np.float32
+    p = tuple(
+        map(f, (-2.76076847742355e-16, 2.00018790482477e-13, -8.60467152213735e-11, 5.12229709037114e-08))
+    ) + tuple(map(f, (1.48572235717979e-05, 6.37261928875436e-04, 4.89352455891786e-03)))
+    q = tuple(map(f, (1.19825839466702e-06, 1.18534705686654e-04, 2.26843463243900e-03, 4.89352518554385e-03)))
+    end = f(7.90531110763549805)  # beyond which float32 knows no difference to 1
+
+    def tanh(x: Any) -> Any:
+        x = -end if x < -end else x
+        x = end if x > end else x
+        s = x * x
+        above = (((((p[0] * s + p[1]) * s + p[2]) * s + p[3]) * s + p[4]) * s + p[5]) * s + p[6]
+        return x * above / (((q[0] * s + q[1]) * s + q[2]) * s + q[3])
+
+    return tanh
+
+
+def _silu(compiled: Any) -> Callable[[Any], Any]:
+    tanh, half = compiled(_tanh(compiled)), np.float32(0.5)
+
+    def silu(x: Any) -> Any:
+        x = half * x  # as observers.network has it
+        return x + x * tanh(x)
+
+    return silu
+
+
+def _relu(compiled: Any) -> Callable[[Any], Any]:
+    zero = np.float32(0.0)
+
+    def relu(x: Any) -> Any:
+        return zero if x < zero else x
+
+    return relu
+
+
+_ACTIVATIONS = {"tanh": _tanh, "silu": _silu, "relu": _relu}

@@ -1,0 +1,172 @@
+"""How fast observers step by themselves: against Kalman filters, and against the matrix products in their networks."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from kkl_gym.simulate import advance
+from kkl_gym.system import System
+from observers import Artifact, InverseMap, KKLObserver
+from observers.compiled import available
+from training.kalman import ExtendedKalmanFilter, measurement_covariance, process_intensity, unknown_start
+from training.trajectories.derivatives import jacobian
+
+BATCHES = 10  # of one step each, by filters that take one sample at a time
+
+
+def observer_tasks(
+    artifact: Artifact, system: System, *, rows: int | None, steps: int
+) -> dict[str, Callable[[], float]]:
+    """What steps an observer and extended Kalman filters along the same samples.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    rows : int or None
+        How many are observed at once; None is a single one, without an axis.
+    steps : int
+        Number of samples.
+
+    Returns
+    -------
+    dict of str to callable
+        CPU seconds for each step, by name: "KKL"; "KKL, NumPy" of a single one where Numba is installed; "EKF" of this
+        package, which is for batches; and "EKF of filterpy" where that is installed, one filter for each row.
+    """
+    rng, n = np.random.default_rng(0), rows or 1
+    y = np.array(system.output_range) * rng.uniform(-0.5, 0.5, (steps + 1, n, system.ny))
+    u = np.array(system.u_max) * rng.uniform(-1, 1, (steps + 1, n, system.nu))
+    known = u[..., : artifact.nu]
+    tasks = {}
+    numba = available()
+    if rows is None:
+        if numba:
+            tasks["KKL, NumPy"] = _stepping(KKLObserver(artifact, compiled=False), y[:, 0], known[:, 0])
+        tasks["KKL"] = _stepping(KKLObserver(artifact, compiled=numba or None), y[:, 0], known[:, 0])
+    else:
+        tasks["KKL"] = _stepping(KKLObserver(artifact), y, known)
+    R = measurement_covariance(system, artifact.measurement_noise)
+    Q = process_intensity(system, system.process_noise, artifact.filter.dt)
+    ekf = ExtendedKalmanFilter(system, artifact.filter.dt, Q=Q, R=R)
+    tasks["EKF"] = _stepping(ekf, y[: BATCHES + 1], u) if rows else _stepping(ekf, y, u)
+    try:
+        from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
+    except ImportError:
+        return tasks
+    each = [_Filterpy(FilterpyEKF, system, artifact.filter.dt, Q=Q, R=R) for _ in range(n)]
+
+    def filterpy() -> float:
+        count = min(BATCHES, steps) if rows else steps
+        began = time.process_time()
+        for k in range(count):
+            for row, one in enumerate(each):
+                one.step(y[k, row], u[k, row])
+        return (time.process_time() - began) / count
+
+    return {**tasks, "EKF of filterpy": filterpy}
+
+
+def limit(inverse: InverseMap, rows: int) -> tuple[Callable[[], float], float]:
+    """The matrix products of a map's network, and nothing else.
+
+    Parameters
+    ----------
+    inverse : InverseMap
+        The map.
+    rows : int
+        Of the batch.
+
+    Returns
+    -------
+    task : callable
+        CPU seconds that they take, all together.
+    operations : float
+        How many additions and multiplications they are.
+    """
+    weights = [np.ascontiguousarray(weight.T, dtype=np.float32) for weight in inverse.mlp.weights]
+    values = [np.ones((rows, len(weight)), np.float32) for weight in weights]
+    out = [np.empty((rows, weight.shape[1]), np.float32) for weight in weights]
+
+    def products() -> float:
+        began = time.process_time()
+        for _ in range(BATCHES):
+            for value, weight, into in zip(values, weights, out):
+                np.matmul(value, weight, out=into)
+        return (time.process_time() - began) / BATCHES
+
+    return products, 2.0 * rows * sum(weight.size for weight in weights)
+
+
+def table_rows(
+    single: Mapping[str, float], batch: Mapping[str, float], *, network: float, products: float, operations: float
+) -> list[list[str]]:
+    """Rows of the table.
+
+    Parameters
+    ----------
+    single, batch : mapping of str to float
+        Seconds per step by name, of one and of many.
+    network : float
+        Seconds of a batch's network, with what it is given.
+    products : float
+        Seconds of the matrix products in it.
+    operations : float
+        Additions and multiplications in these.
+
+    Returns
+    -------
+    list of list of str
+        Name, µs of one, µs of a batch, and for the observer GFLOP/s of the network, of the products, and the share.
+    """
+    found = []
+    for name, seconds in single.items():
+        many = f"{1e6 * batch[name]:,.0f}" if name in batch else ""
+        speeds = ["", "", ""]
+        if name == "KKL":
+            reached, most = (operations / time / 1e9 for time in (network, products))
+            speeds = [f"{reached:.0f}", f"{most:.0f}", f"{100 * reached / most:.0f} %"]
+        found.append([name, f"{1e6 * seconds:.1f}", many, *speeds])
+    return found
+
+
+def _stepping(observer: Any, y: np.ndarray, u: np.ndarray) -> Callable[[], float]:
+    def task() -> float:
+        observer.reset(y[0])
+        began = time.process_time()
+        for k in range(1, len(y)):
+            observer.step(y[k], u[k])
+        return (time.process_time() - began) / (len(y) - 1)
+
+    return task
+
+
+class _Filterpy:
+    """filterpy's EKF, with this package's step of the equations and their Jacobian: what a user would write."""
+
+    def __init__(self, kind: Any, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray) -> None:
+        self._system, self._dt = system, dt
+        self._filter = kind(dim_x=system.nx, dim_z=system.ny)
+        self._start = unknown_start(system)
+        self._filter.x, self._filter.P = (np.array(each) for each in self._start)
+        self._filter.Q, self._filter.R = Q * dt, R
+        self._low, self._high = np.array(system.bounds).T
+        self._f, self._h = jacobian(system.f, system.nx), jacobian(system.h, system.nx)
+        self._w = [0.0] * system.nx
+
+    def step(self, y: np.ndarray, u: np.ndarray) -> None:
+        found, system = self._filter, self._system
+        state = found.x.tolist()
+        found.F = np.eye(system.nx) + self._dt * self._matrix(self._f, state)
+        found.P = found.F @ found.P @ found.F.T + found.Q
+        found.x = np.array(advance(system, state, u.tolist(), self._w, self._dt))
+        found.update(y, lambda x: self._matrix(self._h, x.tolist()), lambda x: np.array(system.h(x)))
+        if not ((self._low <= found.x) & (found.x <= self._high)).all():  # samples are no motion's
+            found.x, found.P = (np.array(each) for each in self._start)
+
+    def _matrix(self, rows: Any, x: list[float]) -> np.ndarray:
+        return np.array([[row[j](*x) if j in row else 0.0 for j in range(self._system.nx)] for row in rows])
