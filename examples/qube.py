@@ -293,7 +293,7 @@ def draw(
         for i, name in enumerate(SIGNALS.hidden):
             ax = axes[i, column]
             ax.plot(t, record.x[shown, i], "k", lw=1.5, label="recorded")
-            for (label, x_hat), style in zip(estimators.items(), ("m--", "c-", "y:"), strict=False):
+            for (label, x_hat), style in zip(estimators.items(), ("m--", "c-", "g-", "y:"), strict=False):
                 if not np.isnan(x_hat[column][:, i]).any():
                     ax.plot(t, x_hat[column][shown, i], style, lw=1.0, label=label)
             margin = 0.2 * np.ptp(record.x[:, i])
