@@ -276,8 +276,8 @@ def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[st
     settings = dict(known.get(ENV_IDS.get(system.name, "default"), known["default"]))
     for key in ("env_kwargs", "env_wrapper"):  # what rl-zoo3 makes the task of
         settings.pop(key, None)
-    if isinstance(settings["policy_kwargs"], str):
-        settings["policy_kwargs"] = _keywords(settings["policy_kwargs"])
+    if isinstance(given := settings.get("policy_kwargs"), str):
+        settings["policy_kwargs"] = _keywords(given)
     return name, settings
 
 

@@ -59,7 +59,7 @@ def test_the_default_activation(trained):
 
 
 @pytest.mark.parametrize(("parts", "match"), [
-    ({"policy.pth": pickle.dumps(_Bomb())}, "no agent of stable-baselines3: Weights only load failed"),
+    ({"policy.pth": pickle.dumps(_Bomb(), protocol=2)}, "no agent of stable-baselines3: Weights only load failed"),
     ({"policy.pth": None}, r"no agent of stable-baselines3: .*policy.pth"),
     ({"data": b'{"policy_kwargs": {"activation_fn": "<class \'torch.nn.ELU\'>"}}'}, "activation .*ELU.* is none of"),
     ({"data": b"{"}, "agent.zip"),
