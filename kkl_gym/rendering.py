@@ -209,7 +209,7 @@ class Window:
             An RGB image.
         """
         pygame = self._pygame
-        if self._screen is None:
+        if not self._open():
             pygame.display.init()
             self._screen = pygame.display.set_mode(frame.shape[1::-1])
             pygame.display.set_caption(self._title)
@@ -220,9 +220,13 @@ class Window:
 
     def close(self) -> None:
         """Close the window."""
-        if self._screen is not None:
+        if self._open():
             self._pygame.display.quit()
-            self._screen = None
+        self._screen = None
+
+    def _open(self) -> bool:
+        """Whether the window is there: a process has one, which another environment or the user may have closed."""
+        return self._screen is not None and self._pygame.display.get_surface() is self._screen
 
 
 def samples_a_frame(dt: float) -> int:

@@ -240,7 +240,7 @@ class CompiledDecoder:
         """
         network, n, width = self._network, len(z), len(self._bias)
         enter, finish = _batches(network.activation)
-        ages = np.broadcast_to(np.log1p(np.minimum(age, self._age_max) / self._age_unit), n)
+        ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
         x_hat = np.empty((n, network.outputs))
         pieces = network.pieces(n)
         most = max(piece.stop - piece.start for piece in pieces)

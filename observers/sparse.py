@@ -87,6 +87,7 @@ class SparseUpdate:
             The state one sample later.
         """
         z_next = np.empty(len(z))
+        u = u.copy()  # the user's own: to Numba, an array that is read-only or has strides is of another type
         _single()(z, y, u, y_next, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
         return z_next
 

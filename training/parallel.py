@@ -114,9 +114,19 @@ def _attempt(
     try:
         with around():
             run(job)
-    except Exception as error:  # as text: not every error finds its way from process to process
-        return index, str(error) or type(error).__name__
+    except (Exception, SystemExit) as error:  # as text: not every error finds its way from process to process
+        return index, _text(error)
     return index, None
+
+
+def _text(error: BaseException) -> str:
+    """Say what an error says; one that says nothing, or cannot, by its name."""
+    if isinstance(error, SystemExit):
+        return f"left with sys.exit({error.code!r})"
+    try:
+        return str(error) or type(error).__name__
+    except Exception:
+        return type(error).__name__
 
 
 @contextmanager

@@ -116,7 +116,7 @@ function listen() {
   });
   $("controls").addEventListener("submit", (event) => event.preventDefault());
   $("pause").addEventListener("click", () => pause(!paused));
-  $("restart").addEventListener("click", () => restarted(world.history[0].x));
+  $("restart").addEventListener("click", () => restarted(world.start));
   $("start").addEventListener("click", () => restarted());
   $("portrait").addEventListener("click", ({ offsetX, offsetY }) => restarted(portrait.stateAt(offsetX, offsetY)));
   document.addEventListener("keydown", (event) => {

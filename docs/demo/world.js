@@ -25,7 +25,7 @@ export class World {
   }
 
   restart(x0 = this.system.start(this.random)) {
-    this.x = x0;
+    this.x = this.start = x0;
     this.count = 0; // of samples
     this.escaped = false;
     this.history = [];

@@ -152,3 +152,19 @@ def test_keys_for_people():
     }
     assert len(both) == 8
     assert (both["w"], both["aw"], both["ds"]) == ([0.0, 1.0], [-1.0, 1.0], [1.0, -1.0])
+
+
+def test_what_another_environment_has_closed_opens_again(shown):
+    """As a training environment's window does after an evaluation: a process has one window."""
+    env, other = (gym.make("KKLVanDerPol-v0", render_mode="human") for _ in range(2))
+    env.reset(seed=0)
+    other.reset(seed=0)
+    other.close()
+    before = len(shown)
+    env.step(np.zeros(1, np.float32))
+    env.step(np.zeros(1, np.float32))
+    assert len(shown) == before + 1
+    other.close()  # a window that is no longer its own
+    assert pygame.display.get_init()
+    env.close()
+    assert not pygame.display.get_init()

@@ -265,3 +265,31 @@ def test_threads_do_not_share_memory():
     for i, z in inputs.items():
         expected = observer._states(z, 1.0)
         assert all(np.array_equal(x_hat, expected) for x_hat in found[i])
+
+
+def test_inputs_that_are_read_only_or_have_strides():
+    """To Numba they are of other types, but a run goes on and compiles nothing in its midst."""
+    one, other = (observers.load("van_der_pol", compiled=choice) for choice in (True, False))
+    held = np.broadcast_to(0.3, (1,))
+    frozen = np.array([0.2])
+    frozen.flags.writeable = False
+    for observer in (one, other):
+        observer.reset([0.5])
+        observer.step([0.4], [0.1])
+    made = len(observers.sparse._single().signatures)
+    for u in (held, frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0]):
+        assert apart(one.step([0.4], u), other.step([0.4], u), one.artifact) < ACCURATE
+    assert len(observers.sparse._single().signatures) == made
+
+
+def test_a_batch_compiles_nothing_more_where_rows_restart():
+    observer = observers.load("van_der_pol")
+    y = np.linspace(-1, 1, MANY_ROWS)[:, None]
+    enter = machine._batches(observer.artifact.inverse.mlp.activation)[0]
+    observer.reset(y)
+    observer.step(y, y)
+    made = len(enter.signatures)
+    observer.restart(y[:3], np.arange(MANY_ROWS) < 3)
+    observer.step(y, y)
+    observer.estimate(np.zeros((MANY_ROWS, 1)))
+    assert len(enter.signatures) == made

@@ -59,16 +59,35 @@ class UnsendableError(Exception):
         super().__init__(f"with {lock}")
 
 
+class UnspeakableError(Exception):
+    def __str__(self):
+        raise RuntimeError("no text")
+
+
+ERRORS = {
+    "odd": UnsendableError("a lock"),
+    "silent": ValueError(),
+    "unspeakable": UnspeakableError(),
+    "leaving": SystemExit("enough"),
+    "leaving quietly": SystemExit(),
+}
+
+
 def fail(job):
-    raise {"odd": UnsendableError("a lock"), "silent": ValueError()}[job.name]
+    raise ERRORS[job.name]
 
 
-def test_errors_that_cannot_be_sent_or_say_nothing(tmp_path):
-    with engine(2) as here:
-        failures = {
-            job.name: failure for job, failure, _ in here.run(fail, [Busy("odd", tmp_path), Busy("silent", tmp_path)])
-        }
-    assert failures == {"odd": "with a lock", "silent": "ValueError"}
+@pytest.mark.parametrize("workers", [1, 2])
+def test_errors_that_cannot_be_sent_or_told_and_jobs_that_leave(workers, tmp_path):
+    with engine(workers) as here:
+        failures = {job.name: failure for job, failure, _ in here.run(fail, [Busy(name, tmp_path) for name in ERRORS])}
+    assert failures == {
+        "odd": "with a lock",
+        "silent": "ValueError",
+        "unspeakable": "UnspeakableError",
+        "leaving": "left with sys.exit('enough')",
+        "leaving quietly": "left with sys.exit(None)",
+    }
 
 
 @needs_proc
