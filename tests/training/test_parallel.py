@@ -157,7 +157,7 @@ def test_workers_do_not_outlive_their_parent(how, tmp_path):
     try:
         until(lambda: all(job.processes for job in jobs))
         os.killpg(parent.pid, how) if how == signal.SIGINT else parent.send_signal(how)  # Ctrl-C reaches all of them
-        _, said = parent.communicate(timeout=60)
+        _, said = parent.communicate(timeout=120)
     finally:
         parent.kill()
     workers = [number for job in jobs for number in job.processes]
