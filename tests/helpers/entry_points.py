@@ -9,7 +9,7 @@ import gymnasium as gym
 import meanings as means
 import numpy as np
 from bad_values import array_value, mapping_value, scalar_value
-from conftest import random_artifact
+from random_artifacts import random_artifact
 
 import observers
 from kkl_gym import (

@@ -5,7 +5,7 @@ import dataclasses
 import gymnasium as gym
 import numpy as np
 import pytest
-from conftest import random_artifact
+from random_artifacts import random_artifact
 
 from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
 from observers import Artifact, ArtifactError, KKLObserver, Limits, Monitor

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from conftest import random_artifact
 from linear_system import Autonomous, C, F, Oscillator, TwoOutputs, exact_observer
+from random_artifacts import random_artifact
 from scipy.linalg import expm
 
 import training

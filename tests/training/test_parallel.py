@@ -133,6 +133,7 @@ def test_an_interruption_ends_the_workers_and_nobody_else(tmp_path):
 
 
 PARENT = """
+import signal
 import sys
 from pathlib import Path
 
@@ -140,6 +141,7 @@ from busy_jobs import Busy, work
 from training.parallel import engine
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs of a shell ignore it
     with engine(2) as here:
         list(here.run(work, [Busy(name, Path(sys.argv[1]), 600.0) for name in "ab"]))
 """

@@ -9,8 +9,8 @@ from pathlib import Path
 import linear_system
 import numpy as np
 import pytest
-from conftest import random_artifact
 from linear_system import C, F, Oscillator, sylvester
+from random_artifacts import random_artifact
 from scipy.linalg import solve_continuous_lyapunov, solve_discrete_lyapunov, solve_sylvester
 
 import observers

@@ -6,9 +6,9 @@ import re
 import numpy as np
 import pytest
 import torch
-from conftest import random_artifact
 from kinked_systems import SYSTEMS as KINKED
 from linear_system import C, F, Oscillator, sylvester
+from random_artifacts import random_artifact
 from wrong_systems import Branching, Flat, Late
 
 from kkl_gym import EquationError, get_system
