@@ -8,6 +8,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from observers.storage import replacing
 from training.agents.agent import Agent, AgentError
 
 
@@ -41,8 +42,8 @@ class Export:
         from training.agents.sb3_files import to_sb3
 
         model = to_sb3(Agent.read(find(self.agent)), system=self.system)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        model.save(self.out)
+        with replacing(self.out) as path:
+            model.save(path)
         console.print(f"wrote {self.out}: {type(model).__name__}.load reads it")
 
 

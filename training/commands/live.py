@@ -222,7 +222,8 @@ class Live:
         figure.text(0.02, 0.05, KEYS, size="small", color="0.4")
 
     def _set_noise(self, level: float) -> None:
-        self.sensor.level = self.env.observer.measurement_noise = float(level)
+        observer = self.env.observer  # whose map may be told less noise of some outputs than of others
+        self.sensor.level = observer.measurement_noise = observer.artifact.inverse.within(float(level))
 
     def _set_input(self, share: float) -> None:
         self._action[:1] = share

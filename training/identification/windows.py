@@ -28,9 +28,7 @@ LEAST_USED = 0.8  # share of the windows that the model must explain at a new le
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
-LEFT = (
-    1.0  # standard errors that a fit may be from where its squares are least, and from what another beginning leads to
-)
+LEFT = 1.0  # standard errors that a fit may be from its least squares, and from a fit that began elsewhere
 MOST_SAMPLES = 6400  # of a window
 
 Starts = dict[tuple[int, int], np.ndarray]

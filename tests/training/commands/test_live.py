@@ -48,6 +48,13 @@ def test_frames_follow_the_motion():
     assert len(live.history) == 1201  # twelve seconds
 
 
+def test_noise_ends_where_the_map_knows_no_more():
+    """A slider is for all outputs, of which a map may be told less noise than of others."""
+    live, _ = live_of("van_der_pol")
+    live._set_noise(5.0)
+    assert live.env.observer.measurement_noise == live.sensor.level == 1.0
+
+
 def test_keys_and_sliders():
     live, _ = live_of("van_der_pol")
     live.advance(600)
