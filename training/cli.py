@@ -35,6 +35,7 @@ COMMANDS = {
     "export": ("export", "ExportCommand"),
     "demo": ("demo", "Demo"),
     "speed": ("speed", "Speed"),
+    "sizes": ("sizes", "Sizes"),
 }
 
 
@@ -44,6 +45,7 @@ AFTER_INTERRUPTION = {
     ("identify",): "--resume goes on from the last checkpoint",
     ("adapt",): "--resume goes on from the last checkpoint",
     ("benchmark",): "the same command goes on",
+    ("sizes",): "the same command goes on",
     ("agent", "train"): "--resume goes on from the last checkpoint",
     ("agent", "compare"): "the same command goes on",
 }

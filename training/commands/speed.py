@@ -19,7 +19,7 @@ from observers import Artifact, KKLObserver
 from observers import shipped as shipped_maps
 from observers.artifact import resolve
 from training.commands.options import OneObserver, OneSystem, Shown, shown
-from training.commands.speed_observers import limit, observer_tasks, table_rows
+from training.commands.speed_observers import in_turns, limit, observer_tasks, table_rows
 from training.presets import SMALL
 from training.progress import ProgressBars, progress_bars
 
@@ -184,14 +184,7 @@ class Speed:
     def _in_turns(
         self, tasks: Mapping[str, Callable[[], float]], report: Callable[[int], object] = lambda done: None
     ) -> dict[str, list[float]]:
-        seconds: dict[str, list[float]] = {name: [] for name in tasks}
-        for turn in range(self.turns + 1):
-            for i, (name, task) in enumerate(tasks.items(), 1):
-                elapsed = task()
-                if turn:  # the first one warms up
-                    seconds[name].append(elapsed)
-                report(turn * len(tasks) + i)
-        return seconds
+        return in_turns(tasks, self.turns, report)
 
 
 class Still(gym.Env[np.ndarray, np.ndarray]):

@@ -1,8 +1,8 @@
 """How fast observers step by themselves: against Kalman filters, and against the matrix products in their networks."""
 
 import time
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,38 @@ from training.kalman import ExtendedKalmanFilter, measurement_covariance, proces
 from training.trajectories.derivatives import jacobian
 
 BATCHES = 10  # of one step each, by filters that take one sample at a time
+
+
+Name = TypeVar("Name", bound=Hashable)
+
+
+def in_turns(
+    tasks: Mapping[Name, Callable[[], float]], turns: int, report: Callable[[int], object] = lambda done: None
+) -> dict[Name, list[float]]:
+    """Let tasks take turns, because a shared machine's speed drifts.
+
+    Parameters
+    ----------
+    tasks : mapping of name to callable
+        Each gives the seconds that it took.
+    turns : int
+        How many there are, after one that warms up and does not count.
+    report : callable, optional
+        Told how many tasks are done.
+
+    Returns
+    -------
+    dict of name to list of float
+        Seconds in each turn.
+    """
+    seconds: dict[Name, list[float]] = {name: [] for name in tasks}
+    for turn in range(turns + 1):
+        for i, (name, task) in enumerate(tasks.items(), 1):
+            elapsed = task()
+            if turn:
+                seconds[name].append(elapsed)
+            report(turn * len(tasks) + i)
+    return seconds
 
 
 def observer_tasks(
