@@ -28,7 +28,8 @@ LEAST_USED = 0.8  # share of the windows that the model must explain at a new le
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
-LEFT = 1.0  # standard errors that a fit may be from its least squares, and from a fit that began elsewhere
+LEFT = 0.2  # standard errors that a fit may be from its least squares: where it is stuck, curvature says too little
+APART = 0.5  # standard errors that it may be from a fit that began elsewhere
 MOST_SAMPLES = 6400  # of a window
 
 Starts = dict[tuple[int, int], np.ndarray]
@@ -52,7 +53,7 @@ def fit_windows(
     explain most of them, but for noise, from one of the guesses. Chaos and process noise set an end to their
     growth, which no start explains for long: residuals are no longer white then, and standard errors that follow the
     scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
-    standard error of the shorter ones away, and count only if both fits end in one place.
+    standard error of the shorter ones away, and count only if both fits come to rest, and in one place.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ def fit_windows(
             break
         now = fit.errors(told, told)
         other = _longer_fit(shooting, theta - aside, records, starts, length)
-        if (_apart(fit, other, told) > LEFT * now).any():
+        if other.left > LEFT or (_apart(fit, other, told) > APART * now).any():
             break  # so long windows have many minima, and their curvature says nothing of where the others are
         report(described(fit, length))
         gain = now / before
