@@ -28,7 +28,8 @@ LEAST_USED = 0.8  # share of the windows that the model must explain at a new le
 GAIN = 0.7  # standard errors at twice the length, over those before, from which on longer windows are not worth it
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
-LEFT = 0.2  # standard errors that a fit may be from its least squares: where it is stuck, curvature says too little
+FIRST_LEFT = 1.0  # standard errors that a first fit may be from its least squares, and still be on the right way
+LEFT = 0.4  # the same of longer windows: where a fit is stuck, curvature promises more than it knows
 APART = 0.5  # standard errors that it may be from a fit that began elsewhere
 MOST_SAMPLES = 6400  # of a window
 
@@ -160,7 +161,7 @@ def _first_fit(
                 problem = error
                 continue
             fits.append(fit)
-            if fit.used.mean() >= LEAST_USED and fit.left <= LEFT and (fit.noise <= expected).all():
+            if fit.used.mean() >= LEAST_USED and fit.left <= FIRST_LEFT and (fit.noise <= expected).all():
                 return fit, starts, length
         if last and fits:
             return min(fits, key=lambda fit: fit.cost), starts, length
