@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from kkl_gym import SYSTEMS
-from observers.storage import replacing, write
+from observers.storage import write
 from training import markdown
 from training.commands.options import (
     NoiseLevel,
@@ -22,6 +22,7 @@ from training.commands.options import (
     read_policy,
 )
 from training.evaluation.levels import beyond, level_for
+from training.figures import TRUTH, drawing
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def report(out: Path) -> Table:
     for observer, group in duffing.groupby("observer", sort=False):
         lines += ["", f"{observer} by amplitude of the output, noticed in time:", "", *_by_amplitude(group)]
     write(out / "table.md", "\n".join(lines) + "\n")
-    _draw(out / "roc.png", found)
+    draw(out / "roc.png", found)
     return shown
 
 
@@ -161,27 +162,32 @@ def _by_amplitude(duffing: "pd.DataFrame") -> list[str]:
     return markdown.table(["fault", *names], rows)
 
 
-def _draw(path: Path, found: "pd.DataFrame") -> None:
-    from matplotlib.figure import Figure
+def draw(path: Path, found: "pd.DataFrame") -> None:
+    """Draw how many faults are noticed in time against false alarms, as the threshold of the score varies.
 
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    found : DataFrame
+        The rows of faults.csv.
+    """
     from training.evaluation.faults import FAULTS
 
     observers = list(found.observer.unique())
-    figure = Figure(figsize=(3.3 * len(observers), 3.4), layout="constrained")
-    axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
-    for ax, observer in zip(axes, observers, strict=True):
-        group = found[found.observer == observer]
-        sound = np.sort(group[group.fault == "none"].score)
-        thresholds = np.concatenate([sound, [np.inf]])
-        false = [(sound > threshold).mean() for threshold in thresholds]
-        for fault in FAULTS[1:]:
-            scores = group[group.fault == fault].score.to_numpy()
-            ax.plot(false, [(scores > threshold).mean() for threshold in thresholds], label=fault)
-            at_one = (sound > 1).mean(), (scores > 1).mean()
-            ax.plot(*at_one, "ko", markersize=4, label="score 1" if fault == FAULTS[-1] else None)
-        title = f"{Path(observer).stem.replace('_', ' ')}, {group.deadline.iloc[0]:g} s"
-        ax.set(title=title, xlabel="false alarms, share of trajectories", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    axes[0].set_ylabel("faults noticed in time")
-    axes[-1].legend(loc="lower right")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 2.5 * len(observers), 3.0) as figure:
+        axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
+        for ax, observer in zip(axes, observers, strict=True):
+            group = found[found.observer == observer]
+            sound = np.sort(group[group.fault == "none"].score)
+            thresholds = np.concatenate([sound, [np.inf]])
+            false = [(sound > threshold).mean() for threshold in thresholds]
+            for fault in FAULTS[1:]:
+                scores = group[group.fault == fault].score.to_numpy()
+                ax.plot(false, [(scores > threshold).mean() for threshold in thresholds], label=fault)
+                at_one = (sound > 1).mean(), (scores > 1).mean()
+                ax.plot(*at_one, "o", color=TRUTH, label="score 1" if fault == FAULTS[-1] else None)
+            title = f"{Path(observer).stem.replace('_', ' ')}, {group.deadline.iloc[0]:g} s"
+            ax.set(title=title, xlabel="false alarms, share of trajectories", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
+        axes[0].set_ylabel("faults noticed in time")
+        axes[-1].legend(loc="lower right")
