@@ -9,6 +9,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+import numpy as np
+
 from kkl_gym.rendering import ESTIMATE, TARGET
 from observers.storage import replacing
 
@@ -44,6 +46,7 @@ ALIKE: dict[str, Any] = {
     "savefig.facecolor": "auto",
 }
 COLOURS = 32  # of a moving picture
+NEAR = 16  # of 255, below which a colour could be taken for the ground
 
 _around: ContextVar[Theme] = ContextVar("theme", default="light")
 
@@ -127,7 +130,7 @@ def save(path: Path, figure: "Figure") -> None:
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
     """Write a moving picture that repeats itself, whole or not at all.
 
-    All frames have the colours of the first: what stays the same then costs nothing.
+    All frames have the same few colours, those of the first, the middle and the last: what does not move costs nothing.
 
     Parameters
     ----------
@@ -138,10 +141,14 @@ def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> Non
     seconds : float
         That it lasts.
     """
-    from PIL.Image import Dither
+    from PIL import Image
 
-    first = frames[0].quantize(COLOURS, dither=Dither.NONE)
-    others = [frame.quantize(palette=first, dither=Dither.NONE) for frame in frames[1:]]
+    some = np.concatenate([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
+    few = Image.fromarray(some).quantize(COLOURS, kmeans=1)
+    colours = np.array(few.getpalette()).reshape(-1, 3)
+    colours[np.abs(colours - some[0, 0]).max(axis=1) < NEAR] = some[0, 0]  # the ground as it is, and nothing like it
+    few.putpalette(colours.ravel().tolist())
+    first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
     duration = round(1000 * seconds / len(frames))
     with replacing(path) as temporary:
         first.save(temporary, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
