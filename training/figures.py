@@ -130,7 +130,8 @@ def save(path: Path, figure: "Figure") -> None:
 def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
     """Write a moving picture that repeats itself, whole or not at all.
 
-    All frames have the same few colours, those of the first, the middle and the last: what does not move costs nothing.
+    All frames have the same few colours, for which the first, the middle and the last are looked at: what does not move
+    then costs nothing. Those of the style stay as they are, and so does the ground.
 
     Parameters
     ----------
@@ -141,13 +142,15 @@ def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> Non
     seconds : float
         That it lasts.
     """
+    from matplotlib.colors import to_rgb
     from PIL import Image
 
     some = np.concatenate([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
-    few = Image.fromarray(some).quantize(COLOURS, kmeans=1)
-    colours = np.array(few.getpalette()).reshape(-1, 3)
-    colours[np.abs(colours - some[0, 0]).max(axis=1) < NEAR] = some[0, 0]  # the ground as it is, and nothing like it
-    few.putpalette(colours.ravel().tolist())
+    ground, own = some[0, 0].astype(int), 255 * np.array([to_rgb(colour) for colour in CYCLES[_around.get()]])
+    few = Image.fromarray(some).quantize(COLOURS - len(own), kmeans=1)
+    colours = np.array(few.getpalette()).reshape(-1, 3)[: COLOURS - len(own)]
+    colours[np.abs(colours - ground).max(axis=1) < NEAR] = ground  # and nothing that is nearly like it
+    few.putpalette([*colours.ravel().tolist(), *own.round().astype(int).ravel().tolist()])
     first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
     duration = round(1000 * seconds / len(frames))
     with replacing(path) as temporary:
