@@ -620,7 +620,7 @@ def test_committed_results_give_the_committed_table_and_figure(name, tmp_path):
                 assert image.get_array()[i, j] == pytest.approx(expected[0], rel=0.01, abs=0.001)
     words = {text.get_text() for text in figure.findobj(Text)}
     assert {"What it is", "SMAPE in %, all steps"} <= words
-    assert colorbar.get_ylabel() == "SMAPE in %, all steps"
+    assert colorbar.get_xlabel() == "SMAPE in %, all steps"
 
 
 def test_drawing_leaves_the_users_matplotlib_alone(monkeypatch):
