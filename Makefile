@@ -6,8 +6,8 @@ BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 CLOSED := reverse_duffing van_der_pol
 
-.PHONY: demo install test test-slow test-long test-browser lint format maps results benchmark ablation certificates agents \
-	environments speed sizes clients docs clean help
+.PHONY: demo install test test-slow test-long test-browser lint format maps results figures benchmark ablation \
+	certificates agents environments speed sizes clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
 	$(BIN)/kkl-gym demo
@@ -50,26 +50,28 @@ maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; 
 	for system in $(SYSTEMS); do $(BIN)/kkl-gym train $$system --config training/version1.json --threads 2 \
 		--out runs/$$system-v1 --resume || exit 1; done
 
-results: $(VENV)/ready  ## the figures and the accuracy in the README and in docs/
-	$(BIN)/kkl-gym demo --out docs/figures
-	$(BIN)/kkl-gym demo --gif --seed 7 --duration 12 --out runs/portraits
-	cp runs/portraits/estimates.gif docs/figures/portraits.gif
-	for system in $(SYSTEMS); do \
-		$(BIN)/kkl-gym demo $$system --gif --seed 7 --duration 12 --out runs/portraits || exit 1; \
-		cp runs/portraits/estimates-$$system.gif docs/figures/$$system.gif || exit 1; done
-	$(BIN)/kkl-gym agent evaluate van_der_pol --out docs/figures
+results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
 		--csv docs/results/accuracy.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system $$system-spinn --noise 0.05 0.1 0.2 1 \
+		--csv docs/results/noise_levels/$$system.csv || exit 1; done
 	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system --calibration --ekf \
-		--csv docs/results/error_bars/$$system.csv || exit 1; done
+		--csv runs/error_bars/$$system.csv || exit 1; done
+	mkdir -p docs/results/error_bars
+	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
+	$(MAKE) figures
+
+figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, a minute
+	$(BIN)/python docs/figures/draw.py
 
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
 	$(BIN)/kkl-gym benchmark
 	mkdir -p docs/results/benchmark
-	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md heatmap.png) docs/results/benchmark
+	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md) docs/results/benchmark
+	$(MAKE) figures
 
 SPINN := $(addprefix ablation-spinn-,soap spectrum motions scaling solved transients adaptive lipschitz)
 ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-modes ablation-soap ablation-free \
@@ -78,25 +80,34 @@ ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-
 ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
 	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
 	mkdir -p docs/results/ablation
-	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md heatmap.png) docs/results/ablation
+	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
+	$(MAKE) figures
 
-certificates: $(VENV)/ready  ## the figures in docs/background/certificates.md
-	$(BIN)/kkl-gym certify $(SYSTEMS) $(SYSTEMS:%=%-spinn) --out docs/results/certificates
-	$(BIN)/kkl-gym faults --out docs/results/faults
+CERTIFIED := $(SYSTEMS) $(SYSTEMS:%=%-spinn)
+
+certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
+	$(BIN)/kkl-gym certify $(CERTIFIED)
+	$(BIN)/kkl-gym faults
+	mkdir -p docs/results/certificates docs/results/faults
+	cp runs/certificates/table.md $(CERTIFIED:%=runs/certificates/%.json) docs/results/certificates
+	cp $(addprefix runs/faults/,faults.csv table.md) docs/results/faults
+	$(MAKE) figures
 
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	mkdir -p docs/results/agents training/agents/shipped
-	cp $(addprefix runs/agents/comparison/,results.csv table.md scores.png) docs/results/agents
+	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
+	$(MAKE) figures
 
 HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0
 
 environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
 	mkdir -p docs/results/environments
-	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md scores.png curves.png) docs/results/environments
+	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
+	$(MAKE) figures
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
 	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed

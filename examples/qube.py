@@ -33,7 +33,8 @@ from scipy.signal import savgol_filter
 import kkl_gym
 from kkl_gym.elementary import cos, sin, tanh
 from observers import Artifact
-from observers.storage import replacing, write
+from observers.storage import write
+from training.figures import ALARM, ESTIMATE, RIVAL, TARGET, TRUTH, drawing
 from training.identification.shooting import Shooting, shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
@@ -77,6 +78,7 @@ GUESSES = {
     "pendulum_damping": 1e-5,
     "pendulum_friction": 4e-5,
 }
+LOOKS = ("--", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)  # of estimators in the figure
 WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
 
 
@@ -281,28 +283,24 @@ def draw(
     path: Path, estimators: Mapping[str, Sequence[np.ndarray]], records: Sequence[Record], titles: Sequence[str]
 ) -> None:
     """Draw the first seconds of the runs, each in a column, recorded and as estimated."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(4.2 * len(records), 9), layout="constrained")
-    axes = figure.subplots(len(SIGNALS.hidden), len(records), squeeze=False, sharex=True)
-    shown = slice(0, round(5.0 / DT))
-    for column, (record, title) in enumerate(zip(records, titles, strict=True)):
-        t = record.t[shown] - record.t[0]
-        axes[0, column].set_title(title)
-        axes[-1, column].set_xlabel("t in s")
-        for i, name in enumerate(SIGNALS.hidden):
-            ax = axes[i, column]
-            ax.plot(t, record.x[shown, i], "k", lw=1.5, label="recorded")
-            for (label, x_hat), style in zip(estimators.items(), ("m--", "c-", "g-", "y:"), strict=False):
-                if not np.isnan(x_hat[column][:, i]).any():
-                    ax.plot(t, x_hat[column][shown, i], style, lw=1.0, label=label)
-            margin = 0.2 * np.ptp(record.x[:, i])
-            ax.set_ylim(record.x[:, i].min() - margin, record.x[:, i].max() + margin)
-            if column == 0:
-                ax.set_ylabel(name)
-    axes[-1, 0].legend(loc="upper right", fontsize="small")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 2.6 * len(records), 9) as figure:
+        axes = figure.subplots(len(SIGNALS.hidden), len(records), squeeze=False, sharex=True)
+        shown = slice(0, round(5.0 / DT))
+        for column, (record, title) in enumerate(zip(records, titles, strict=True)):
+            t = record.t[shown] - record.t[0]
+            axes[0, column].set_title(title)
+            axes[-1, column].set_xlabel("t in s")
+            for i, name in enumerate(SIGNALS.hidden):
+                ax = axes[i, column]
+                ax.plot(t, record.x[shown, i], color=TRUTH, lw=1.8, label="recorded")
+                for (label, x_hat), look in zip(estimators.items(), LOOKS, strict=False):
+                    if not np.isnan(x_hat[column][:, i]).any():
+                        ax.plot(t, x_hat[column][shown, i], ls=look[0], color=look[1], lw=1.0, label=label)
+                margin = 0.2 * np.ptp(record.x[:, i])
+                ax.set_ylim(record.x[:, i].min() - margin, record.x[:, i].max() + margin)
+                if column == 0:
+                    ax.set_ylabel(name)
+        axes[-1, 0].legend(loc="upper right")
 
 
 if __name__ == "__main__":

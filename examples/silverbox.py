@@ -18,7 +18,7 @@ from rich.table import Table
 
 import kkl_gym
 from kkl_gym.simulate import advance
-from observers.storage import replacing
+from training.figures import ALARM, RIVAL, drawing
 from training.identification import estimate_parameters
 from training.identification.shooting import Shooting, settled
 from training.identification.windows import windows
@@ -155,17 +155,13 @@ def main(
 
 def draw(path: Path, tests: dict[str, Record], residuals: dict[str, Any]) -> None:
     """Draw measured outputs, and what simulated ones leave of them."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 5), layout="constrained")
-    axes = figure.subplots(2, len(tests), sharex="col", sharey="row")
-    for (above, below), (name, record) in zip(axes.T, tests.items(), strict=True):
-        above.plot(record.t, record.y, lw=0.3)
-        below.plot(record.t[FREE:], residuals[name][FREE:], lw=0.3, color="C3")
-        above.set(title=name, ylabel="V2 in V")
-        below.set(xlabel="t in s", ylabel="V2 - simulated V2 in mV")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 10, 5) as figure:
+        axes = figure.subplots(2, len(tests), sharex="col", sharey="row")
+        for (above, below), (name, record) in zip(axes.T, tests.items(), strict=True):
+            above.plot(record.t, record.y, color=RIVAL, lw=0.3)
+            below.plot(record.t[FREE:], residuals[name][FREE:], color=ALARM, lw=0.3)
+            above.set(title=name, ylabel="V2 in V")
+            below.set(xlabel="t in s", ylabel="V2 - simulated V2 in mV")
 
 
 if __name__ == "__main__":

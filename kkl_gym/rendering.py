@@ -10,7 +10,7 @@ import numpy as np
 from kkl_gym.system import Box, System
 from observers.checks import shown
 
-STATE, ESTIMATE, TARGET = "0.2", "C3", "C2"
+ESTIMATE, TARGET = "C3", "C2"  # of matplotlib's cycle; states are drawn as text is
 TRAIL = 1000  # samples that a phase portrait shows
 FRAMES = 100  # a second at most, about what players and screens keep up with
 DRAWN = 50  # frames a second at most that a window is drawn, whose time is that of the motion
@@ -109,12 +109,13 @@ class Canvas:
 
     def __init__(self, system: System, estimates: bool = False, box: Box | None = None) -> None:
         try:
+            from matplotlib import rcParams
             from matplotlib.backends.backend_agg import FigureCanvasAgg
             from matplotlib.figure import Figure
         except ImportError as error:
             raise ImportError('rendering needs matplotlib: pip install "kkl-gym[plots]"') from error
         self.estimates = estimates
-        self._states = list(system.portrait)
+        self._states, ink = list(system.portrait), rcParams["text.color"]
         self._nx, self._u_max = system.nx, np.array(system.u_max)
         figure = Figure(figsize=(4.8, 4.8), dpi=100, layout="constrained")
         self._canvas: Any = FigureCanvasAgg(figure)
@@ -126,9 +127,9 @@ class Canvas:
         ax.set(xlim=(left - wide, right + wide), ylim=(bottom - tall, top + tall), xlabel=names[0], ylabel=names[1])
         ax.set_title(system.name.replace("_", " "))
         (target,) = ax.plot(*(system.target[i] for i in self._states), "+", color=TARGET, markersize=12, label="target")
-        (trail,) = ax.plot([], [], color=STATE, lw=1.0, animated=True)
+        (trail,) = ax.plot([], [], color=ink, lw=1.0, animated=True)
         (guesses,) = ax.plot([], [], color=ESTIMATE, lw=0.7, alpha=0.7, animated=True)
-        (state,) = ax.plot([], [], "o", color=STATE, label="state", animated=True)
+        (state,) = ax.plot([], [], "o", color=ink, label="state", animated=True)
         (guess,) = ax.plot([], [], "o", color=ESTIMATE, markersize=4, label="estimate", animated=True)
         self._lines = ((trail, state), (guesses, guess))
         ax.legend(handles=[target, state, guess] if estimates else [target, state], loc="upper right")

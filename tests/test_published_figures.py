@@ -85,3 +85,19 @@ def test_the_page_on_error_bars(title, observer, starts, driven, span):
         assert len(shares) == 6
         cells.append(f"{shares.min():.1f} to {shares.max():.1f}")
     assert f"| {title} | {' | '.join(cells)} |" in (RESULTS / "error_bars.md").read_text()
+
+
+def test_the_page_on_accuracy_says_what_noise_does():
+    files = [RESULTS / "accuracy.csv", *(RESULTS / "noise_levels" / f"{system}.csv" for system in SYSTEMS)]
+    found = pd.concat(map(pd.read_csv, files))
+    found = found[(found.starts == "X") & ~found.driven & found.observer.isin(SYSTEMS)]
+    medians = found.groupby(["measurement_noise", "observer"]).smape.median()
+    growth = medians[1.0] / medians[0.1]
+    page = (RESULTS / "accuracy.md").read_text()
+    assert f"the errors of the default maps {growth.min():.1f} to {growth.max():.1f} times as large" in page
+    rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
+    tuned = rivals[(rivals.starts == "X") & (rivals.noise == 0.5)].groupby(["method", "system"]).smape.median()
+    behind = {
+        (name, system) for name in ("ekf", "ukf") for system in SYSTEMS if tuned[name][system] > medians[0.5][system]
+    }
+    assert behind == {("ekf", "reverse_duffing")}, "which the page says"

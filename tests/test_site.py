@@ -57,6 +57,20 @@ def test_links_lead_to_the_same_place_in_the_site(source, page, link, becomes):
     )
 
 
+def test_pictures_are_light_and_dark_where_both_are_there(tmp_path):
+    themed = runpy.run_path(str(DOCS / "site" / "hooks.py"))["themed"]
+    (tmp_path / "figures").mkdir()
+    for name in ("a.png", "a-dark.png", "b.png"):
+        (tmp_path / "figures" / name).touch()
+    (tmp_path / "guides").mkdir()
+    a, b, code = "![An a](../figures/a.png)", "![A b](../figures/b.png)", "`![An a](../figures/a.png)`"
+    twice = (
+        "![An a](../figures/a.png#only-light){ loading=lazy }![An a](../figures/a-dark.png#only-dark){ loading=lazy }"
+    )
+    text = "One {}\n\n{}\n\n{}, [a link](../figures/a.png)\n\n```md\n![An a](../figures/a.png)\n```\n"
+    assert themed(text.format(a, b, code), tmp_path / "guides") == text.format(twice, b, code)
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(DOCS / "site" / "mkdocs.yml")]

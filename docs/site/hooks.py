@@ -1,9 +1,9 @@
-"""What the site does beyond mkdocs: pages for files of the root, and links that lead out of ``docs/``."""
+"""What the site does beyond mkdocs: pages for files of the root, links that lead out of ``docs/``, pictures on dark."""
 
 import posixpath
 import re
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import get_plugin_logger
@@ -17,6 +17,8 @@ SHOWN: Mapping[str, str] = {"CONTRIBUTING.md": "development/contributing.md", "C
 ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # of Sphinx, in docstrings
 # Code of both kinds, in which nothing is a link; then the target of a link or an image.
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
+# The same code, then an image and where it lies.
+IMAGE = re.compile(r"^```.*?^```|`[^`\n]*`|(!\[[^\]]*\])\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
 
 log = get_plugin_logger(__name__)
 
@@ -32,7 +34,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     """Turn links that GitHub follows into links that hold in the site as well."""
     at = page.file.src_uri
     sources = {shown: source for source, shown in SHOWN.items()}
-    return relinked(markdown, sources.get(at, f"docs/{at}"), at, repository=(config.repo_url or "").rstrip("/"))
+    links = relinked(markdown, sources.get(at, f"docs/{at}"), at, repository=(config.repo_url or "").rstrip("/"))
+    return themed(links, ROOT / "docs" / posixpath.dirname(at))
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
@@ -75,3 +78,33 @@ def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:
         return f"]({repository}/{kind}/{BRANCH}/{target}{mark}{anchor})"
 
     return LINK.sub(rewrite, markdown)
+
+
+def themed(markdown: str, folder: Path) -> str:
+    """Show a picture twice where there is a dark one beside it, of which readers see the one that suits the ground.
+
+    Parameters
+    ----------
+    markdown : str
+        The page.
+    folder : Path
+        From where it names pictures.
+
+    Returns
+    -------
+    str
+        The page, in which ``NAME.png`` is followed by ``NAME-dark.png`` if there is one. The one that is not shown is
+        not loaded.
+    """
+
+    def twice(found: re.Match[str]) -> str:
+        alt, name = found.groups()
+        if name is None:
+            return found[0]
+        dark = str(PurePosixPath(name).with_stem(f"{PurePosixPath(name).stem}-dark"))
+        if not (folder / dark).exists():
+            return found[0]
+        shown = ((name, "only-light"), (dark, "only-dark"))
+        return "".join(f"{alt}({target}#{ground}){{ loading=lazy }}" for target, ground in shown)
+
+    return IMAGE.sub(twice, markdown)

@@ -2,13 +2,19 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
 
+from training.figures import MEASURED, RIVAL, drawing
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+Cell = Mapping[str, Any]
+COLUMNS = 3  # of panels in a figure
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
@@ -71,7 +77,32 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
     return found, float(ends.low), float(ends.high)
 
 
-def draw_panel(ax: "Axes", cells: Sequence[Mapping[str, Any] | None], labels: Sequence[str], title: str) -> None:
+def draw_scores(path: Path, panels: Mapping[str, Sequence[Cell | None]], labels: Sequence[str], title: str) -> None:
+    """Draw the normalised scores of several tasks.
+
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    panels : mapping of str to sequence of mapping or None
+        For each task what :func:`draw_panel` takes.
+    labels : sequence of str
+        What is told apart, in the same order.
+    title : str
+        Of the figure.
+    """
+    columns = min(COLUMNS, max(1, len(panels)))
+    rows = -(-len(panels) // columns)
+    with drawing(path, 2.6 * columns + 1.5, 2.6 * rows + 0.6) as figure:
+        axes = figure.subplots(max(1, rows), columns, sharey=True, squeeze=False).ravel()
+        for ax, (task, cells) in zip(axes, panels.items()):
+            draw_panel(ax, cells, labels, task)
+        for ax in axes[len(panels) :]:
+            ax.set_axis_off()
+        figure.suptitle(title)
+
+
+def draw_panel(ax: "Axes", cells: Sequence[Cell | None], labels: Sequence[str], title: str) -> None:
     """Draw the normalised scores of one task: agents as dots, their means with intervals.
 
     Parameters
@@ -89,9 +120,9 @@ def draw_panel(ax: "Axes", cells: Sequence[Mapping[str, Any] | None], labels: Se
     for place, cell in enumerate(cells):
         if cell is not None:
             found, low, high = cell["interval"]
-            ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color="0.6", markersize=4)
-            ax.plot([low, high], [place, place], color="C0", lw=2)
-            ax.plot(found, place, "o", color="C0")
-    ax.axvline(1.0, color="0.8", lw=0.8)
+            ax.plot(cell["agents"], np.full(len(cell["agents"]), place), ".", color=MEASURED)
+            ax.plot([low, high], [place, place], color=RIVAL, lw=2)
+            ax.plot(found, place, "o", color=RIVAL, markersize=6)
+    ax.axvline(1.0, color=MEASURED, lw=0.8)
     ax.set(title=title, xlabel="normalised score")
     ax.set_yticks(range(len(labels)), labels)

@@ -156,13 +156,38 @@ def report(out: Path) -> str:
     ValueError
         If there are no CSV files.
     """
+    results, methods, note, missing = _read(out)
+    write_table(out / "table.md", results, methods, note=note + missing)
+    draw(out / "heatmap.png", results, methods, note=note)
+    return note + missing
+
+
+def draw_results(out: Path, path: Path) -> None:
+    """Draw the heatmap alone from the CSV files.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the benchmark.
+    path : Path
+        Of the picture.
+
+    Raises
+    ------
+    ValueError
+        If there are no CSV files.
+    """
+    results, methods, note, _ = _read(out)
+    draw(path, results, methods, note=note)
+
+
+def _read(out: Path) -> tuple[pd.DataFrame, pd.DataFrame, str, str]:
+    """Results and methods, what was compared, and which are missing."""
     check_results(out)
     results, methods = (pd.read_csv(out / name) for name in FILES)
     note = f"Budget {methods.budget[0]}, seed {methods.seed[0]}, {methods.trajectories.max()} trajectories a case."
     partial, missing = _missing(methods)
-    write_table(out / "table.md", results, methods, note=note + partial + missing)
-    draw(out / "heatmap.png", results, methods, note=note + partial)
-    return note + partial + missing
+    return results, methods, note + partial, missing
 
 
 def _missing(methods: pd.DataFrame) -> tuple[str, str]:

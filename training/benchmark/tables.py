@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from observers.storage import replacing, write
+from observers.storage import write
 from training.evaluation.levels import read_level, show_level
+from training.figures import save, style
 from training.markdown import table
 from training.systems import PROFILES
 
@@ -234,8 +235,7 @@ def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str)
     note : str
         The figure's title.
     """
-    with replacing(path) as temporary:
-        heatmap(results, methods, note=note).savefig(temporary, dpi=130)
+    save(path, heatmap(results, methods, note=note))
 
 
 def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figure":
@@ -251,7 +251,7 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
     Returns
     -------
     matplotlib.figure.Figure
-        Columns are where trajectories start, rows the levels of measurement noise.
+        Rows are where trajectories start, columns the levels of measurement noise.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -261,33 +261,35 @@ def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figu
     summary = summarise(results, "smape").set_index(["system", "method", "starts", "noise"])
     domains = [domain for domain in DOMAINS if domain in set(results.starts)]
     levels = sorted(set(results.noise), key=_size)
-    size = (2.2 + (0.8 + 0.95 * len(systems)) * len(domains), 1.0 + (0.6 + 0.36 * len(labels)) * len(levels))
-    figure = Figure(figsize=size, layout="constrained")
-    axes: Any = figure.subplots(len(levels), len(domains), squeeze=False, sharex=True, sharey=True)
+    size = (2.4 + 0.9 * len(systems) * len(levels), 1.4 + (0.3 + 0.24 * len(labels)) * len(domains))
     image: Any = None
-    for row, noise in zip(axes, levels, strict=True):
-        for ax, domain in zip(row, domains, strict=True):
-            values = np.full((len(labels), len(systems)), np.nan)
-            for i, name in enumerate(labels):
-                for j, system in enumerate(systems):
-                    key = (system, name, domain, noise)
-                    if key in summary.index:
-                        values[i, j] = summary.loc[key]["median"]
-                        _write_cell(ax, (j, i), values[i, j], summary.loc[key]["half_iqr"])
-            image = ax.imshow(values, cmap="RdYlBu_r", norm=LogNorm(0.1, 200, clip=True), aspect="auto")
-            ax.set_xticks(range(len(systems)), [system.replace("_", "\n") for system in systems], fontsize=7)
-            ax.set_yticks(range(len(labels)), list(labels.values()), fontsize=8)
-            ax.set_title(f"{DOMAINS[domain]}, noise {noise}", fontsize=9)
-            ax.tick_params(length=0)
-    figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", shrink=0.6)
-    figure.suptitle(note, fontsize=9)
+    with style():
+        figure = Figure(figsize=size)
+        axes: Any = figure.subplots(len(domains), len(levels), squeeze=False, sharex=True, sharey=True)
+        for row, domain in zip(axes, domains, strict=True):
+            for ax, noise in zip(row, levels, strict=True):
+                values = np.full((len(labels), len(systems)), np.nan)
+                for i, name in enumerate(labels):
+                    for j, system in enumerate(systems):
+                        key = (system, name, domain, noise)
+                        if key in summary.index:
+                            values[i, j] = summary.loc[key]["median"]
+                            _write_cell(ax, (j, i), values[i, j], summary.loc[key]["half_iqr"])
+                image = ax.imshow(values, cmap="RdYlBu_r", norm=LogNorm(0.1, 200, clip=True), aspect="auto")
+                ax.set_xticks(range(len(systems)), [system.replace("_", "\n") for system in systems], fontsize=8)
+                ax.set_yticks(range(len(labels)), list(labels.values()), fontsize=8)
+                ax.set_title(f"{DOMAINS[domain]}, noise {noise}", fontsize=9)
+                ax.tick_params(length=0)
+                ax.grid(visible=False)
+        figure.colorbar(image, ax=axes, label="SMAPE in %, all steps", location="bottom", aspect=60, pad=0.01)
+        figure.suptitle(note, fontsize=9)
     return figure
 
 
 def _write_cell(ax: Any, at: tuple[int, int], median: float, half_iqr: float) -> None:
     light = 0.5 < median < 80.0
-    text = f"{_short(median)}\n± {_short(half_iqr)}"
-    ax.text(*at, text, ha="center", va="center", fontsize=6.5, color="black" if light else "white")
+    text = f"{_short(median)} ± {_short(half_iqr)}"
+    ax.text(*at, text, ha="center", va="center", fontsize=7.5, color="black" if light else "white")
 
 
 def _labels(methods: pd.DataFrame) -> dict[str, str]:

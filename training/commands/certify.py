@@ -13,10 +13,11 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.storage import replacing, write
+from observers.storage import write
 from training import markdown
 from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for, show_level
+from training.figures import drawing
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
@@ -269,27 +270,24 @@ def draw(
         Where the error is shown.
     """
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
     from training.evaluation.certificates.gains import noise_variance
     from training.evaluation.report import draw_residual
 
     panels = 1 + (artifact.forward is not None)
-    figure = Figure(figsize=(5.5 * panels, 4.4), layout="constrained")
-    axes = figure.subplots(1, panels, squeeze=False)[0]
-    first, second = (i % system.nx for i in system.portrait)
-    shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
-    variance = noise_variance(artifact, motion.z[shown], **noise)
-    x, size = motion.x[shown], np.sqrt(variance)
-    order = size.argsort()
-    points: Any = axes[-1].scatter(
-        x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
-    )
-    figure.colorbar(points, ax=axes[-1], label="predicted rms error")
-    axes[-1].set_title(f"error due to noise {show_level(noise['measurement_noise'])}, along the motion")
-    axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
-    if artifact.forward is not None:
-        draw_residual(axes[0], artifact, system)
-    figure.suptitle(name)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 5 * panels, 4) as figure:
+        axes = figure.subplots(1, panels, squeeze=False)[0]
+        first, second = (i % system.nx for i in system.portrait)
+        shown = np.random.default_rng(0).permutation(len(motion.x))[:SHOWN]
+        variance = noise_variance(artifact, motion.z[shown], **noise)
+        x, size = motion.x[shown], np.sqrt(variance)
+        order = size.argsort()
+        points: Any = axes[-1].scatter(
+            x[order, first], x[order, second], c=size[order], s=3, norm=LogNorm() if size.all() else None
+        )
+        figure.colorbar(points, ax=axes[-1], label="predicted rms error")
+        axes[-1].set_title(f"error due to noise {show_level(noise['measurement_noise'])}, along the motion")
+        axes[-1].set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+        if artifact.forward is not None:
+            draw_residual(axes[0], artifact, system)
+        figure.suptitle(name)

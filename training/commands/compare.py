@@ -11,7 +11,7 @@ from rich.console import Console
 from kkl_gym import get_system
 from observers import Artifact
 from observers.artifact import resolve
-from observers.storage import replacing, write
+from observers.storage import write
 from training import markdown
 from training.agents.any_environment.information import SHOWN
 from training.agents.comparison import (
@@ -24,7 +24,7 @@ from training.agents.comparison import (
     run_case,
 )
 from training.agents.information import observer_of
-from training.agents.statistics import draw_panel, interval, middle, normalised
+from training.agents.statistics import draw_scores, interval, middle, normalised
 from training.agents.tasks import TASKS
 from training.commands.compare_environments import compare_environments
 from training.commands.environment import EnvironmentOptions
@@ -190,19 +190,8 @@ def report(out: Path) -> None:
     out : Path
         Folder of the comparison.
     """
-    import pandas as pd  # which takes half a second that help need not wait for
-
-    results = pd.read_csv(out / "results.csv")
-    results["noise"] = [_plain(level) for level in results.noise]
-    shipped = noise_levels() if set(results.system) & set(TASKS) else {}
-    levels = {name: tuple(map(as_name, at)) for name, at in shipped.items()}
-    for name, group in results.groupby("system", sort=False):
-        if name not in TASKS:
-            levels[str(name)] = tuple(group.noise.unique())
-    plan = set(kinds(levels))
-    missing = plan - set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
-    partial = f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
-    tasks = list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
+    results, partial = _read(out)
+    tasks = _tasks(results)
     lines = [
         "# Agents",
         "",
@@ -229,7 +218,49 @@ def report(out: Path) -> None:
     spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
     write(out / "table.md", "\n".join(lines) + "\n")
-    _draw(out / "scores.png", results, tasks, partial)
+    draw_results(out, out / "scores.png")
+
+
+def draw_results(out: Path, path: Path) -> None:
+    """Draw the scores alone from results.csv.
+
+    Parameters
+    ----------
+    out : Path
+        Folder of the comparison.
+    path : Path
+        Of the figure.
+    """
+    results, partial = _read(out)
+    tasks, shown = _tasks(results), COMPARED[::-1]
+    cells = _cells(results, tasks)
+    panels = {
+        f"{system.replace('_', ' ')}, noise {noise}": [cells.get((system, noise, knows)) for knows in shown]
+        for system, noise in tasks
+    }
+    title = f"What agents know and how well they act.{partial}"
+    draw_scores(path, panels, [LABELS[knows] for knows in shown], title)
+
+
+def _read(out: Path) -> tuple["pd.DataFrame", str]:
+    """The rows of results.csv, and how many agents are missing, as a sentence."""
+    import pandas as pd  # which takes half a second that help need not wait for
+
+    results = pd.read_csv(out / "results.csv")
+    results["noise"] = [_plain(level) for level in results.noise]
+    shipped = noise_levels() if set(results.system) & set(TASKS) else {}
+    levels = {name: tuple(map(as_name, at)) for name, at in shipped.items()}
+    for name, group in results.groupby("system", sort=False):
+        if name not in TASKS:
+            levels[str(name)] = tuple(group.noise.unique())
+    plan = set(kinds(levels))
+    missing = plan - set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
+    return results, f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
+
+
+def _tasks(results: "pd.DataFrame") -> list[tuple[str, str]]:
+    """Systems and noises of results, in their order."""
+    return list(results[["system", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
 
 def _plain(level: float | str) -> str:
@@ -259,18 +290,3 @@ def _cells(results: "pd.DataFrame", tasks: list[tuple[str, str]]) -> dict[tuple[
                     "success": group.success.mean(),
                 }
     return cells
-
-
-def _draw(path: Path, results: "pd.DataFrame", tasks: list[tuple[str, str]], partial: str) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(2.6 * len(tasks) + 1.5, 3.6), layout="constrained")
-    axes = figure.subplots(1, len(tasks), sharey=True, squeeze=False)[0]
-    cells = _cells(results, tasks)
-    for ax, task in zip(axes, tasks, strict=True):
-        shown = [cells.get((*task, knows)) for knows in reversed(COMPARED)]
-        labels = [LABELS[knows] for knows in reversed(COMPARED)]
-        draw_panel(ax, shown, labels, f"{task[0].replace('_', ' ')}, noise {task[1]}")
-    figure.suptitle(f"What agents know and how well they act.{partial}", fontsize="medium")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)

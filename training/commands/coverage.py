@@ -8,10 +8,10 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.storage import replacing
 from training.evaluation.coverage import REGIONS, Coverage, coverage, kalman_coverage
 from training.evaluation.errors import UnseenTrajectories
 from training.evaluation.levels import Level, as_cell, show_level
+from training.figures import TRUTH, drawing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -132,20 +132,18 @@ def draw(path: Path, rows: "pd.DataFrame") -> None:
     rows : DataFrame
         As for :func:`coverage_table`.
     """
-    from matplotlib.figure import Figure
-
     spans = list(rows.span.unique())
-    figure = Figure(figsize=(4.0 * len(spans), 3.4), layout="constrained")
-    axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
-    for ax, span in zip(axes, spans, strict=True):
-        for (who, starts, driven), group in rows[rows.span == span].groupby(
-            ["observer", "starts", "driven"], sort=False
-        ):
-            label = f"{who}, {starts}{', driven' if driven else ''}"
-            ax.plot(group.measurement_noise.astype(str), group["90"], "o-" if who == "KKL" else "s--", label=label)
-        ax.axhline(90, color="k", linewidth=0.8)
-        ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
-    axes[0].set_ylabel("errors in the 90 % region, %")
-    axes[-1].legend(loc="lower right", fontsize="small")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 4.0 * len(spans), 3.4) as figure:
+        axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]
+        cases = list(rows[["starts", "driven"]].drop_duplicates().itertuples(index=False, name=None))
+        for ax, span in zip(axes, spans, strict=True):
+            for (who, starts, driven), group in rows[rows.span == span].groupby(
+                ["observer", "starts", "driven"], sort=False
+            ):
+                label = f"{who}, {starts}{', driven' if driven else ''}"
+                look, color = "o-" if who == "KKL" else "s--", f"C{cases.index((starts, driven))}"
+                ax.plot(group.measurement_noise.astype(str), group["90"], look, color=color, label=label)
+            ax.axhline(90, color=TRUTH, linewidth=0.8)
+            ax.set(title=span, xlabel="measurement noise", ylim=(0, 102))
+        axes[0].set_ylabel("errors in the 90 % region, %")
+        axes[-1].legend(loc="lower right")

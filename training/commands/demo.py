@@ -14,11 +14,11 @@ from rich.table import Table
 import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
-from observers.storage import replacing
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
 from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
+from training.figures import ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
 from training.progress import progress_bars
 
 EVERY = 100  # steps between two reports
@@ -96,7 +96,7 @@ class Demo:
                 moving = path.with_suffix(".gif")
                 with progress.phase("drawing the moving picture"):
                     animate(moving, [episode.motion for episode in episodes])
-                progress.say(f"wrote {moving}: states in black, estimates in red, measured outputs below")
+                progress.say(f"wrote {moving}: states in black, estimates in magenta, measured outputs below")
         return path
 
 
@@ -255,36 +255,34 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
     episodes : sequence of Episode
         What is shown.
     """
-    from matplotlib.figure import Figure
-
     rows = max(episode.x.shape[1] for episode in episodes)
-    figure = Figure(figsize=(4.5 * len(episodes), 2.2 * rows), layout="constrained")
-    axes = figure.subplots(rows, len(episodes), squeeze=False)
-    for column, episode in enumerate(episodes):
-        system, C = episode.env.unwrapped.system, episode.env.observer.artifact.C  # type: ignore[attr-defined]
-        t = np.arange(len(episode.x)) * episode.env.unwrapped.dt  # type: ignore[attr-defined]
-        for i in range(rows):
-            ax: Any = axes[i, column]
-            if i >= system.nx:
-                ax.set_visible(False)
-                continue
-            for measured, row in zip(episode.y.T, [] if C is None else C, strict=False):
-                if np.array_equal(row, np.eye(system.nx)[i]):
-                    ax.plot(t, measured, color="0.75", lw=0.6, label="measured")
-            ax.plot(t, episode.x[:, i], "k", lw=1.2, label="true")
-            ax.plot(t, episode.x_hat[:, i], "m--", lw=1.0, label="observer" if episode.chosen else "default observer")
-            if episode.spinn is not None:
-                ax.plot(t, episode.spinn[:, i], ":", color="tab:blue", lw=1.2, label="SPINN")
-            low, high = episode.x[:, i].min(), episode.x[:, i].max()
-            margin = 0.25 * (high - low) or 1.0
-            ax.set_ylim(low - margin, high + margin)  # the first estimates may be far off
-            ax.set_ylabel(system.state_names[i])
-        axes[0, column].set_title(system.name.replace("_", " "))
-        axes[system.nx - 1, column].set_xlabel("t in s")
-    handles = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, loc="lower left", ncols=len(handles))
-    noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
-    what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
-    figure.suptitle(f"Hidden states estimated from {what} (standard deviation {noise} on every sample)")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, max(6.0, 2.6 * len(episodes)), 1.9 * rows) as figure:
+        axes = figure.subplots(rows, len(episodes), squeeze=False)
+        for column, episode in enumerate(episodes):
+            system, C = episode.env.unwrapped.system, episode.env.observer.artifact.C  # type: ignore[attr-defined]
+            t = np.arange(len(episode.x)) * episode.env.unwrapped.dt  # type: ignore[attr-defined]
+            for i in range(rows):
+                ax: Any = axes[i, column]
+                if i >= system.nx:
+                    ax.set_visible(False)
+                    continue
+                for measured, row in zip(episode.y.T, [] if C is None else C, strict=False):
+                    if np.array_equal(row, np.eye(system.nx)[i]):
+                        ax.plot(t, measured, color=MEASURED, alpha=0.6, lw=0.6, label="measured")
+                ax.plot(t, episode.x[:, i], color=TRUTH, lw=1.8, label="true")
+                label = "observer" if episode.chosen else "default observer"
+                ax.plot(t, episode.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label=label)
+                if episode.spinn is not None:
+                    ax.plot(t, episode.spinn[:, i], ":", color=RIVAL, label="SPINN")
+                low, high = episode.x[:, i].min(), episode.x[:, i].max()
+                margin = 0.25 * (high - low) or 1.0
+                ax.set_ylim(low - margin, high + margin)  # the first estimates may be far off
+                ax.set_ylabel(system.state_names[i])
+            axes[0, column].set_title(system.name.replace("_", " "))
+            axes[system.nx - 1, column].set_xlabel("t in s")
+        lines = [pair for ax in axes.flat for pair in zip(*ax.get_legend_handles_labels(), strict=True)]
+        handles = {label: handle for handle, label in lines}
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
+        noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
+        what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
+        figure.suptitle(f"Hidden states estimated from {what} (standard deviation {noise} on every sample)")

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from kkl_gym import SYSTEMS
-from observers.storage import replacing, write
+from observers.storage import write
 from training import markdown
 from training.commands.options import (
     NoiseLevel,
@@ -22,10 +22,13 @@ from training.commands.options import (
     read_policy,
 )
 from training.evaluation.levels import beyond, level_for
+from training.figures import ALARM, ESTIMATE, MEASURED, RIVAL, TRUTH, drawing
 from training.progress import progress_bars
 
 if TYPE_CHECKING:
     import pandas as pd
+
+LEAST, MOST = 0.5, 100.0  # thresholds that are drawn
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,8 @@ class Faults:
     Half of the trajectories are under random inputs, if the observer knows inputs; all have process noise. From the
     middle of each the sensor is biased by a fifth of the output's range, or dead (y = 0), or frozen at its last value.
     A fault should be noticed within a time that is chosen for each shipped system, and is a fifth of the duration for
-    others. Writes faults.csv, a row for each trajectory and fault, table.md and roc.png, in which the threshold of the
-    score varies.
+    others. Writes faults.csv, a row for each trajectory and fault, table.md and scores.png, in which the threshold of
+    the score varies.
     """
 
     observers: Observers = tuple(SYSTEMS)
@@ -108,12 +111,12 @@ class Faults:
         found = pd.concat(frames, ignore_index=True)
         write(self.out / "faults.csv", found.to_csv(index=False, float_format="%.6g"))
         console.print(report(self.out))
-        console.print(f"wrote faults.csv, table.md and roc.png in {self.out}")
+        console.print(f"wrote faults.csv, table.md and scores.png in {self.out}")
         return found
 
 
 def report(out: Path) -> Table:
-    """Write table.md and roc.png from faults.csv alone.
+    """Write table.md and scores.png from faults.csv alone.
 
     Parameters
     ----------
@@ -144,7 +147,7 @@ def report(out: Path) -> Table:
     for observer, group in duffing.groupby("observer", sort=False):
         lines += ["", f"{observer} by amplitude of the output, noticed in time:", "", *_by_amplitude(group)]
     write(out / "table.md", "\n".join(lines) + "\n")
-    _draw(out / "roc.png", found)
+    draw(out / "scores.png", found)
     return shown
 
 
@@ -161,27 +164,29 @@ def _by_amplitude(duffing: "pd.DataFrame") -> list[str]:
     return markdown.table(["fault", *names], rows)
 
 
-def _draw(path: Path, found: "pd.DataFrame") -> None:
-    from matplotlib.figure import Figure
+def draw(path: Path, found: "pd.DataFrame") -> None:
+    """Draw how many runs exceed a threshold of the score in time, as it varies: sound ones and faulty ones.
 
+    Parameters
+    ----------
+    path : Path
+        Of the figure.
+    found : DataFrame
+        The rows of faults.csv.
+    """
     from training.evaluation.faults import FAULTS
 
     observers = list(found.observer.unique())
-    figure = Figure(figsize=(3.3 * len(observers), 3.4), layout="constrained")
-    axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
-    for ax, observer in zip(axes, observers, strict=True):
-        group = found[found.observer == observer]
-        sound = np.sort(group[group.fault == "none"].score)
-        thresholds = np.concatenate([sound, [np.inf]])
-        false = [(sound > threshold).mean() for threshold in thresholds]
-        for fault in FAULTS[1:]:
-            scores = group[group.fault == fault].score.to_numpy()
-            ax.plot(false, [(scores > threshold).mean() for threshold in thresholds], label=fault)
-            at_one = (sound > 1).mean(), (scores > 1).mean()
-            ax.plot(*at_one, "ko", markersize=4, label="score 1" if fault == FAULTS[-1] else None)
-        title = f"{Path(observer).stem.replace('_', ' ')}, {group.deadline.iloc[0]:g} s"
-        ax.set(title=title, xlabel="false alarms, share of trajectories", xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    axes[0].set_ylabel("faults noticed in time")
-    axes[-1].legend(loc="lower right")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, max(5.0, 2.5 * len(observers)), 3.2) as figure:
+        axes: Any = figure.subplots(1, len(observers), sharey=True, squeeze=False)[0]
+        for ax, observer in zip(axes, observers, strict=True):
+            group = found[found.observer == observer]
+            for fault, color in zip(FAULTS, (MEASURED, RIVAL, ALARM, ESTIMATE), strict=True):
+                scores = np.sort(group[group.fault == fault].score)
+                share = 100 * np.arange(len(scores), 0, -1) / len(scores)
+                ax.step(scores, share, where="pre", color=color, label="sound" if fault == "none" else fault)
+            ax.axvline(1.0, color=TRUTH, lw=0.8, ls="--", label="where it warns")
+            title = f"{Path(observer).stem.replace('_', ' ')}, within {group.deadline.iloc[0]:g} s"
+            ax.set(title=title, xlabel="threshold of the score", xscale="log", xlim=(LEAST, MOST), ylim=(-2, 102))
+        axes[0].set_ylabel("runs above it, %")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=1 + len(FAULTS))

@@ -13,11 +13,11 @@ from observers.artifact import resolve
 from training.commands.options import Shown
 from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
+from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
 SECONDS = 12.0  # that are shown, of a system whose runs last 50
 FRAME = 0.04  # seconds from one to the next
 MOST = 100  # samples of a frame: what a window could not keep up with is not made up for
-TRUTH, GUESS, SAMPLE, ALARM = "0.55", "C6", "C0", "C1"
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
 
 
@@ -147,7 +147,7 @@ class Live:
             dots.set_data(t, y[:, k])
         self._score.set_data(t, np.minimum(score, 2.5))
         sound = not score[-1] > 1
-        self._score.set_color("0.4" if sound else ALARM)
+        self._score.set_color(TRUTH if sound else ALARM)
         self._said.set_text("" if np.isnan(score[-1]) else f"{score[-1]:.2f}" + ("" if sound else ": a fault?"))
         return self.artists
 
@@ -190,7 +190,7 @@ class Live:
         for k, ax in enumerate(axes[:-1]):
             for output, row in enumerate([] if C is None else C):
                 if np.array_equal(row, np.eye(system.nx)[k]):
-                    self._measured.append((output, ax.plot([], [], ".", color=SAMPLE, ms=1.5, animated=True)[0]))
+                    self._measured.append((output, ax.plot([], [], ".", color=MEASURED, ms=1.5, animated=True)[0]))
             self._lanes.append([line for (line,) in _pair(ax, "-")])
             ax.set(ylim=_wider(system.X[k]), ylabel=system.state_names[k])
         last = axes[-1]
@@ -219,7 +219,7 @@ class Live:
             self._input.on_changed(self._set_input)
         self._faults = RadioButtons(figure.add_axes((0.5, 0.1, 0.15, 0.85), frameon=False), FAULTS)
         self._faults.on_clicked(self._set_fault)
-        figure.text(0.02, 0.05, KEYS, size="small", color="0.4")
+        figure.text(0.02, 0.05, KEYS, size="small")
 
     def _set_noise(self, level: float) -> None:
         observer = self.env.observer  # whose map may be told less noise of some outputs than of others
@@ -265,31 +265,32 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
             f"--live needs a window, and matplotlib's backend here is {backend!r}: run it where there is a display, "
             "with tkinter or PyQt installed; MPLBACKEND must not name another backend"
         )
-    figure: Any = plt.figure(figsize=(12, 7.5))
-    live = Live(figure, environment, measurement_noise, seed=seed)
-    before = time.perf_counter()
+    with style():
+        figure: Any = plt.figure(figsize=(12, 7.5), layout="none")
+        live = Live(figure, environment, measurement_noise, seed=seed)
+        before = time.perf_counter()
 
-    def frame(number: int) -> list[Any]:
-        nonlocal before
-        now = time.perf_counter()
-        samples = round((now - before) / live.dt)
-        if not live.paused:
-            live.advance(min(samples, MOST))
-        before += samples * live.dt
-        return live.draw()
+        def frame(number: int) -> list[Any]:
+            nonlocal before
+            now = time.perf_counter()
+            samples = round((now - before) / live.dt)
+            if not live.paused:
+                live.advance(min(samples, MOST))
+            before += samples * live.dt
+            return live.draw()
 
-    manager = figure.canvas.manager
-    if manager is not None and manager.key_press_handler_id is not None:
-        figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # its keys, such as f for the whole screen
-    figure.canvas.mpl_connect("key_press_event", lambda event: live.press(event.key))
-    animation = FuncAnimation(figure, frame, interval=1000 * FRAME, blit=True, cache_frame_data=False)
-    plt.show()
+        manager = figure.canvas.manager
+        if manager is not None and manager.key_press_handler_id is not None:
+            figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # its keys, such as f for the whole screen
+        figure.canvas.mpl_connect("key_press_event", lambda event: live.press(event.key))
+        animation = FuncAnimation(figure, frame, interval=1000 * FRAME, blit=True, cache_frame_data=False)
+        plt.show()
     return animation
 
 
 def _pair(ax: Any, *styles: str) -> list[list[Any]]:
     """Lines for the truth and for the estimate, in each of the styles."""
-    looks = ({"color": TRUTH, "lw": 3.5, "ms": 9.0}, {"color": GUESS, "lw": 1.3, "ms": 5.0})
+    looks = ({"color": TRUTH, "lw": 3.5, "ms": 9.0}, {"color": ESTIMATE, "lw": 1.3, "ms": 5.0})
     return [[ax.plot([], [], style, animated=True, **look)[0] for style in styles] for look in looks]
 
 

@@ -8,14 +8,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from kkl_gym.rendering import ESTIMATE, STATE
 from kkl_gym.system import System
-from observers.storage import replacing
+from training.figures import ESTIMATE, MEASURED, TRUTH, save_moving, style
 
 SECONDS = 12.0  # of motion at the pace of the systems that ship, where it plays as fast as the motion
 FRAMES = 144  # at most
 TRAIL = 0.35  # of what is shown: older points would hide the new ones
-COLOURS = 32
 
 
 @dataclass(frozen=True)
@@ -55,34 +53,21 @@ def animate(path: Path, motions: Sequence[Motion]) -> None:
     from matplotlib.figure import Figure
 
     side = 2.4 if len(motions) > 1 else 4.8  # one alone must have room for the legend
-    figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120, layout="constrained")
-    canvas: Any = FigureCanvasAgg(figure)
-    axes = figure.subplots(2, len(motions), squeeze=False, height_ratios=[4, 1])
-    columns = [Column(motion, *pair) for motion, pair in zip(motions, axes.T, strict=True)]
-    columns[0].name_lines(figure)
-    canvas.draw()
-    still = canvas.copy_from_bbox(figure.bbox)
     frames: list[Image.Image] = []
-    for share in np.arange(1, FRAMES + 1) / FRAMES:
-        canvas.restore_region(still)
-        for column in columns:
-            column.show(share)
-        image = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-        frames.append(image.quantize(palette=frames[0], dither=Image.Dither.NONE) if frames else reduced(image))
-    with replacing(path) as temporary:
-        frames[0].save(
-            temporary,
-            format="GIF",
-            save_all=True,
-            append_images=frames[1:],
-            duration=round(1000 * SECONDS / FRAMES),
-            loop=0,
-        )
-
-
-def reduced(image: Image.Image) -> Image.Image:
-    """Return the first frame with few colours, which the others share: what stays the same then costs nothing."""
-    return image.quantize(COLOURS, dither=Image.Dither.NONE)
+    with style():
+        figure = Figure(figsize=(side * len(motions), side + 0.7), dpi=120)
+        canvas: Any = FigureCanvasAgg(figure)
+        axes = figure.subplots(2, len(motions), squeeze=False, height_ratios=[4, 1])
+        columns = [Column(motion, *pair) for motion, pair in zip(motions, axes.T, strict=True)]
+        columns[0].name_lines(figure)
+        canvas.draw()
+        still = canvas.copy_from_bbox(figure.bbox)
+        for share in np.arange(1, FRAMES + 1) / FRAMES:
+            canvas.restore_region(still)
+            for column in columns:
+                column.show(share)
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    save_moving(path, frames, seconds=SECONDS)
 
 
 class Column:
@@ -116,9 +101,9 @@ class Column:
                 portrait.plot([], [], style, color=color, lw=width, animated=True)[0],
                 portrait.plot([], [], "o", color=color, markersize=size, animated=True)[0],
             )
-            for style, color, width, size in (("-", STATE, 1.4, 7), ("-", ESTIMATE, 1.2, 4))
+            for style, color, width, size in (("-", TRUTH, 1.4, 7), ("-", ESTIMATE, 1.2, 4))
         ]
-        self.outputs = [strip.plot([], [], color="0.6", lw=0.6, animated=True)[0] for _ in self.y.T]
+        self.outputs = [strip.plot([], [], color=MEASURED, lw=0.6, animated=True)[0] for _ in self.y.T]
 
     def name_lines(self, figure: Any) -> None:
         """Put the legend of all columns above them.

@@ -12,11 +12,12 @@ from rich.table import Table
 
 from kkl_gym import System, get_system
 from observers import Artifact
-from observers.storage import replacing, write
+from observers.storage import write
 from training.commands.options import NoiseLevel, SystemName
 from training.commands.speed_observers import in_turns, observer_tasks
 from training.config import read_changes
 from training.evaluation.levels import level_for
+from training.figures import ESTIMATE, TRUTH, drawing
 from training.jobs import locked
 from training.presets import preset
 from training.progress import LOG, ProgressBars, progress_bars
@@ -160,25 +161,22 @@ def draw(path: Path, *frames: "pd.DataFrame") -> None:
     *frames : DataFrame
         Rows of sizes.csv, of one system each.
     """
-    from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator
 
-    figure = Figure(figsize=(3.6 * len(frames), 3.4), layout="constrained")
-    axes: Any = figure.subplots(1, len(frames), squeeze=False)[0]
-    for ax, frame in zip(axes, frames, strict=True):
-        for column, label in {"smape_under_noise": "under noise", "smape_without_noise": "without noise"}.items():
-            ax.plot(frame.us_a_row, frame[column], "o-", label=label)
-        for row in frame.itertuples():
-            ax.annotate(
-                f"{row.width}", (row.us_a_row, row.smape_under_noise), xytext=(0, 5), textcoords="offset points"
-            )
-        ax.set(xscale="log", yscale="log", title=frame.system.iloc[0].replace("_", " "))
-        ax.set_xlabel("µs for each row of a batch")
-        for axis in (ax.xaxis, ax.yaxis):
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.set_major_formatter("{x:g}")
-            axis.set_minor_formatter("")
-    axes[0].set_ylabel("median SMAPE in %")
-    axes[0].legend()
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 3.6 * len(frames), 3.4) as figure:
+        axes: Any = figure.subplots(1, len(frames), squeeze=False)[0]
+        for ax, frame in zip(axes, frames, strict=True):
+            curves = {"smape_under_noise": ("under noise", ESTIMATE), "smape_without_noise": ("without noise", TRUTH)}
+            for column, (label, color) in curves.items():
+                ax.plot(frame.us_a_row, frame[column], "o-", color=color, label=label)
+            for row in frame.itertuples():
+                at = (row.us_a_row, row.smape_under_noise)
+                ax.annotate(f"{row.width}", at, xytext=(0, 5), textcoords="offset points", fontsize="small")
+            ax.set(xscale="log", yscale="log", title=frame.system.iloc[0].replace("_", " "))
+            ax.set_xlabel("µs for each row of a batch")
+            for axis in (ax.xaxis, ax.yaxis):
+                axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_formatter("")
+        axes[0].set_ylabel("median SMAPE in %")
+        axes[0].legend()

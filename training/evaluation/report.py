@@ -7,10 +7,10 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.storage import replacing
 from training.config import current_names
 from training.evaluation.errors import UnseenTrajectories, errors, unseen_trajectories
 from training.evaluation.levels import show_level
+from training.figures import ESTIMATE, TRUTH, drawing
 from training.maps.smooth import residual
 from training.pipeline import Result
 from training.trajectories.controllers import Controller
@@ -39,47 +39,44 @@ def write_report(
     seed : int
         Seed of the trajectories and their noise.
     """
-    from matplotlib.figure import Figure
-
     artifact = result.artifact
     seconds = min(20.0 * system.pace, artifact.training["duration"])
     trajectories = unseen_trajectories(
         system, artifact.filter.dt, n=20, duration=seconds, seed=seed, driven=policy is not None, policy=policy
     )
-    figure = Figure(figsize=(12, 3.2 + 1.5 * system.nx), layout="constrained")
-    grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
-    losses = figure.add_subplot(grid[0, 0])
-    for name, history in result.losses.items():
-        losses.semilogy(*np.array(history).T, label=name)
-    losses.set(xlabel="batch", ylabel="error", title=f"{system.name}, {current_names(artifact.training)['pipeline']}")
-    losses.legend()
-    right = figure.add_subplot(grid[0, 1])
-    if artifact.forward is None:
-        _draw_noise_levels(right, result, system, trajectories, seed)
-    else:
-        draw_residual(right, artifact, system)
+    with drawing(path, 12, 3.2 + 1.5 * system.nx) as figure:
+        grid = figure.add_gridspec(1 + system.nx, 2, height_ratios=[2.0, *[1.0] * system.nx])
+        losses = figure.add_subplot(grid[0, 0])
+        for name, history in result.losses.items():
+            losses.semilogy(*np.array(history).T, label=name)
+        title = f"{system.name}, {current_names(artifact.training)['pipeline']}"
+        losses.set(xlabel="batch", ylabel="error", title=title)
+        losses.legend()
+        right = figure.add_subplot(grid[0, 1])
+        if artifact.forward is None:
+            _draw_noise_levels(right, result, system, trajectories, seed)
+        else:
+            draw_residual(right, artifact, system)
 
-    x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
-    u = trajectories.u[:, :1] if policy else None
-    rng = np.random.default_rng(seed)
-    t = np.arange(len(x)) * artifact.filter.dt
-    for column, level in enumerate((0.0, artifact.measurement_noise)):
-        y = noisy_output(system, x, measurement_noise=level, rng=rng)
-        x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y, u)
-        nrmse = errors(artifact, system, trajectories, measurement_noise=level, seed=seed).nrmse
-        for i in range(system.nx):
-            ax = figure.add_subplot(grid[1 + i, column])
-            ax.plot(t, x[..., i], "k", lw=1.2, label="true")
-            ax.plot(t, x_hat[..., i], "m--", lw=1.2, label="estimated")
-            ax.set_ylabel(system.state_names[i])
-            if i == 0:
-                ax.set_title(f"measurement noise {show_level(level)}")
-                ax.legend(loc="upper right")
-            if len(nrmse) and not np.isnan(nrmse[0, i]):
-                ax.set_title(f"NRMSE {np.median(nrmse[:, i]):.2g} %", loc="right", fontsize="medium")
-        ax.set_xlabel("t in s")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        x = trajectories.x[:, :1]  # the first that stayed within the bounds, if any did
+        u = trajectories.u[:, :1] if policy else None
+        rng = np.random.default_rng(seed)
+        t = np.arange(len(x)) * artifact.filter.dt
+        for column, level in enumerate((0.0, artifact.measurement_noise)):
+            y = noisy_output(system, x, measurement_noise=level, rng=rng)
+            x_hat = KKLObserver(artifact, level, process_noise=0.0).estimate(y, u)
+            nrmse = errors(artifact, system, trajectories, measurement_noise=level, seed=seed).nrmse
+            for i in range(system.nx):
+                ax = figure.add_subplot(grid[1 + i, column])
+                ax.plot(t, x[..., i], color=TRUTH, lw=1.8, label="true")
+                ax.plot(t, x_hat[..., i], "--", color=ESTIMATE, label="estimated")
+                ax.set_ylabel(system.state_names[i])
+                if i == 0:
+                    ax.set_title(f"measurement noise {show_level(level)}")
+                    ax.legend(loc="upper right")
+                if len(nrmse) and not np.isnan(nrmse[0, i]):
+                    ax.set_title(f"NRMSE {np.median(nrmse[:, i]):.2g} %", loc="right")
+            ax.set_xlabel("t in s")
 
 
 def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: UnseenTrajectories, seed: int) -> None:
@@ -126,4 +123,5 @@ def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 
     image = ax.pcolormesh(*grids, size, norm=LogNorm() if size.all() else None, shading="auto")
     ax.figure.colorbar(image, ax=ax, label="|∂T/∂x f − A T − B h|")
     ax.set(xlabel=system.state_names[first], ylabel=system.state_names[second])
+    ax.grid(visible=False)
     ax.set_title("PDE residual over X" if system.nx == 2 else "PDE residual through the centre of X")

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from observers.storage import replacing
+from training.figures import ESTIMATE, MEASURED, TRUTH, drawing
 from training.identification.identify import Identified
 
 LAGS = 40  # samples
@@ -42,25 +42,21 @@ def write_report(path: Path, found: Identified) -> None:
     found : Identified
         What was identified.
     """
-    from matplotlib.figure import Figure
-
     shown = found.predictions[:SHOWN]
-    figure = Figure(figsize=(12, 3.2 + 2.2 * len(shown)), layout="constrained")
-    grid = figure.add_gridspec(1 + len(shown), 2)
-    _draw_course(figure.add_subplot(grid[0, 0]), found)
-    _draw_residuals(figure.add_subplot(grid[0, 1]), found)
-    for row, prediction in enumerate(shown, 1):
-        ax = figure.add_subplot(grid[row, :])
-        record, samples = prediction.record, slice(prediction.first, prediction.first + len(prediction.y))
-        t = record.t[samples]
-        for j, name in enumerate(record.signals.measured):
-            ax.plot(t, record.y[samples, j], ".", ms=2, color="0.6", label=f"{name}, measured")
-            ax.plot(t, prediction.y[:, j], lw=1.2, label="predicted")
-        ax.axvline(t[prediction.fitted], color="k", lw=0.8, ls=":")
-        ax.set(xlabel="t in s", title=f"{record.name}, left out; its start from the samples before the line")
-        ax.legend(loc="upper right", fontsize="small")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 12, 3.2 + 2.2 * len(shown)) as figure:
+        grid = figure.add_gridspec(1 + len(shown), 2)
+        _draw_course(figure.add_subplot(grid[0, 0]), found)
+        _draw_residuals(figure.add_subplot(grid[0, 1]), found)
+        for row, prediction in enumerate(shown, 1):
+            ax = figure.add_subplot(grid[row, :])
+            record, samples = prediction.record, slice(prediction.first, prediction.first + len(prediction.y))
+            t = record.t[samples]
+            for j, name in enumerate(record.signals.measured):
+                ax.plot(t, record.y[samples, j], ".", ms=2, color=MEASURED, label=f"{name}, measured")
+                ax.plot(t, prediction.y[:, j], color=ESTIMATE, label="predicted")
+            ax.axvline(t[prediction.fitted], color=TRUTH, lw=0.8, ls=":")
+            ax.set(xlabel="t in s", title=f"{record.name}, left out; its start from the samples before the line")
+            ax.legend(loc="upper right")
 
 
 def _draw_course(ax: Any, found: Identified) -> None:
@@ -70,7 +66,7 @@ def _draw_course(ax: Any, found: Identified) -> None:
         if found.history and final:
             batches, values = zip(*((batch, values[name] / final) for batch, values in found.history), strict=True)
             ax.plot(batches, values, label=name)
-    ax.axhline(1.0, color="k", lw=0.8, ls=":")
+    ax.axhline(1.0, color=TRUTH, lw=0.8, ls=":")
     ax.set(xlabel="batch of the network", ylabel="parameter over its final value", title=found.system.name)
     if found.history:
         ax.legend()
@@ -83,6 +79,6 @@ def _draw_residuals(ax: Any, found: Identified) -> None:
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)
         ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals of {noise:.3g}")
     limit = 1.96 / np.sqrt(max(np.isfinite(fit.residuals[:, fit.used, 0]).sum(), 1))
-    ax.axhspan(-limit, limit, color="0.85", zorder=0)
+    ax.axhspan(-limit, limit, color=MEASURED, alpha=0.3, lw=0, zorder=0)
     ax.set(xlabel="lag in samples", ylabel="autocorrelation", title="residuals of the windows")
     ax.legend()

@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 from rich.table import Column, Table
 
-from observers.storage import replacing, write
+from observers.storage import write
 from training.checking.finding import percent
 from training.evaluation.levels import Level, as_cell, show_level
+from training.figures import TRUTH, drawing
 from training.neighbours import RESOLUTION
 from training.observable.found import Observability
 
@@ -96,28 +97,25 @@ def save(found: Observability, folder: Path, title: str) -> None:
     ]
     columns = ["signal", "measurement_noise", "steps", "seconds", "error", "linear", "change"]
     write(folder / "observability.csv", pd.DataFrame(rows, columns=columns).to_csv(index=False, float_format="%.6g"))
-    with replacing(folder / "observability.png") as temporary:
-        _draw(found, temporary, title)
+    _draw(found, folder / "observability.png", title)
 
 
 def _draw(found: Observability, path: Path, title: str) -> None:
     """Errors against windows, a plot for each signal."""
-    from matplotlib.figure import Figure
-
     n = len(found.hidden)
     columns = min(n, 3)
-    figure = Figure(figsize=(4.5 * columns + 0.5, 3.5 * -(-n // columns)), layout="constrained")
-    figure.suptitle(title)
-    axes = figure.subplots(-(-n // columns), columns, squeeze=False, sharey=True).ravel()
-    for i, ax in enumerate(axes):
-        ax.set_visible(i < n)
-    for i, (ax, judged) in enumerate(zip(axes, found.judgements)):
-        for level, errors in zip(found.noise, found.errors):
-            ax.plot(found.windows, 100 * np.maximum(errors[:, i], LEAST_SHOWN), "o-", ms=3, label=_column(level))
-        ax.plot(found.windows, 100 * np.maximum(found.linear[:, i], LEAST_SHOWN), "k:", label="linear, no noise")
-        ax.plot(found.windows, 100 * np.maximum(found.changes[:, i], LEAST_SHOWN), "k--", label="its change, no noise")
-        ax.set_xscale("symlog", linthresh=1)
-        ax.set(yscale="log", xlabel="steps back", title=f"{judged.signal}: {judged.verdict}")
-    axes[0].set_ylabel("error in % of the standard deviation")
-    axes[0].legend(fontsize="small")
-    figure.savefig(path, dpi=110)
+    with drawing(path, 4.5 * columns + 0.5, 3.5 * -(-n // columns)) as figure:
+        figure.suptitle(title)
+        axes = figure.subplots(-(-n // columns), columns, squeeze=False, sharey=True).ravel()
+        for i, ax in enumerate(axes):
+            ax.set_visible(i < n)
+        for i, (ax, judged) in enumerate(zip(axes, found.judgements)):
+            for level, errors in zip(found.noise, found.errors):
+                ax.plot(found.windows, 100 * np.maximum(errors[:, i], LEAST_SHOWN), "o-", label=_column(level))
+            for errors, look, label in ((found.linear, ":", "linear"), (found.changes, "--", "its change")):
+                shown = 100 * np.maximum(errors[:, i], LEAST_SHOWN)
+                ax.plot(found.windows, shown, look, color=TRUTH, label=f"{label}, no noise")
+            ax.set_xscale("symlog", linthresh=1)
+            ax.set(yscale="log", xlabel="steps back", title=f"{judged.signal}: {judged.verdict}")
+        axes[0].set_ylabel("error in % of the standard deviation")
+        axes[0].legend()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from observers import Artifact
-from observers.storage import replacing
+from training.figures import ESTIMATE, TRUTH, drawing
 from training.recorded.errors import estimates
 from training.recorded.fit import Recorded
 from training.records import Record, pieces
@@ -25,25 +25,21 @@ def write_recorded_report(path: Path, result: Recorded) -> None:
     result : Recorded
         What the training made.
     """
-    from matplotlib.figure import Figure
-
     artifact = result.artifact
     shown = sorted(
         (piece for piece in pieces(result.held_out) if piece.x is not None), key=lambda piece: -piece.duration
     )
     shown = shown[:SHOWN]
     columns = max(1, len(shown))
-    figure = Figure(figsize=(5 * columns + 1, 2.6 + 1.6 * artifact.nx), layout="constrained")
-    grid = figure.add_gridspec(1 + artifact.nx, columns, height_ratios=[1.6, *[1.0] * artifact.nx])
-    training = figure.add_subplot(grid[0, :])
-    for name, history in result.losses.items():
-        training.semilogy(*np.array(history).T, label=name)
-    training.set(xlabel="batch", ylabel="error", title=f"{artifact.system}, from recorded states")
-    training.legend()
-    for column, piece in enumerate(shown):
-        draw_estimates(figure, grid, column, artifact, piece, result.errors.relative)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 5 * columns + 1, 2.6 + 1.6 * artifact.nx) as figure:
+        grid = figure.add_gridspec(1 + artifact.nx, columns, height_ratios=[1.6, *[1.0] * artifact.nx])
+        training = figure.add_subplot(grid[0, :])
+        for name, history in result.losses.items():
+            training.semilogy(*np.array(history).T, label=name)
+        training.set(xlabel="batch", ylabel="error", title=f"{artifact.system}, from recorded states")
+        training.legend()
+        for column, piece in enumerate(shown):
+            draw_estimates(figure, grid, column, artifact, piece, result.errors.relative)
 
 
 def draw_estimates(
@@ -54,12 +50,12 @@ def draw_estimates(
     assert piece.x is not None
     for i, (name, error) in enumerate(relative.items()):
         ax = figure.add_subplot(grid[1 + i, column])
-        ax.plot(t, piece.x[:, i], "k", lw=1.2, label="recorded")
-        ax.plot(t, x_hat[:, i], "m--", lw=1.2, label="estimated")
+        ax.plot(t, piece.x[:, i], color=TRUTH, lw=1.8, label="recorded")
+        ax.plot(t, x_hat[:, i], "--", color=ESTIMATE, label="estimated")
         if column == 0:
             ax.set_ylabel(name)
-            ax.set_title(f"rms error {error:.2g} of the standard deviation", loc="right", fontsize="medium")
+            ax.set_title(f"rms error {error:.2g} of the standard deviation", loc="right")
         if i == 0:
-            ax.set_title(Path(piece.name).name, loc="left", fontsize="medium")
+            ax.set_title(Path(piece.name).name, loc="left")
             ax.legend(loc="upper right")
     ax.set_xlabel("t in s")

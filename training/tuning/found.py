@@ -10,8 +10,9 @@ import pandas as pd
 from rich.table import Table
 
 from kkl_gym.system import System
-from observers.storage import replacing, write
+from observers.storage import write
 from training.evaluation.levels import Level, as_cell, show_level
+from training.figures import drawing
 from training.tuning.check import settings
 from training.tuning.probe import Choice
 
@@ -70,14 +71,11 @@ class Found:
             for choice in choices
         ]
         write_csv(folder / "front.csv", ["noise", "kind", "modes", "error"], rows)
-        with replacing(folder / "front.png") as temporary:
-            self.figure().savefig(temporary, dpi=110)
+        with drawing(folder / "front.png", 11, 4) as figure:
+            self.draw(figure)
 
-    def figure(self) -> "Figure":
-        """Predicted errors against numbers of modes, and the eigenvalues that are written."""
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(11, 4), layout="constrained")
+    def draw(self, figure: "Figure") -> None:
+        """Draw predicted errors against numbers of modes, and the eigenvalues that are written."""
         left, right = figure.subplots(1, 2)
         color = f"C{list(self.fronts).index(self.noise)}"
         for i, (level, choices) in enumerate(self.fronts.items()):
@@ -91,7 +89,7 @@ class Found:
         title = self.system.name.replace("_", " ")
         left.set(xlabel="modes for each output", ylabel="predicted error in %", title=title)
         left.set_ylim(top=10 * left.get_ylim()[1])  # room for the legend
-        left.legend(fontsize="small", ncols=2)
+        left.legend(ncols=2)
         for choice in self.others:
             if choice.kind == "default":
                 poles = choice.spectrum.poles
@@ -100,8 +98,7 @@ class Found:
         right.plot(poles.real, poles.imag, "x", color=color, label=f"written: {self.best.kind}")
         right.set(xscale="symlog", xlabel="Re λ in 1/s", ylabel="Im λ in rad/s")
         right.set_title(f"eigenvalues of A, noise {show_level(self.noise)}")
-        right.legend(fontsize="small")
-        return figure
+        right.legend()
 
 
 def _points(choices: list[Choice]) -> np.ndarray:

@@ -105,7 +105,7 @@ def test_report_from_the_file_alone(found, tmp_path):
     table = (tmp_path / "table.md").read_text()
     assert "| lorenz |" in table
     assert "| bias | 2 s | 100.0 % |" in table
-    assert (tmp_path / "roc.png").stat().st_size > 5_000
+    assert (tmp_path / "scores.png").stat().st_size > 5_000
 
 
 def test_duffing_is_reported_by_amplitude(tmp_path):
@@ -175,7 +175,7 @@ def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path,
         (path, "oscillator", fault): 4 for fault in FAULTS
     }
     assert set(found.deadline) == {2.4}  # a fifth of the duration
-    assert (tmp_path / "out" / "roc.png").stat().st_size > 5_000
+    assert (tmp_path / "out" / "scores.png").stat().st_size > 5_000
 
 
 def test_published_faults_have_the_columns_that_the_command_writes(found, tmp_path):

@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from observers.storage import replacing, write
+from observers.storage import write
 from training import markdown
+from training.agents import statistics
 from training.agents.any_environment.comparison import RANDOM, Case
 from training.agents.any_environment.information import SHOWN
-from training.agents.statistics import draw_panel, interval, middle, normalised
+from training.agents.statistics import interval, middle, normalised
+from training.figures import drawing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -133,23 +135,14 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
     partial : str
         What is missing, as a sentence.
     """
-    from matplotlib.figure import Figure
-
-    tasks = tasks_in(results)
-    columns = min(4, max(1, len(tasks)))
-    rows = -(-len(tasks) // columns)
-    figure = Figure(figsize=(2.6 * columns + 1.5, 2.6 * rows + 0.6), layout="constrained")
-    axes = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     shown = [kind for kind in reversed(SHOWN) if kind in set(results.shown)]
-    for ax, task in zip(axes, tasks):
+    panels = {}
+    for task in tasks_in(results):
         found = [cell(results, task, kind) for kind in shown]
         known = [one if one is not None and np.isfinite(one.get("interval", [np.nan])[0]) else None for one in found]
-        draw_panel(ax, known, [LABELS[kind] for kind in shown], _named(task))
-    for ax in axes[len(tasks) :]:
-        ax.set_axis_off()
-    figure.suptitle(f"What agents are shown and how well they act.{partial}", fontsize="medium")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        panels[_named(task)] = known
+    title = f"What agents are shown and how well they act.{partial}"
+    statistics.draw_scores(path, panels, [LABELS[kind] for kind in shown], title)
 
 
 def curves(cases: Sequence[Case]) -> "pd.DataFrame":
@@ -199,25 +192,21 @@ def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
     partial : str
         What is missing, as a sentence.
     """
-    from matplotlib.figure import Figure
-
     tasks = tasks_in(found)
-    figure = Figure(figsize=(10.0, 2.7 * max(1, len(tasks)) + 0.8), layout="constrained")
-    axes = figure.subplots(max(1, len(tasks)), 2, sharey="row", squeeze=False)
-    for row, (env_id, noise) in zip(axes, tasks):
-        for i, kind in enumerate(SHOWN):
-            level = 0.0 if kind == "state" else noise
-            of = found[(found.environment == env_id) & (found.noise == level) & (found.shown == kind)]
-            for ax, over in zip(row, ("steps", "seconds")):
-                if len(of):
-                    ax.plot(of[over], of["return"], color=f"C{i}", lw=1.2, label=LABELS[kind])
-        row[0].set(ylabel="return", title=_named((env_id, noise)), xlabel="steps of the environment")
-        row[1].set(xlabel="CPU seconds")
-        row[1].set_xscale("log")
-        row[1].legend(fontsize="x-small")
-    figure.suptitle(f"Learning curves.{partial}", fontsize="medium")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+    with drawing(path, 10.0, 2.7 * max(1, len(tasks)) + 0.8) as figure:
+        axes = figure.subplots(max(1, len(tasks)), 2, sharey="row", squeeze=False)
+        for row, (env_id, noise) in zip(axes, tasks):
+            for i, kind in enumerate(SHOWN):
+                level = 0.0 if kind == "state" else noise
+                of = found[(found.environment == env_id) & (found.noise == level) & (found.shown == kind)]
+                for ax, over in zip(row, ("steps", "seconds")):
+                    if len(of):
+                        ax.plot(of[over], of["return"], color=f"C{i}", label=LABELS[kind])
+            row[0].set(ylabel="return", title=_named((env_id, noise)), xlabel="steps of the environment")
+            row[1].set(xlabel="CPU seconds")
+            row[1].set_xscale("log")
+            row[1].legend()
+        figure.suptitle(f"Learning curves.{partial}")
 
 
 __all__ = ["LABELS", "cell", "curves", "draw_curves", "draw_scores", "tasks_in", "write_table"]

@@ -1,0 +1,172 @@
+"""One style for all figures, on a light ground or a dark one, and how figures and moving pictures are written.
+
+Colours are named by what they are for, as places in the cycle of colours: what is drawn in them follows the theme.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from kkl_gym.rendering import ESTIMATE, TARGET
+from observers.storage import replacing
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+Theme = Literal["light", "dark"]
+RIVAL, ALARM, TRUTH, MEASURED = "C0", "C1", "C6", "C7"
+# All eight are told apart with each kind of colour blindness. The same places of matplotlib's own cycle, in which
+# environments render outside of this style, have like colours.
+CYCLES: dict[Theme, tuple[str, ...]] = {
+    "light": ("#0072b2", "#e69f00", "#009e73", "#c2187a", "#56b4e9", "#7a4a1e", "#1a1a1a", "#9a9a9a"),
+    "dark": ("#4aa3df", "#f0a83c", "#2fbf93", "#ff6db8", "#a6dcff", "#b98a5a", "#eceae4", "#8a909c"),
+}
+GROUNDS: dict[Theme, str] = {"light": "#ffffff", "dark": "#1e2129"}  # those of the site
+RULES: dict[Theme, str] = {"light": "#e4e4e4", "dark": "#363b47"}
+ALIKE: dict[str, Any] = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlesize": "medium",
+    "figure.constrained_layout.use": True,
+    "figure.titlesize": "medium",
+    "font.size": 10.0,
+    "grid.linewidth": 0.6,
+    "legend.fontsize": "small",
+    "legend.framealpha": 0.8,
+    "lines.linewidth": 1.2,
+    "lines.markersize": 4.0,
+    "savefig.dpi": 110,
+    "savefig.facecolor": "auto",
+}
+COLOURS = 32  # of a moving picture
+NEAR = 16  # of 255, below which a colour could be taken for the ground
+
+_around: ContextVar[Theme] = ContextVar("theme", default="light")
+
+
+@contextmanager
+def style(theme: Theme | None = None) -> Iterator[None]:
+    """Draw in the style of this package until the end of a block.
+
+    Parameters
+    ----------
+    theme : "light" or "dark", optional
+        None takes that of the block around this one; there is none around what commands draw, which is light.
+
+    Yields
+    ------
+    None
+        Figures must be made, drawn and saved inside.
+
+    Raises
+    ------
+    ValueError
+        If there is no such theme.
+    """
+    import matplotlib
+    from cycler import cycler
+
+    chosen = _around.get() if theme is None else theme
+    if chosen not in get_args(Theme):
+        raise ValueError(f"theme must be one of {', '.join(get_args(Theme))}, got {theme!r}")
+    ground, ink, rule = GROUNDS[chosen], CYCLES[chosen][int(TRUTH[1])], RULES[chosen]
+    grounds = dict.fromkeys(("axes.facecolor", "figure.facecolor", "legend.facecolor"), ground)
+    inks = dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), ink)
+    rules = dict.fromkeys(("grid.color", "legend.edgecolor"), rule)
+    looks: Any = {**ALIKE, **grounds, **inks, **rules, "axes.prop_cycle": cycler(color=CYCLES[chosen])}
+    outer = _around.set(chosen)
+    try:
+        with matplotlib.rc_context(looks):
+            yield
+    finally:
+        _around.reset(outer)
+
+
+@contextmanager
+def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
+    """Make a figure in this style, which is written at the end of the block.
+
+    Parameters
+    ----------
+    path : Path
+        Of the picture, whose ending says the format; its folder is made.
+    width, height : float
+        In inches. On pages there is room for ten of them in the width.
+
+    Yields
+    ------
+    matplotlib.figure.Figure
+        To be drawn on. No window and no global state of matplotlib know of it.
+    """
+    from matplotlib.figure import Figure
+
+    with style():
+        figure = Figure(figsize=(width, height))
+        yield figure
+        save(path, figure)
+
+
+def save(path: Path, figure: "Figure") -> None:
+    """Write a figure, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        Of the picture, whose ending says the format; its folder is made.
+    figure : matplotlib.figure.Figure
+        What is written.
+    """
+    with style(), replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> None:
+    """Write a moving picture that repeats itself, whole or not at all.
+
+    All frames have the same few colours, for which the first, the middle and the last are looked at: what does not move
+    then costs nothing. Those of the style stay as they are, and so does the ground.
+
+    Parameters
+    ----------
+    path : Path
+        Of the GIF; its folder is made.
+    frames : sequence of PIL.Image.Image
+        In RGB.
+    seconds : float
+        That it lasts.
+    """
+    from matplotlib.colors import to_rgb
+    from PIL import Image
+
+    some = np.concatenate([np.asarray(frames[i]) for i in (0, len(frames) // 2, -1)])
+    ground, own = some[0, 0].astype(int), 255 * np.array([to_rgb(colour) for colour in CYCLES[_around.get()]])
+    few = Image.fromarray(some).quantize(COLOURS - len(own), kmeans=1)
+    colours = np.array(few.getpalette()).reshape(-1, 3)[: COLOURS - len(own)]
+    colours[np.abs(colours - ground).max(axis=1) < NEAR] = ground  # and nothing that is nearly like it
+    few.putpalette([*colours.ravel().tolist(), *own.round().astype(int).ravel().tolist()])
+    first, *others = (frame.quantize(palette=few, dither=Image.Dither.NONE) for frame in frames)
+    duration = round(1000 * seconds / len(frames))
+    with replacing(path) as temporary:
+        first.save(temporary, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+
+
+__all__ = [
+    "ALARM",
+    "ESTIMATE",
+    "MEASURED",
+    "RIVAL",
+    "TARGET",
+    "TRUTH",
+    "Theme",
+    "drawing",
+    "save",
+    "save_moving",
+    "style",
+]
