@@ -15,16 +15,13 @@ from typing import Any
 import numpy as np
 
 from kkl_gym.equations import components, input_matrix, rate_at
-from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
+from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, Step, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
 
 logger = logging.getLogger("kkl_gym")
-
-Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
-"""(x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance_batch`."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 _NUMBERS = (float, int, np.generic)
+_NUMERIC = (np.ndarray, *_NUMBERS)
 _SYMPY_NAMES = {"abs": "Abs", "maximum": "Max", "minimum": "Min"}
 
 
@@ -41,9 +42,13 @@ def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callabl
 
 
 def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> Callable[[Any, Any], Any]:
+    on_arrays = getattr(np, name)
+
     def function(a: Any, b: Any) -> Any:
         if isinstance(a, _NUMBERS) and isinstance(b, _NUMBERS):
             return on_numbers(a, b)
+        if isinstance(a, _NUMERIC) and isinstance(b, _NUMERIC):
+            return on_arrays(a, b)
         return _elsewhere(name, a, b)
 
     return _named(function, f"{name}(a, b)", meaning)
@@ -56,9 +61,7 @@ def _named(function: Any, call: str, meaning: str) -> Any:
 
 
 def _elsewhere(name: str, *args: Any) -> Any:
-    """A function of arguments that are not all numbers, by the library that they are of."""
-    if all(isinstance(arg, (np.ndarray, *_NUMBERS)) for arg in args):
-        return getattr(np, name)(*args)
+    """A function of symbols or tensors, by the library that they are of."""
     if sympy := _library("sympy", "Basic", args):
         return getattr(sympy, _SYMPY_NAMES.get(name, name))(*args)
     if torch := _library("torch", "Tensor", args):

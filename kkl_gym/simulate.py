@@ -43,6 +43,8 @@ _ROWS = [np.array([1.0, sum(row), *row]) for row in (*STAGES, WEIGHTS)]
 VectorField = Callable[[Any], Any]
 Feedback = Callable[[int, np.ndarray], np.ndarray]
 """(k, x) to the inputs held over interval k, (n, nu)."""
+Step = Callable[[np.ndarray, np.ndarray, np.ndarray, float], np.ndarray]
+"""(x, u, w, dt) to the next x, as :func:`advance_batch`."""
 
 
 class SubstepsError(ValueError):
@@ -360,9 +362,10 @@ def followed_rows(
     """
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
-        for row in rows[((x[:, rows] >= low) & (x[:, rows] <= high)).all(0)]:
-            start = [values[:, row].tolist() for values in (x, u, w)]
-            end[:, row] = followed(system, *start, dt=dt, end=end[:, row])
+        with np.errstate(all="ignore"):  # equations that are made of others may be NumPy's even for one state
+            for row in rows[((x[:, rows] >= low) & (x[:, rows] <= high)).all(0)]:
+                start = [values[:, row].tolist() for values in (x, u, w)]
+                end[:, row] = followed(system, *start, dt=dt, end=end[:, row])
     return end
 
 
@@ -394,6 +397,7 @@ def simulate(
     u: np.ndarray | Feedback | None = None,
     w: np.ndarray | None = None,
     *,
+    step: Step | None = None,
     report: Callable[[int], object] | None = None,
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
@@ -413,6 +417,8 @@ def simulate(
         (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
     w : ndarray, shape (steps, n, nx), optional
         Process noise, held over each interval; None is zero.
+    step : callable, optional
+        Takes the steps, such as :func:`kkl_gym.compiled.batch_step`; :func:`advance_batch` if it is left out.
     report : callable, optional
         Told now and then the number of intervals that are done.
 
@@ -437,6 +443,7 @@ def simulate(
             raise ValueError(f"{name} must have shape {(steps, n, width)}, got {np.shape(signal)}")
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))
     no_u, no_w = np.zeros((system.nu, n)), np.zeros((system.nx, n))
+    advanced = step or functools.partial(advance_batch, system)
     out = np.full((steps + 1, n, system.nx), np.nan)
     x = np.ascontiguousarray(x0.T)
     out[0] = x0
@@ -448,7 +455,7 @@ def simulate(
             no_u if acting is None else np.ascontiguousarray(acting.T),
             no_w if w is None else np.ascontiguousarray(w[k].T),
         )
-        end = advance_batch(system, x, *held, dt)
+        end = advanced(x, *held, dt)
         beyond = np.flatnonzero(~((end >= low) & (end <= high)).all(0))
         if len(beyond):
             end = followed_rows(system, x, *held, dt=dt, end=end, rows=beyond)

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
+from kkl_gym.compiled import batch_step
 from kkl_gym.elementary import exp, sin
 from kkl_gym.simulate import (
     GROWTH,
@@ -441,3 +442,20 @@ def test_long_simulations_tell_how_far_they_are():
     reported = simulate(Lorenz(), x0, 120, 0.01, report=told.append)
     assert told == [0, 50, 100]
     assert np.array_equal(reported, simulate(Lorenz(), x0, 120, 0.01))
+
+
+def test_a_compiled_step_may_take_the_steps():
+    pytest.importorskip("numba")
+    rng, taken = np.random.default_rng(0), []
+    x0 = Lorenz().draw_starts(rng, 50, 2.0)
+    x0[:5] *= 100.0  # which are lost
+
+    def step(*arguments):
+        taken.append(arguments)
+        return batch_step(Lorenz())(*arguments)
+
+    u = rng.uniform(-10, 10, (40, 50, 1))
+    compiled, in_numpy = (simulate(Lorenz(), x0, 40, DT, u=u, step=one) for one in (step, None))
+    assert len(taken) == 40
+    assert np.isnan(compiled[-1]).any(1).sum() == np.isnan(in_numpy[-1]).any(1).sum() > 0
+    np.testing.assert_allclose(compiled, in_numpy, rtol=1e-8)

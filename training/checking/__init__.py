@@ -1,19 +1,18 @@
 """Whether a system is ready for training, and what to change: what ``kkl-gym check`` prints."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 from numpy.linalg import LinAlgError
 
-from kkl_gym.simulate import RATE_STEP, SubstepsError, check_duration, check_interval
+from kkl_gym.simulate import SubstepsError, check_duration, check_interval
 from kkl_gym.system import System
 from observers.checks import check_dt
 from training.checking import dynamics, equations, levels, observability
 from training.checking.finding import Finding, Verdict
 from training.checking.subject import Subject
 from training.trajectories.controllers import Controller
-
-STEPS, FEWEST = 5000, 200  # sampling intervals of motions where no duration is given
 
 FIRST: dict[str, Callable[[System], Iterator[Finding]]] = {
     "system": equations.declaration,
@@ -54,7 +53,7 @@ def check(
     dt : float, optional
         Sampling interval in seconds; the system's own if it is left out.
     duration : float, optional
-        Length of motions in seconds; the system's own if it is left out, but no more than STEPS sampling intervals.
+        Length of motions in seconds; the system's own if it is left out, but no more than what is followed in seconds.
     policy : callable, optional
         States (n, nx) to actions (n, nu) in [-1, 1]. It acts on the system in place of random inputs.
     spinn : bool, default False
@@ -82,21 +81,13 @@ def check(
     except SubstepsError as error:
         yield Finding("sampling", "problem", *str(error).split(": ", 1))
         return
-    length = _affordable(system, interval) if duration is None else duration
-    check_duration(length, interval)
-    subject = Subject(system, interval, length, policy)
+    subject = Subject(system, interval, system.duration if duration is None else duration, policy)
+    check_duration(subject.duration, interval)
+    if duration is None:
+        subject = replace(subject, duration=subject.affordable())
     for name, look_at in THEN.items():
         if name != "spinn" or spinn:
             yield from _guarded(name, look_at, subject)
-
-
-def _affordable(system: System, dt: float) -> float:
-    """The system's own duration in seconds, or what takes as long to simulate as STEPS sampling intervals."""
-    try:
-        substeps = 1.0 if system.discrete else max(1.0, system.typical_rate * dt / RATE_STEP)
-    except ValueError:  # of an integrator; the check of the rate says so
-        substeps = 1.0
-    return min(system.duration, dt * max(FEWEST, round(STEPS / substeps)))
 
 
 def _guarded(name: str, look: Callable[[Any], Iterator[Finding]], at: System | Subject) -> Iterator[Finding]:

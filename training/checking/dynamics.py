@@ -17,6 +17,7 @@ from training.systems import named_policy
 TOO_LOW, TOO_HIGH = 0.5, 20.0  # rate(x) in multiples of what the Jacobian says
 TIMED = 300  # steps of the environment
 SLOW = 500.0  # microseconds of such a step
+STEEP = 10  # times as many substeps late in motions as is typical
 MANY = 0.5  # share of motions from X that leave the bounds
 FEW = 0.1  # share of motions that run away where wider bounds help
 WIDER = 10.0  # times as wide are the bounds in which motions are followed that leave the declared ones
@@ -51,6 +52,10 @@ def rate(subject: Subject) -> Iterator[Finding]:
     elif np.median(said) > TOO_HIGH * usual > 0:
         found += f". The {of} of df/dx is {number(usual)}/s at the median over 2X: substeps are wasted"
         advice = "lower rate(x)" if own else "let X's half-widths fit how far each state moves, or override rate(x)"
+        yield Finding("rate", "note", found, advice)
+    elif (late := _late_substeps(subject)) >= STEEP * _substeps(typical, dt):
+        found += f". Motions end where f is steep and takes {number(late)}: simulations run as much longer"
+        advice = "round f off there, such as sqrt(x) near 0 by x / sqrt(abs(x) + c) with a small c, or override rate(x)"
         yield Finding("rate", "note", found, advice)
     else:
         yield Finding("rate", "ok", found)
@@ -153,6 +158,14 @@ def _substeps(rate: float, dt: float) -> int:
     return 1 << max(0, int(np.ceil(np.log2(rate * dt / RATE_STEP))))
 
 
+def _late_substeps(subject: Subject) -> float:
+    """Mean over the second half of motions."""
+    if isinstance(subject.motions, SubstepsError):  # the check of the bounds says so
+        return 1.0
+    x = subject.motions.x
+    return float(subject.substeps(x[len(x) // 2 :]).mean())
+
+
 def _too_long(said: np.ndarray, fastest: np.ndarray, dt: float) -> bool:
     """Whether substeps by what is said are far too long for the Jacobian at more than a point in a hundred."""
     if len(said) != len(fastest):
@@ -165,7 +178,8 @@ def _beyond(subject: Subject, motions: Motions) -> np.ndarray:
     """The motions that leave, in bounds WIDER times as wide, (steps + 1, n, nx)."""
     lost = ~motions.stays
     try:
-        return simulate(_wider(subject.system), motions.x[0, lost], len(motions.u), subject.dt, u=motions.u[:, lost])
+        x0, u = motions.x[0, lost], motions.u[:, lost]
+        return simulate(_wider(subject.system), x0, len(u), subject.dt, u=u, step=subject.step)
     except SubstepsError:  # too fast out there
         return motions.x[:, lost]
 

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import EquationError
-from kkl_gym.compiled import batch_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
 from training.checking.finding import Finding, Verdict, number, percent
@@ -98,7 +97,7 @@ def machine_code(subject: Subject) -> Iterator[Finding]:
     if importlib.util.find_spec("numba") is None:
         yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
         return
-    obstacle = batch_step(subject.system).obstacle
+    obstacle = subject.step.obstacle
     if obstacle is None:
         yield Finding("compiled", "ok", "large batches of environments run as machine code")
     elif subject.system.discrete:

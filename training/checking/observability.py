@@ -50,7 +50,7 @@ def observability(subject: Subject) -> Iterator[Finding]:
     """The predicted error of each state, and states of which y tells nothing."""
     system = subject.system
     try:
-        probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS)
+        probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS, step=subject.step)
     except EquationError:
         found = "no error can be predicted where equations do not work on symbols"
         yield Finding("observability", "note", found, "write them in arithmetic and functions of kkl_gym.elementary")

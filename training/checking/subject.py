@@ -5,8 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
+from kkl_gym.compiled import BatchStep, batch_step
 from kkl_gym.equations import input_matrix
-from kkl_gym.simulate import SubstepsError, simulate
+from kkl_gym.simulate import RATE_STEP, SubstepsError, simulate
 from kkl_gym.system import System
 from training.trajectories.controllers import Controller
 from training.trajectories.policy import under_policy
@@ -14,6 +15,8 @@ from training.trajectories.signals import DRIVEN, random_inputs
 
 POINTS = 1000  # of X, of 2X and of the bounds
 MOTIONS = 200  # that are followed
+STEPS, FEWEST = 5000, 200  # substeps, and sampling intervals, of motions where no duration is given
+FOLLOWED = 20  # motions by which substeps are counted
 NUMERICAL_STEP = 1e-5  # of derivatives, in half-widths of X: cubes of it are as large as what rounding leaves
 
 
@@ -80,6 +83,11 @@ class Subject:
     dt: float
     duration: float
     policy: Controller | None = None
+
+    @property
+    def step(self) -> BatchStep:
+        """What moves batches of it, compiled where it can be."""
+        return batch_step(self.system)
 
     @cached_property
     def inner(self) -> np.ndarray:
@@ -172,7 +180,7 @@ class Subject:
             u = np.zeros((steps, len(x0), system.nu))
             if driven:
                 u[:, 2 * n :] = random_inputs(system, 2 * n, steps, dt=self.dt, rng=rng, kinds=DRIVEN)
-            return Motions(kinds, simulate(system, x0, steps, self.dt, u=u), u)
+            return Motions(kinds, simulate(system, x0, steps, self.dt, u=u, step=self.step), u)
         except SubstepsError as error:
             return error
 
@@ -183,3 +191,35 @@ class Subject:
         if isinstance(motions, SubstepsError):
             return np.zeros((0, 0, self.system.nx))
         return motions.x[:, motions.stays & motions.rows("X")]
+
+    def substeps(self, x: np.ndarray) -> np.ndarray:
+        """The substeps that sampling intervals ask for, not rounded, and one at least.
+
+        Parameters
+        ----------
+        x : ndarray, shape (steps, n, nx)
+            States at the start of the intervals; NaN where there is none.
+
+        Returns
+        -------
+        ndarray, shape (steps,)
+            Mean over states, so that what ignites now and then hardly counts.
+        """
+        with np.errstate(all="ignore"):
+            need = np.broadcast_to(self.system.rate(np.moveaxis(x, -1, 0)), x.shape[:-1]) * self.dt / RATE_STEP
+        return np.asarray(np.nan_to_num(need, nan=1.0, posinf=1.0).clip(1.0).mean(-1))
+
+    def affordable(self) -> float:
+        """The duration in seconds, or what STEPS substeps make of it along motions from X without input."""
+        x, longest = of_X(self.system, FOLLOWED), min(STEPS, round(self.duration / self.dt))
+        counted = np.ones(longest)
+        for k in range(0, 0 if self.system.discrete else longest, FEWEST):
+            if not len(x) or counted[:k].sum() >= STEPS:
+                break
+            try:
+                motions = simulate(self.system, x, min(FEWEST, longest - k), self.dt, step=self.step)
+            except SubstepsError:  # the check of the bounds says so
+                break
+            counted[k : k + FEWEST] = self.substeps(motions[:-1])
+            x = motions[-1][np.isfinite(motions[-1]).all(-1)]
+        return min(self.duration, self.dt * max(FEWEST, int((counted.cumsum() <= STEPS).sum())))

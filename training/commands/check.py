@@ -28,8 +28,8 @@ COLOURS = {"ok": "green", "note": "yellow", "problem": "bold red"}
 class Check:
     """Look at a system before anything is trained: what is right, what is wrong, and what to change.
 
-    Takes some ten seconds. Equations on all kinds of numbers, starts, bounds, rate, sampling, outputs, target, noise,
-    and the error to expect of each state. The exit status is 1 if there is a problem.
+    Takes some ten seconds, and twice that under a policy. Equations on all kinds of numbers, starts, bounds, rate,
+    sampling, outputs, target, noise, and the error to expect of each state. The exit status is 1 if there is a problem.
     docs/guides/check.md explains the lines.
     """
 

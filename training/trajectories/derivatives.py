@@ -195,10 +195,16 @@ def _of_column(system: System, j: int) -> list[dict[int, Callable[..., Any]]]:
 
 def _times(rows: Sequence[dict[int, Callable[..., Any]]], at: Components, Phi: Components) -> list[Any]:
     """Derivatives by the state, of as many components as it has, times Phi, row by row."""
-    nx, out = len(rows), []
+    nx, out = len(rows), list[Any]()
+    # Rows of Phi are multiplied as one where they are arrays, since each operation costs as much as its work.
+    blocks = [Phi[k * nx : (k + 1) * nx] for k in range(nx)]
     for row in rows:
         values = {k: derivative(*at) for k, derivative in row.items() if k < nx}
-        out += [sum(value * Phi[k * nx + j] for k, value in values.items()) for j in range(nx)]
+        if isinstance(Phi, np.ndarray):
+            total = sum(value * blocks[k] for k, value in values.items())
+            out += list(total) if values else [0] * nx
+        else:
+            out += [sum(value * blocks[k][j] for k, value in values.items()) for j in range(nx)]
     return out
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import scipy
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import Step, simulate
 from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.filter_noise import noise_covariance
@@ -76,6 +76,8 @@ class Probe:
         Of their starts.
     start : Spectrum
         Modes to choose more to, beside the library.
+    step : callable, optional
+        Takes the steps of the motions alone; NumPy's if it is left out.
 
     Raises
     ------
@@ -89,6 +91,7 @@ class Probe:
     motions: int = 40
     seed: int = 0
     start: Spectrum = field(default_factory=Spectrum)
+    step: Step | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.dt < self.duration < np.inf or self.motions < 2:
@@ -99,7 +102,7 @@ class Probe:
         system, nx = self.system, self.system.nx
         x0 = system.draw_starts(generator(Stream.TUNING, self.seed), 2 * self.motions)
         steps = round(self.duration / self.dt)
-        inside = np.isfinite(simulate(system, x0, steps, self.dt)[-1]).all(-1)
+        inside = np.isfinite(simulate(system, x0, steps, self.dt, step=self.step)[-1]).all(-1)
         if 2 * inside.sum() < self.motions:
             raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
         x0 = x0[inside][: self.motions]

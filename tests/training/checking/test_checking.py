@@ -1,5 +1,6 @@
 """Systems that are deliberately wrong, each with what is said of it; and systems of which nothing is to be said."""
 
+import functools
 import importlib.util
 import math
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ import pytest
 from linear_system import Autonomous, Oscillator
 
 import kkl_gym.compiled
-import training.checking.equations
+import training.checking.subject
 import training.smoothness
 from kkl_gym import SYSTEMS, System, get_system
 from kkl_gym.compiled import BatchStep
+from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import sqrt
+from kkl_gym.simulate import advance_batch
 from training.checking import FIRST, THEN, check, dynamics
 from training.checking.subject import Subject
 from training.systems import controller
@@ -26,7 +29,8 @@ DURATION = 2.0
 
 @pytest.fixture(autouse=True)
 def _nothing_is_compiled(monkeypatch):
-    monkeypatch.setattr(training.checking.equations, "batch_step", lambda system: BatchStep(lambda *args: args[0]))
+    in_numpy = functools.partial(functools.partial, advance_batch)
+    monkeypatch.setattr(training.checking.subject, "batch_step", lambda system: BatchStep(in_numpy(system)))
 
 
 def findings(system, name=None, *, dt=None, duration=DURATION, policy=None):
@@ -172,7 +176,7 @@ def test_a_part_that_no_single_state_says():
 
 def test_compiled_or_not(monkeypatch):
     assert one(Oscillator(), "compiled", "ok").found == "large batches of environments run as machine code"
-    monkeypatch.setattr(training.checking.equations, "batch_step", kkl_gym.compiled.batch_step)
+    monkeypatch.setattr(training.checking.subject, "batch_step", kkl_gym.compiled.batch_step)
     pytest.importorskip("numba")
     assert one(Oscillator(), "compiled", "ok").found == "large batches of environments run as machine code"
     assert "several times slower: " in one(NumpySine(), "compiled", "note").found
@@ -585,13 +589,57 @@ def test_a_spectrum_that_makes_T_smooth(monkeypatch):
 
 def test_motions_are_no_longer_than_can_be_followed_in_seconds(monkeypatch):
     monkeypatch.setattr("training.checking.THEN", {"bounds": THEN["bounds"]})
-    monkeypatch.setattr("training.checking.STEPS", 1500)
+    monkeypatch.setattr("training.checking.subject.STEPS", 1500)
     (found,) = (one for one in findings(High(), duration=None) if one.check == "bounds")
     assert "motions of 2 s" in found.found  # 1,500 / (300 0.01 / 0.4) intervals
     with pytest.raises(ValueError, match="duration"):
         findings(Oscillator(), duration=1e-3)
     with pytest.raises(ValueError, match="dt"):
         findings(Oscillator(), dt=-1.0)
+
+
+@dataclass(frozen=True)
+class Draining(System):
+    """Two tanks that run empty, where the outflow of Torricelli is infinitely steep. Metres and seconds."""
+
+    smooth: float = 0.0  # m
+
+    name = "draining"
+    X = ((0.05, 0.6), (0.05, 0.6))
+    bounds = ((-0.1, 2.0), (-0.1, 2.0))
+    u_max = (5e-5,)
+    G = ((65.0,), (0.0,))
+
+    def f(self, x):
+        outflow = [0.0144 * level / sqrt(absolute(level) + self.smooth) for level in x]
+        return -outflow[0], outflow[0] - outflow[1]
+
+    def h(self, x):
+        return (x[1],)
+
+
+@pytest.mark.parametrize(("smooth", "verdict"), [(1e-30, "note"), (1e-3, "ok")])
+def test_motions_that_come_to_where_f_is_steep(smooth, verdict, monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr(training.checking.subject, "batch_step", kkl_gym.compiled.batch_step)
+    monkeypatch.setattr("training.checking.subject.STEPS", 1000)
+    monkeypatch.setattr("training.checking.THEN", {name: THEN[name] for name in ("rate", "bounds")})
+    *_, rate, bounds = findings(Draining(smooth), duration=None)
+    # Of 1,000 intervals of 0.5 s those are left that 1,000 substeps make, or 200.
+    assert bounds.found.startswith(f"all of 200 motions of {500 if verdict == 'ok' else 100} s stay within them")
+    assert rate.verdict == verdict
+    assert ("end where f is steep" in rate.found) == (verdict == "note")
+    assert ("sqrt(abs(x) + c)" in rate.advice) == (verdict == "note")
+
+
+def test_motions_that_are_lost_take_no_substeps():
+    class Leaving(Oscillator):
+        name = "leaving"
+
+        def f(self, x):
+            return 10.0 + 0.0 * x[0], 0.0 * x[1]
+
+    assert Subject(Leaving(), 0.01, 30.0).affordable() == 30.0
 
 
 def test_the_page_explains_every_line():
