@@ -2,7 +2,7 @@
 
 For the step, the system's own equations are run once on sympy symbols; what comes out is written down as Python, put
 into the same step as single states take, and compiled, which takes a second for each system, set of parameters and
-process.
+process. Rows go through it many at a time, one in each lane of the processor's vectors.
 """
 
 import functools
@@ -20,6 +20,7 @@ from kkl_gym.system import System
 from observers.sparse import MANY_ROWS
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
+_LANES = 32  # rows that make a step together: a few of the processor's vectors
 
 logger = logging.getLogger("kkl_gym")
 
@@ -123,7 +124,8 @@ def compiled_step(system: System) -> Step:
     import numba
     import sympy
 
-    compiled = numba.njit(error_model="numpy")  # a division by zero is infinite, not an exception
+    compiled = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite, not an exception
+    inlined = functools.partial(compiled, forceinline=True)  # a call would keep rows from going through together
     nx, nu = system.nx, system.nu
     x, u = (list(sympy.symbols(f"{letter}:{n}", real=True)) for letter, n in (("x", nx), ("u", nu)))
 
@@ -140,40 +142,16 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    need = sympy.lambdify([(*x,)], sympy.sympify(rate_at(system, x)), "math", cse=True)
-
-    def tupled(values: list[str]) -> str:
-        return "(" + "".join(f"{value}, " for value in values) + ")"
-
-    states, inputs, noise = ([f"{name}[{i}, row]" for i in range(n)] for name, n in (("x", nx), ("u", nu), ("w", nx)))
-    # Indexed by numbers, not by loops, so that a row's state never leaves the processor's registers.
-    lines = [
-        "def kernel(x, u, w, dt, out):",
-        "    lost = False",
-        "    for row in range(x.shape[1]):",
-        f"        need = rate({tupled(states)}) * dt * {PER_RATE!r}",
-        f"        if not need <= {MOST_EQUAL}:",
-        "            out[:, row] = nan",
-        "            lost = True",
-        "            continue",
-        "        n = 1",
-        "        while n < need:",
-        "            n *= 2",
-        f"        end = integrate(field, {tupled(states + inputs)}, {tupled(noise + ['0.0'] * nu)}, dt / n, n)",
-        f"        if not rate({tupled([f'end[{i}]' for i in range(nx)])}) * dt * {PER_RATE!r} <= {GROWTH} * n:",
-        "            out[:, row] = nan",
-        "            lost = True",
-        "            continue",
-        *[f"        out[{i}, row] = end[{i}]" for i in range(nx)],
-        "    return lost",
-    ]
+    rate = sympy.sympify(rate_at(system, x)).replace(_is_root, lambda power: sympy.sqrt(power.base))
     namespace: dict[str, Any] = {
-        "field": compiled(field),
-        "rate": compiled(need),
-        "integrate": compiled(runge_kutta(nx + nu)),
+        "field": inlined(field),
+        "rate": inlined(sympy.lambdify([(*x,)], rate, "math", cse=True)),
+        "integrate": inlined(runge_kutta(nx + nu)),
+        "inf": math.inf,
         "nan": math.nan,
+        "np": np,
     }
-    exec("\n".join(lines), namespace)
+    exec("\n".join(_kernel_lines(nx, nu)), namespace)
     kernel = compiled(namespace["kernel"])
 
     def substeps(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
@@ -207,6 +185,67 @@ def compiled_step(system: System) -> Step:
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
     return step
+
+
+def _is_root(expression: Any) -> bool:
+    """Whether sympy holds it for a power, of which the square root takes a fraction of the time."""
+    return bool(expression.is_Pow and expression.exp == 0.5)
+
+
+def _kernel_lines(nx: int, nu: int) -> list[str]:
+    """Python of the kernel: substeps of one length for each row, in groups of rows that need as many.
+
+    Components and lanes are written out, and lie in one array at distances that the compiler knows. That is what lets
+    it use the processor's vectors.
+    """
+
+    def lane(i: int) -> str:
+        return f"s[{i * _LANES} + j]"
+
+    def tupled(values: list[str]) -> str:
+        return "(" + "".join(f"{value}, " for value in values) + ")"
+
+    held = [*[f"x[{i}, row]" for i in range(nx)], *[f"u[{i}, row]" for i in range(nu)]]
+    held += [f"w[{i}, row]" for i in range(nx)]
+    lanes = [lane(i) for i in range(len(held) + 2)]
+    states, noise, substeps, length = lanes[:nx], lanes[nx + nu : -2], lanes[-2], lanes[-1]
+    moved = f"integrate(field, {tupled(lanes[: nx + nu])}, {tupled(noise + ['0.0'] * nu)}, {length}, 1)"
+    return [
+        "def kernel(x, u, w, dt, out):",
+        f"    n, s = x.shape[1], np.empty({len(lanes) * _LANES})",
+        "    needs, order, counts = np.empty(n), np.empty(n, np.int64), np.empty(n)",
+        "    for row in range(n):",
+        f"        needs[row] = rate({tupled(held[:nx])}) * dt * {PER_RATE!r}",
+        "    found, least, most = 0, -inf, 1.0",
+        f"    while found < n and most <= {MOST_EQUAL}:",
+        "        for row in range(n):",
+        "            if least < needs[row] <= most:",
+        "                order[found], counts[found] = row, most",
+        "                found += 1",
+        "        least, most = most, 2.0 * most",
+        "    lost = found < n",
+        "    if lost:",
+        "        out[:] = nan",
+        f"    for first in range(0, found, {_LANES}):",
+        f"        for j in range({_LANES}):",
+        "            at = min(first + j, found - 1)  # lanes that are left over do the last row again",
+        f"            row, {substeps}, {length} = order[at], counts[at], dt / counts[at]",
+        *[f"            {lanes[i]} = {value}" for i, value in enumerate(held)],
+        "        for done in range(int(counts[at])):",
+        f"            for j in range({_LANES}):",
+        f"                end, unfinished = {moved}, done < {substeps}",
+        *[f"                {value} = end[{i}] if unfinished else {value}" for i, value in enumerate(states)],
+        f"        for j in range({_LANES}):",
+        f"            {length} = rate({tupled(states)}) * dt * {PER_RATE!r}",
+        f"        for j in range(min({_LANES}, found - first)):",
+        "            row = order[first + j]",
+        f"            if {length} <= {GROWTH} * {substeps}:",
+        *[f"                out[{i}, row] = {value}" for i, value in enumerate(states)],
+        "            else:",
+        "                out[:, row] = nan",
+        "                lost = True",
+        "    return lost",
+    ]
 
 
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -98,7 +98,8 @@ class Plant:
         self.output_space = _float32_box(*output_bounds(self.system, 6.0 * np.asarray(self.measurement_noise)))
         self.observation_space = self.state_space if observe == "state" else self.output_space
         self.action_space = gym.spaces.Box(-1.0, 1.0, (self.system.nu,), np.float32)
-        self._v_scale = np.broadcast_to(np.asarray(self.measurement_noise), (self.system.ny,))
+        self._ny = self.system.ny  # which evaluates h, and vectors draw noise row by row
+        self._v_scale = np.broadcast_to(np.asarray(self.measurement_noise), (self._ny,))
         self._w_range = 2.0 * self.process_noise * np.array(self.system.scale)
         self.weights = 1.0 / (self.system.nx * np.square(self.system.scale))
 
@@ -123,7 +124,7 @@ class Plant:
         v : ndarray, shape (NOISE_BLOCK, ny)
             Standard normal.
         """
-        n, nx, ny = NOISE_BLOCK, self.system.nx, self.system.ny
+        n, nx, ny = NOISE_BLOCK, len(self._w_range), self._ny
         return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
 
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -345,16 +345,13 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
         x = batch_step(self.system)(before, u, w, self.plant.dt)
-        within = (x >= self._low) & (x <= self._high)
-        if not within.all():  # unless that is but an error of the method
-            beyond = np.flatnonzero(~within.all(0))
-            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=beyond)
-            within = (x >= self._low) & (x <= self._high)
-        if within.all():
-            inside = np.ones_like(within[0])
+        inside = self._inside(x)
+        if not inside.all():  # unless that is but an error of the method
+            x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
+            inside = self._inside(x)
+        if inside.all():
             y = self._measure(x, v)
         else:  # the last state and output inside
-            inside = np.all(within, axis=0)
             x = np.where(inside, x, before)
             y = np.where(inside, self._measure(x, v), self._y[:, rows])
         sample = self._sample[rows] + 1
@@ -365,26 +362,42 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
             self._terminated[rows], self._truncated[rows] = ~inside, truncated
         deviation = x - self._target
-        return 1.0 / (1.0 + 4.0 * (self.plant.weights @ (deviation * deviation)))
+        deviation *= deviation
+        cost = self.plant.weights @ deviation
+        cost *= 4.0
+        cost += 1.0
+        return np.divide(1.0, cost, out=cost)
+
+    def _inside(self, x: np.ndarray) -> np.ndarray:
+        """Which rows are within the declared bounds; false for NaN too."""
+        within = x >= self._low
+        within &= x <= self._high
+        return within.all(0)
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = real_array("actions", actions)
         if values.shape != (self.num_envs, self.system.nu):
             raise ValueError(f"actions must have shape ({self.num_envs}, {self.system.nu}), got {values.shape}")
-        u = np.minimum(np.maximum(values, -1.0), 1.0) * self._u_max
+        u = np.maximum(values, -1.0)
+        np.minimum(u, 1.0, out=u)
+        u *= self._u_max
         if np.isnan(u).any():
             raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(1)).tolist()}")
         return np.ascontiguousarray(u.T)
 
     def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
-        used = self._used[rows]
+        whole = len(rows) == self.num_envs
+        used = self._used if whole else self._used[rows]
         if used.max() == NOISE_BLOCK:
             self._draw(rows[used == NOISE_BLOCK])
-            used[used == NOISE_BLOCK] = 0
-        self._used[rows] = used + 1
+            used = np.where(used == NOISE_BLOCK, 0, used)
+        if whole:
+            self._used = used + 1
+        else:
+            self._used[rows] = used + 1
         first = used[0]
-        if len(rows) == self.num_envs and (used == first).all():
+        if whole and (used == first).all():
             drawn = self._w[first].T, self._v[first].T
         else:
             drawn = self._w[used, :, rows], self._v[used, :, rows]
