@@ -42,7 +42,8 @@ class Demo:
     seed: int = 0
     """Seed of the starts and the noise."""
     gif: bool = False
-    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
+    """Draw a moving picture as well: phase portraits of the first 12 s, of slow and fast systems at the pace of the
+    shipped ones; estimates.gif beside the figure."""
     live: bool = False
     """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
     the sensor. Keys are shown there."""
@@ -91,7 +92,8 @@ class Demo:
             path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
             with progress.phase("drawing"):
                 draw(path, episodes)
-            progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
+            colours = "magenta and blue" if any(one.spinn is not None for one in episodes) else "magenta"
+            progress.say(f"wrote {path}: true states in black, estimates in {colours}, measured outputs in grey")
             if self.gif:
                 moving = path.with_suffix(".gif")
                 with progress.phase("drawing the moving picture"):
@@ -282,9 +284,11 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         axes[0, column].set_title(system.name.replace("_", " "))
         axes[system.nx - 1, column].set_xlabel("t in s")
     handles = {label: handle for ax in axes.flat for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, loc="lower left", ncols=len(handles))
+    room = episodes[0].x.shape[1] < rows  # under the first column
+    figure.legend(handles.values(), handles, loc="lower left" if room else "outside lower left", ncols=len(handles))
     noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
     what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
-    figure.suptitle(f"Hidden states estimated from {what} (standard deviation {noise} on every sample)")
+    end = "\n" if len(episodes) == 1 else " "  # so that a narrow figure has room
+    figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=110)
