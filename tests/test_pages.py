@@ -9,6 +9,7 @@ import tomllib
 import types
 
 import pytest
+from gymnasium.utils.play import PlayableGame, play
 from pages import PAGES, ROOT, Page, name
 
 from training.cli import COMMANDS, EXTRAS, read
@@ -32,7 +33,7 @@ def ids(page):
 
 @pytest.fixture
 def playground(tmp_path, monkeypatch):
-    """A folder in which blocks of code run, with the examples; agents learn for a few steps only."""
+    """A folder in which blocks of code run, with the examples; agents learn, and people play, for a few steps only."""
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     from sb3_contrib import RecurrentPPO
@@ -47,7 +48,21 @@ def playground(tmp_path, monkeypatch):
 
     for agent in (DQN, PPO, RecurrentPPO, SAC):
         monkeypatch.setattr(agent, "learn", briefly(agent.learn))
+    monkeypatch.setattr("gymnasium.utils.play.play", play_briefly)
     return tmp_path
+
+
+def play_briefly(env, **options):
+    """Press each key for a step."""
+    inspect.signature(play).bind(env, **options)
+    env.reset(seed=0)
+    keys = PlayableGame(env).relevant_keys
+    pressed = env.get_wrapper_attr("get_keys_to_action")()
+    assert {key for one in pressed for key in one} == keys
+    for action in (options["noop"], *pressed.values()):
+        env.step(action)
+        assert env.render().ndim == 3
+    env.close()
 
 
 def run(blocks, page):

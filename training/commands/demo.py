@@ -42,7 +42,8 @@ class Demo:
     seed: int = 0
     """Seed of the starts and the noise."""
     gif: bool = False
-    """Draw a moving picture as well: the first 12 s of phase portraits, estimates.gif beside the figure."""
+    """Draw a moving picture as well: phase portraits of the first 12 s, of slow and fast systems at the pace of the
+    shipped ones; estimates.gif beside the figure."""
     live: bool = False
     """Open a window in which one system moves, by default Van der Pol's, with sliders for noise, input and faults of
     the sensor. Keys are shown there."""
@@ -91,7 +92,8 @@ class Demo:
             path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
             with progress.phase("drawing"):
                 draw(path, episodes)
-            progress.say(f"wrote {path}: true states in black, estimates in magenta and blue, measured outputs in grey")
+            colours = "magenta and blue" if any(one.spinn is not None for one in episodes) else "magenta"
+            progress.say(f"wrote {path}: true states in black, estimates in {colours}, measured outputs in grey")
             if self.gif:
                 moving = path.with_suffix(".gif")
                 with progress.phase("drawing the moving picture"):
@@ -285,4 +287,5 @@ def draw(path: Path, episodes: Sequence[Episode]) -> None:
         figure.legend(handles.values(), handles, loc="outside lower center", ncols=len(handles))
         noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
         what = "one noisy output" if all(episode.y.shape[1] == 1 for episode in episodes) else "noisy outputs"
-        figure.suptitle(f"Hidden states estimated from {what} (standard deviation {noise} on every sample)")
+        end = "\n" if len(episodes) == 1 else " "  # so that a narrow figure has room
+        figure.suptitle(f"Hidden states estimated from {what}{end}(standard deviation {noise} on every sample)")

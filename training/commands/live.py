@@ -15,7 +15,7 @@ from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level
 from training.figures import ALARM, ESTIMATE, MEASURED, TRUTH, style
 
-SECONDS = 12.0  # that are shown, of a system whose runs last 50
+SECONDS = 12.0  # that are shown, by a clock on which slow and fast systems move at the pace of those that ship
 FRAME = 0.04  # seconds from one to the next
 MOST = 100  # samples of a frame: what a window could not keep up with is not made up for
 KEYS = "space: pause   n: new start   left, right: input   up, down: noise   f: next fault"
@@ -86,6 +86,8 @@ class Live:
     ----------
     paused : bool
         Whether time stands still.
+    clock : float
+        Seconds that a sample takes in the window.
     history : deque
         (x, x_hat, y, score) of the samples that are shown.
     """
@@ -101,7 +103,8 @@ class Live:
         self.env = kkl_gym.KKLObservation(
             self.sensor, environment.observer, measurement_noise=level, monitor=limits is not None
         )
-        self.seconds = min(SECONDS, self.system.duration / 4)
+        self.clock = self.dt / self.system.pace
+        self.seconds = min(SECONDS * self.system.pace, self.system.duration / 4)
         self.paused = False
         self.history: deque[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = deque(
             maxlen=round(self.seconds / self.dt) + 1
@@ -273,10 +276,10 @@ def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> A
         def frame(number: int) -> list[Any]:
             nonlocal before
             now = time.perf_counter()
-            samples = round((now - before) / live.dt)
+            samples = round((now - before) / live.clock)
             if not live.paused:
                 live.advance(min(samples, MOST))
-            before += samples * live.dt
+            before += samples * live.clock
             return live.draw()
 
         manager = figure.canvas.manager

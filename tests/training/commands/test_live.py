@@ -100,6 +100,19 @@ def test_a_system_of_ones_own(saved):
     assert live._said.get_text() == ""
 
 
+class Slow(linear_system.Oscillator):
+    name = "slow"
+    dt = 1.0
+
+
+def test_slow_systems_move_at_the_pace_of_those_that_ship(saved):
+    own = f"{__file__}:Slow"
+    live, _ = live_of(own, saved(system=own, dt=1.0))
+    assert (live.clock, live.seconds) == (0.01, 1200.0)
+    live.advance(1300)
+    assert len(live.history) == 1201
+
+
 def test_the_command(monkeypatch):
     asked = []
     monkeypatch.setattr(module, "show", lambda environment, level, *, seed: asked.append((environment, level, seed)))
