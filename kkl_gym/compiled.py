@@ -124,7 +124,7 @@ def compiled_step(system: System) -> Step:
     import numba
     import sympy
 
-    compiled = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite, not an exception
+    compiled: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
     inlined = functools.partial(compiled, forceinline=True)  # a call would keep rows from going through together
     nx, nu = system.nx, system.nu
     x, u = (list(sympy.symbols(f"{letter}:{n}", real=True)) for letter, n in (("x", nx), ("u", nu)))

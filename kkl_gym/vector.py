@@ -372,7 +372,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Which rows are within the declared bounds; false for NaN too."""
         within = x >= self._low
         within &= x <= self._high
-        return within.all(0)
+        return np.all(within, axis=0)
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = real_array("actions", actions)
