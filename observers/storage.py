@@ -10,6 +10,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
@@ -108,7 +109,7 @@ def write(path: str | os.PathLike[str], text: str) -> None:
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files that nobody has written to for an hour: processes that were killed have left them.
+    """Remove temporary files and folders that nobody has written to for an hour: processes that were killed left them.
 
     Parameters
     ----------
@@ -116,9 +117,13 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
         Where they lie.
     """
     for left in Path(folder).glob(f"{UNFINISHED}*"):
-        with suppress(FileNotFoundError):  # another process may clear away, too
-            if time.time() - left.stat().st_mtime > ABANDONED:
-                left.unlink()
+        with suppress(OSError):  # another process may clear away, too, and some are not ours to remove
+            written = [left, *left.rglob("*")]  # a folder's own time says nothing of what is in its files
+            if time.time() - max(path.lstat().st_mtime for path in written) > ABANDONED:
+                if left.is_dir() and not left.is_symlink():
+                    shutil.rmtree(left)
+                else:
+                    left.unlink()
 
 
 def save(

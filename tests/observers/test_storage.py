@@ -473,3 +473,17 @@ def test_what_killed_processes_leave_is_cleared_away(path):
         os.utime(file, (time.time() - 3700.0,) * 2)
     storage.clear_unfinished(path.parent)
     assert os.listdir(path.parent) == [path.name]
+
+
+@pytest.mark.skipif(not hasattr(os, "symlink"), reason="this system has no links")
+def test_what_is_linked_to_stays(tmp_path):
+    kept = tmp_path / "kept" / "file"
+    kept.parent.mkdir()
+    kept.touch()
+    link = tmp_path / ".part-link"
+    link.symlink_to(kept.parent, target_is_directory=True)
+    for path in (link, kept.parent, kept):
+        os.utime(path, (time.time() - 3700.0,) * 2, follow_symlinks=False)
+    storage.clear_unfinished(tmp_path)
+    assert kept.exists()
+    assert not link.is_symlink()

@@ -14,7 +14,7 @@ import gymnasium as gym
 
 from kkl_gym.identity import APPEARANCE, sampling_interval
 from observers.checks import check_dt
-from observers.storage import UNFINISHED
+from observers.storage import UNFINISHED, clear_unfinished
 from training.records.episodes import Episode, Rollouts
 from training.records.signals import Signals
 
@@ -84,6 +84,8 @@ def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
 def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | None", *, policy: str) -> Path:
     """Write a Minari data set, whole or not at all.
 
+    What a process left beside it that was killed is removed, see :func:`observers.storage.clear_unfinished`.
+
     Parameters
     ----------
     rollouts : Rollouts
@@ -115,6 +117,7 @@ def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | Non
     namespace = parse_dataset_id(rollouts.name)[0]
     if namespace is not None and namespace not in list_local_namespaces():
         create_namespace(namespace)
+    clear_unfinished(folder.parent)
     temporary = folder.with_name(f"{UNFINISHED}{secrets.token_hex(4)}")
     temporary.mkdir(parents=True)
     try:
