@@ -101,3 +101,15 @@ def test_the_page_on_accuracy_says_what_noise_does():
         (name, system) for name in ("ekf", "ukf") for system in SYSTEMS if tuned[name][system] > medians[0.5][system]
     }
     assert behind == {("ekf", "reverse_duffing")}, "which the page says"
+
+
+def test_the_guide_to_speed_has_the_errors_and_times_of_each_width():
+    found, page = pd.read_csv(RESULTS / "sizes" / "lorenz.csv"), (ROOT / "docs" / "guides" / "speed.md").read_text()
+    for title, column, digits in (
+        ("width of the hidden layers", "width", 0),
+        ("median SMAPE in %, no noise", "smape_without_noise", 2),
+        ("median SMAPE in %, noise 0.5", "smape_under_noise", 2),
+        ("µs a sample, single", "us_single", 1),
+        ("µs a sample, each of 1,024 rows", "us_a_row", 2),
+    ):
+        assert f"| {title} | {' | '.join(f'{value:.{digits}f}' for value in found[column])} |" in page

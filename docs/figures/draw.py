@@ -28,7 +28,7 @@ from training.agents.agent import Agent
 from training.agents.any_environment.tables import draw_curves
 from training.agents.play import play
 from training.benchmark.results import draw_results as draw_benchmark
-from training.commands import certify, coverage, demo, faults
+from training.commands import certify, coverage, demo, faults, sizes
 from training.commands.agent_files import find
 from training.commands.compare import draw_results as draw_agents
 from training.commands.options import shown
@@ -158,6 +158,9 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
         draw_curves, found=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
     "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
+    "results/sizes/sizes.png": lambda: (
+        lambda path: sizes.draw(path, *map(pd.read_csv, (RESULTS / "sizes").glob("*.csv")))
+    ),
     "results/error_bars/van_der_pol.png": lambda: partial(
         coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol.csv")
     ),
