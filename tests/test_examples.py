@@ -13,9 +13,9 @@ from training.evaluation import calibration
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
-WRITTEN, OWN_SYSTEM, OTHER_PLANTS = (
+WRITTEN, TRAINED, USED, OTHER_PLANTS = (
     (ROOT / "docs" / "guides" / "your_system.md").read_text().partition(f"## {title}")[2].partition("\n## ")[0]
-    for title in ("Write it", "Use it", "Unstable plants")
+    for title in ("Write it", "Check it", "Use it", "Unstable plants")
 )
 
 
@@ -84,15 +84,15 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
-    commands, own, registered = re.findall(r"```(?:sh|python)\n(.*?)```", OWN_SYSTEM, re.DOTALL)
-    done = []
-    for line in commands.splitlines():
-        kkl_gym, command, *rest = line.split()
+    own, agent, registered = re.findall(r"```python\n(.*?)```", USED, re.DOTALL)
+    done = set()
+    for line in "".join(re.findall(r"```sh\n(.*?)```", TRAINED + USED, re.DOTALL)).splitlines():
+        kkl_gym, command, *rest = line.partition("#")[0].split()
         assert kkl_gym == "kkl-gym"
         name = f"{command} {rest[0]}" if command == "agent" else command
         main([command, *rest, *SMALL[name].split()])
-        done.append(name)
-    assert done == list(SMALL)
+        done.add(name)
+    assert done == set(SMALL)
     printed = capsys.readouterr().out
     for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors", "scores.png"):
         assert written in printed
@@ -110,6 +110,10 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
         assert x_hat.shape == info["x"].shape == (2,)
         assert ("x_hat" in info) == (script is own)
         assert envs.reset(seed=0)[0].shape == (8, 2)
+        if script is own:
+            assert {"x", "y", "u", "x_hat"} <= set(made["info"])
+            exec(agent.replace("2_000", "2"), made)
+            assert made["agent"].predict(x_hat)[0].shape == (1,)
         assert [make.close() for make in (env, envs)] == [None, None]
 
 

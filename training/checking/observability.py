@@ -50,14 +50,15 @@ def observability(subject: Subject) -> Iterator[Finding]:
     """The predicted error of each state, and states of which y tells nothing."""
     system = subject.system
     try:
-        probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS, step=subject.step)
+        probe = Probe(system, subject.dt, subject.duration, motions=MOTIONS, step=subject.step, policy=subject.policy)
     except EquationError:
         found = "no error can be predicted where equations do not work on symbols"
         yield Finding("observability", "note", found, "write them in arithmetic and functions of kkl_gym.elementary")
         return
     except ValueError as error:
-        advice = "" if subject.policy else "mend first what is above"
-        yield Finding("observability", "note", f"no error can be predicted for motions without input: {error}", advice)
+        motions = "under the policy" if subject.policy else "without input"
+        found = f"no error can be predicted for motions {motions}: {error}"
+        yield Finding("observability", "note", found, "mend first what is above")
         return
     unknown = untold(subject, probe)
     yield from unknown.values()

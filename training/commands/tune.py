@@ -19,6 +19,7 @@ from training.evaluation.levels import Level, show_level
 from training.presets import preset
 from training.progress import progress_bars
 from training.spectrum import Spectrum, papers_spectrum
+from training.systems import named_policy
 from training.tuning.probe import Choice, Probe
 
 if TYPE_CHECKING:
@@ -49,6 +50,9 @@ class Tune:
     """Sampling interval in seconds; 0.01 for the systems that ship."""
     duration: Seconds = None
     """Length of a run in seconds: how much transients count. 50 for the systems that ship."""
+    policy: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(default: no input)")] = None
+    """What acts on the motions, as for `kkl-gym train`: "controller", or a function of yours as script.py:function.
+    Plants that run away without input need one."""
     parameters: Parameters = field(default_factory=dict)
     seed: int = 0
     """Seed of the motions' starts."""
@@ -83,16 +87,20 @@ class Tune:
             raise ValueError(f"check = {self.check} must be a positive number of seconds")
         if self.check is not None and self.pipeline == "spinn":
             raise ValueError("check trains input-aware maps: it must be left out with --pipeline spinn")
+        if self.policy is not None and (self.check is not None or self.pipeline == "spinn"):
+            raise ValueError(f"policy = {self.policy!r} must be left out with --check and with --pipeline spinn")
         system = get_system(self.system, self.parameters)
         runs = _Runs.of(self, system)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
+        name += "-policy" if self.policy else ""
         folder = (
             self.out
             or Path("runs") / "tuning" / f"{name}-{show_level(runs.noise).replace(', ', '-')}{given.replace(' ', '-')}"
         )
         again = f"kkl-gym train {self.system} --config {folder / 'config.json'}"
         again += f" --pipeline {self.pipeline}" if self.pipeline != "input-aware" else ""
+        again += f" --policy {self.policy}" if self.policy else ""
         again += f" --parameters{given}" if given else ""
         if self.pipeline == "spinn":
             return self._intervals(system, runs, console, folder=folder, again=again)
@@ -138,7 +146,8 @@ class Tune:
             progress_bars(console) as progress,
             progress.phase(f"choosing modes for {system.name}", 3 + len(levels)) as report,
         ):
-            probe = Probe(system, runs.dt, runs.duration, seed=self.seed, start=start)
+            policy = named_policy(system, self.policy) if self.policy else None
+            probe = Probe(system, runs.dt, runs.duration, seed=self.seed, start=start, policy=policy)
             fronts = {}
             for done, level in enumerate(levels, 1):
                 report(done)

@@ -15,7 +15,10 @@ from training.kalman import unknown_start
 from training.neighbours import RESOLUTION
 from training.seeds import Stream, generator
 from training.spectrum import Spectrum, bessel_spectrum
+from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
+from training.trajectories.policy import under_policy
+from training.trajectories.record import POLICYS_OWN
 
 REAL_MODES = 24  # in the library
 FREQUENCIES = np.array([0.02, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.98, 0.999])  # quantiles of the power of y
@@ -65,7 +68,7 @@ class Probe:
     Parameters
     ----------
     system : System
-        Any system; its input is zero here.
+        Any system; without a policy its input is zero here.
     dt : float
         Sampling interval in seconds.
     duration : float
@@ -78,6 +81,9 @@ class Probe:
         Modes to choose more to, beside the library.
     step : callable, optional
         Takes the steps of the motions alone; NumPy's if it is left out.
+    policy : callable, optional
+        States (n, nx) to actions (n, nu) in [-1, 1]: what acts on the motions, as in training; nothing does if it is
+        left out. The inputs count as known, and so they tell nothing of the start.
 
     Raises
     ------
@@ -92,6 +98,7 @@ class Probe:
     seed: int = 0
     start: Spectrum = field(default_factory=Spectrum)
     step: Step | None = None
+    policy: Controller | None = None
 
     def __post_init__(self) -> None:
         if not 0 < self.dt < self.duration < np.inf or self.motions < 2:
@@ -100,17 +107,24 @@ class Probe:
                 "least 2"
             )
         system, nx = self.system, self.system.nx
-        x0 = system.draw_starts(generator(Stream.TUNING, self.seed), 2 * self.motions)
-        steps = round(self.duration / self.dt)
-        inside = np.isfinite(simulate(system, x0, steps, self.dt, step=self.step)[-1]).all(-1)
+        rng = generator(Stream.TUNING, self.seed)
+        x0 = system.draw_starts(rng, 2 * self.motions)
+        steps, u = round(self.duration / self.dt), None
+        if self.policy is None:
+            last = simulate(system, x0, steps, self.dt, step=self.step)[-1]
+        else:
+            own = np.arange(len(x0)) % POLICYS_OWN == 0
+            x, u = under_policy(system, self.policy, x0, steps=steps, dt=self.dt, rng=rng, own=own)
+            last = x[-1]
+        inside = np.isfinite(last).all(-1)
         if 2 * inside.sum() < self.motions:
             raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
-        x0 = x0[inside][: self.motions]
+        x0, u = x0[inside][: self.motions], None if u is None else u[:, inside][:, : self.motions]
         low, high = system.box()
         half = (high - low) / 2
         self._unit = half if half.max() > MIXED * half.min() else np.ones(nx)
         identity = np.tile(np.eye(nx).ravel(), (len(x0), 1))
-        joint = simulate(with_sensitivity(system, driven=False), np.hstack([x0, identity]), steps, self.dt)
+        joint = simulate(with_sensitivity(system, driven=u is not None), np.hstack([x0, identity]), steps, self.dt, u=u)
         # Where motions part, later times depend on the start beyond what double precision can tell.
         growth = np.abs(joint[..., nx:]) * np.divide.outer(self._unit, self._unit).T.ravel()
         useful = np.isfinite(joint).all((1, 2)) & (growth.max((1, 2)) < FARTHEST)

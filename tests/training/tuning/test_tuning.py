@@ -222,6 +222,40 @@ def test_the_command_writes_what_training_takes(tmp_path, capsys):
     assert described["width"] == 8
 
 
+def test_what_is_known_of_a_linear_system_does_not_depend_on_the_policy(probe):
+    """It is its inputs that a policy chooses, which the observer knows."""
+    driven = Probe(Oscillator(), duration=6.0, motions=8, policy=lambda x: np.tanh(x[:, :1]))
+    np.testing.assert_array_equal(driven.x[0], probe.x[0])
+    assert (np.abs(driven.x[-1] - probe.x[-1]) > 0.01).any(1).all()
+    np.testing.assert_allclose(driven.Phi, probe.Phi, rtol=1e-9)
+    np.testing.assert_allclose(driven.error_of_states(None, 0.3), probe.error_of_states(None, 0.3), rtol=1e-9)
+
+
+@dataclass(frozen=True)
+class Unstable(Oscillator):
+    """A saddle, which runs away within seconds without a policy."""
+
+    name = "saddle"
+    X = ((-0.2, 0.2), (-0.2, 0.2))
+    bounds = ((-2.0, 2.0), (-2.0, 2.0))
+    u_max = (2.0,)
+
+    def f(self, x):
+        return x[1], 4.0 * x[0]
+
+
+def test_plants_that_run_away_take_a_policy(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tune = ["tune", f"{__file__}:Unstable", "--noise", "0.01", "--duration", "6", "--modes", "2"]
+    with pytest.raises(SystemExit, match="of 80 motions from X only 0 stayed within the bounds"):
+        main(tune)
+    main([*tune, "--policy", "controller"])
+    again = capsys.readouterr().out.replace("\n", "").rpartition("with it:")[2]
+    config = "runs/tuning/saddle-policy-0.01/config.json"
+    assert again == f"kkl-gym train {__file__}:Unstable --config {config} --policy controller"
+    assert len(json.loads((tmp_path / config).read_text())["eigenvalues"]) == 2
+
+
 def test_results_lie_under_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     system = str(Path(linear_system.__file__)) + ":Oscillator"
@@ -280,7 +314,16 @@ def test_predictions_are_compared_with_trained_observers(tmp_path, capsys, monke
 
 
 @pytest.mark.parametrize(
-    "options", [["--measurement-noise", "-1"], ["--modes", "0"], ["--duration", "0"], ["--dt", "0"], ["--check", "0"]]
+    "options",
+    [
+        ["--measurement-noise", "-1"],
+        ["--modes", "0"],
+        ["--duration", "0"],
+        ["--dt", "0"],
+        ["--check", "0"],
+        ["--policy", "controller", "--check", "1"],
+        ["--policy", "controller", "--pipeline", "spinn"],
+    ],
 )
 def test_bad_options(options, tmp_path):
     with pytest.raises(SystemExit, match="must"):
