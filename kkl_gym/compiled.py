@@ -288,7 +288,8 @@ def _clipping() -> Callable[..., None] | None:
         for row in range(n):
             for i in range(width):
                 value = np.float32(values[row, i])
-                out[row, i] = low[i] if value < low[i] else high[i] if value > high[i] else value
+                value = low[i] if value < low[i] else value
+                out[row, i] = high[i] if value > high[i] else value
 
     return kernel
 
