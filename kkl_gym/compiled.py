@@ -1,4 +1,4 @@
-"""A batch's Runge–Kutta step and its observations as machine code, where Numba is installed: several times as fast.
+"""A batch's Runge–Kutta step as machine code, where Numba is installed: several times as fast.
 
 For the step, the system's own equations are run once on sympy symbols; what comes out is written down as Python, put
 into the same step as single states take, and compiled, which takes a second for each system, set of parameters and
@@ -8,7 +8,6 @@ process. Rows go through it many at a time, one in each lane of the processor's 
 import functools
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,6 @@ import numpy as np
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, Step, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
-from observers.sparse import MANY_ROWS
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
 _LANES = 32  # rows that make a step together: a few of the processor's vectors
@@ -246,51 +244,6 @@ def _kernel_lines(nx: int, nu: int) -> list[str]:
         "                lost = True",
         "    return lost",
     ]
-
-
-def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Values as float32 within bounds.
-
-    Parameters
-    ----------
-    values : ndarray, shape (..., width)
-        What is to be shown.
-    low, high : ndarray of float32, shape (width,)
-        The bounds.
-
-    Returns
-    -------
-    ndarray of float32, shape (..., width)
-        A copy.
-    """
-    many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
-    kernel = _clipping() if many else None
-    if kernel is None:
-        out = values.astype(np.float32)
-        np.maximum(out, low, out=out)
-        np.minimum(out, high, out=out)
-        return out
-    out = np.empty(values.shape, np.float32)
-    kernel(values, low, high, out)
-    return out
-
-
-@functools.cache
-def _clipping() -> Callable[..., None] | None:
-    try:
-        import numba
-    except ImportError:
-        return None
-
-    @numba.njit
-    def kernel(values: np.ndarray, low: np.ndarray, high: np.ndarray, out: np.ndarray) -> None:
-        n, width = values.shape
-        for row in range(n):
-            for i in range(width):
-                value = np.float32(values[row, i])
-                out[row, i] = low[i] if value < low[i] else high[i] if value > high[i] else value
-
-    return kernel
 
 
 def _trials(system: System) -> tuple[np.ndarray, np.ndarray]:

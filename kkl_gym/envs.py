@@ -24,8 +24,8 @@ from kkl_gym.system import Box, System
 from observers.checks import integer, mapping, real_array, shown
 
 _KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
-_INTEGER = np.dtype(np.int64)
-_ACTIONS = (np.dtype(np.float32), np.dtype(np.float64))  # that a step takes as they are
+_INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
+_ACTIONS = (_FLOAT32, np.dtype(np.float64))  # that a step takes as they are
 
 
 class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -181,7 +181,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._trail.append(self._x)
         if self.render_mode == "human" and not self.drawn_by:
             self.animate()
-        return self._observation(), self._info([0.0] * self._nu, False)
+        info = self._info([0.0] * self._nu, False)
+        return self._observation(info), info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Hold the input over one sampling interval.
@@ -232,7 +233,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         cost = 0.0
         for xi, (target, weight) in zip(self._x, self._goal):
             cost += weight * (xi - target) * (xi - target)
-        return self._observation(), 1.0 / (1.0 + 4.0 * cost), escaped, False, self._info(u, escaped)
+        info = self._info(u, escaped)
+        return self._observation(info), 1.0 / (1.0 + 4.0 * cost), escaped, False, info
 
     def render(self) -> np.ndarray | None:
         """Draw the phase portrait so far.
@@ -345,10 +347,10 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             raise complex_motion(self.system, self._x) from None
         return True
 
-    def _observation(self) -> np.ndarray:
+    def _observation(self, info: dict[str, Any]) -> np.ndarray:
         if self.observe == "state":  # within the bounds by construction
-            return np.array(self._x, dtype=np.float32)
-        return np.array([max(low, min(high, y)) for y, (low, high) in zip(self._y, self._limits)], dtype=np.float32)
+            return info["x"].astype(_FLOAT32)
+        return np.array([max(low, min(high, y)) for y, (low, high) in zip(self._y, self._limits)], dtype=_FLOAT32)
 
     def _info(self, u: list[float], escaped: bool) -> dict[str, Any]:
         return {

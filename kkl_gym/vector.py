@@ -1,6 +1,7 @@
 """Many environments at once, simulated as one batch."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from kkl_gym.compiled import batch_step
 from kkl_gym.equations import components, target_of
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
+from kkl_gym.rows import held, judged
 from kkl_gym.simulate import followed_rows
 from kkl_gym.system import Box, System
 from observers.checks import bool_array, choice, integer, mapping, real_array, shown
@@ -118,9 +120,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
         self.system, self.dt = self.plant.system, self.plant.dt
         nx, ny = self.system.nx, self.system.ny
-        self._low, self._high = (np.array(bound)[:, None] for bound in zip(*self.system.bounds, strict=True))
-        self._u_max = np.array(self.system.u_max)
-        self._target = np.array(target_of(self.system))[:, None]
+        low, high = np.array(self.system.bounds, dtype=float).T.copy()
+        self._u_max, target = (np.array(each, dtype=float) for each in (self.system.u_max, target_of(self.system)))
+        self._judged = partial(judged, bounds=(low, high), target=target, weights=self.plant.weights)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
@@ -345,15 +347,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
         x = batch_step(self.system)(before, u, w, self.plant.dt)
-        inside = self._inside(x)
+        inside, reward = self._judged(x)
         if not inside.all():  # unless that is but an error of the method
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
-            inside = self._inside(x)
+            inside, reward = self._judged(x)
         if inside.all():
             y = self._measure(x, v)
         else:  # the last state and output inside
             x = np.where(inside, x, before)
             y = np.where(inside, self._measure(x, v), self._y[:, rows])
+            reward = self._judged(x)[1]
         sample = self._sample[rows] + 1
         truncated = sample >= (self.max_episode_steps or np.inf)
         if whole:
@@ -361,29 +364,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             self._x[:, rows], self._y[:, rows], self._sample[rows] = x, y, sample
             self._terminated[rows], self._truncated[rows] = ~inside, truncated
-        deviation = x - self._target
-        deviation *= deviation
-        cost = self.plant.weights @ deviation
-        cost *= 4.0
-        cost += 1.0
-        return np.divide(1.0, cost, out=cost)
-
-    def _inside(self, x: np.ndarray) -> np.ndarray:
-        """Which rows are within the declared bounds; false for NaN too."""
-        within = x >= self._low
-        within &= x <= self._high
-        return np.all(within, axis=0)
+        return reward
 
     def _inputs(self, actions: np.ndarray) -> np.ndarray:
         values = real_array("actions", actions)
         if values.shape != (self.num_envs, self.system.nu):
             raise ValueError(f"actions must have shape ({self.num_envs}, {self.system.nu}), got {values.shape}")
-        u = np.maximum(values, -1.0)
-        np.minimum(u, 1.0, out=u)
-        u *= self._u_max
+        u = held(values, self._u_max)
         if np.isnan(u).any():
-            raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(1)).tolist()}")
-        return np.ascontiguousarray(u.T)
+            raise ValueError(f"actions must be numbers; NaN in rows {np.flatnonzero(np.isnan(u).any(0)).tolist()}")
+        return u
 
     def _noise(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """One sample of w, (nx, rows), and of v, (ny, rows)."""

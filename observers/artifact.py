@@ -3,6 +3,7 @@
 :meth:`Artifact.save` writes it, at the end of ``kkl-gym train``; :meth:`Artifact.read` reads it.
 """
 
+import functools
 import math
 import os
 import re
@@ -494,12 +495,12 @@ class Artifact:
         """Number of states estimated."""
         return len(self.inverse.x_offset) - len(self.estimated_parameters)
 
-    @property
+    @functools.cached_property  # which every step asks for
     def ny(self) -> int:
         """Number of outputs."""
         return int(self.filter.B.shape[1])
 
-    @property
+    @functools.cached_property
     def nu(self) -> int:
         """Number of inputs that the observer takes into account."""
         return self.filter.nu

@@ -6,8 +6,8 @@ The modes of a filter do not mix, or only in pairs. A matrix product knows nothi
 batch three times where once is enough: this takes a fifth to a half of its time.
 """
 
-import functools
 from collections.abc import Callable
+from functools import cache, partial
 
 import numpy as np
 
@@ -33,14 +33,13 @@ class SparseUpdate:
     """
 
     def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
-        self._diagonal = transition.diagonal().copy()
-        self._rows, self._columns = np.nonzero(transition - np.diag(self._diagonal))
-        if len(self._rows) > len(transition):
-            raise ValueError(f"{len(self._rows)} entries off the diagonal of {len(transition)} are too many to gain")
-        self._mixing = transition[self._rows, self._columns]
-        self._terms = len(drive)
-        self._drive = np.pad(drive, ((0, -len(drive) % 3), (0, 0)))  # the kernel takes three terms at once
-        _kernel()  # or say now that there is no Numba
+        diagonal = transition.diagonal()
+        places = np.array(np.nonzero(transition - np.diag(diagonal)))  # rows and columns
+        if places.shape[1] > len(transition):
+            raise ValueError(f"{places.shape[1]} entries off the diagonal of {len(transition)} are too many to gain")
+        self._terms, spare = len(drive), np.zeros((-len(drive) % 3, len(transition)))  # batches take three at once
+        update = np.vstack([diagonal, drive, spare]), places, transition[*places]
+        self._shape, self._batch, self._one = update[0].shape, partial(_kernel(), *update), partial(_single(), *update)
 
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
         """Return the next z.
@@ -62,13 +61,14 @@ class SparseUpdate:
         ValueError
             If a shape is wrong.
         """
-        if z.shape[1:] != self._diagonal.shape:
-            raise ValueError(f"expected z of shape (n, {len(self._diagonal)}), got {z.shape}")
-        columns = np.zeros((len(z), len(self._drive)))
+        rows, size = self._shape
+        if z.shape[1:] != (size,):
+            raise ValueError(f"expected z of shape (n, {size}), got {z.shape}")
+        columns = np.zeros((len(z), rows - 1))
         np.concatenate(terms, axis=1, out=columns[:, : self._terms])  # raises if they do not fit
         z = np.ascontiguousarray(z, dtype=float)
         z_next = np.empty(z.shape)
-        _kernel()(z, columns, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
+        self._batch(z, columns, z_next)
         return z_next
 
     def single(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
@@ -88,66 +88,62 @@ class SparseUpdate:
         """
         z_next = np.empty(len(z))
         u = u.copy()  # the user's own: to Numba, an array that is read-only or has strides is of another type
-        _single()(z, y, u, y_next, self._diagonal, self._drive, self._rows, self._columns, self._mixing, z_next)
+        self._one(z, y, u, y_next, z_next)
         return z_next
 
 
-@functools.cache
+@cache
 def _single() -> Callable[..., None]:
     import numba
 
     @numba.njit
     def update(
+        gains: np.ndarray,
+        places: np.ndarray,
+        mixing: np.ndarray,
         z: np.ndarray,
         y: np.ndarray,
         u: np.ndarray,
         y_next: np.ndarray,
-        diagonal: np.ndarray,
-        drive: np.ndarray,
-        rows: np.ndarray,
-        columns: np.ndarray,
-        mixing: np.ndarray,
         z_next: np.ndarray,
     ) -> None:
-        size, j = len(z), 0
+        size, j = len(z), 1
         for i in range(size):
-            z_next[i] = diagonal[i] * z[i]
+            z_next[i] = gains[0, i] * z[i]
         for part in (y, u, y_next):
             for value in part:
                 for i in range(size):
-                    z_next[i] += drive[j, i] * value
+                    z_next[i] += gains[j, i] * value
                 j += 1
-        for k in range(len(rows)):
-            z_next[rows[k]] += mixing[k] * z[columns[k]]
+        for k in range(len(mixing)):
+            z_next[places[0, k]] += mixing[k] * z[places[1, k]]
 
     return update
 
 
-@functools.cache
+@cache
 def _kernel() -> Callable[..., None]:
     import numba
 
     @numba.njit
     def update(
+        gains: np.ndarray,
+        places: np.ndarray,
+        mixing: np.ndarray,
         z: np.ndarray,
         terms: np.ndarray,
-        diagonal: np.ndarray,
-        drive: np.ndarray,
-        rows: np.ndarray,
-        columns: np.ndarray,
-        mixing: np.ndarray,
         z_next: np.ndarray,
     ) -> None:
         n, size = z.shape
         for row in range(n):
             a, b, c = terms[row, 0], terms[row, 1], terms[row, 2]  # y, u and the next y, if there is one of each
             for i in range(size):
-                z_next[row, i] = diagonal[i] * z[row, i] + drive[0, i] * a + drive[1, i] * b + drive[2, i] * c
-            for j in range(3, len(drive), 3):
+                z_next[row, i] = gains[0, i] * z[row, i] + gains[1, i] * a + gains[2, i] * b + gains[3, i] * c
+            for j in range(3, terms.shape[1], 3):
                 a, b, c = terms[row, j], terms[row, j + 1], terms[row, j + 2]
                 for i in range(size):
-                    z_next[row, i] += drive[j, i] * a + drive[j + 1, i] * b + drive[j + 2, i] * c
-            for k in range(len(rows)):
-                z_next[row, rows[k]] += mixing[k] * z[row, columns[k]]
+                    z_next[row, i] += gains[j + 1, i] * a + gains[j + 2, i] * b + gains[j + 3, i] * c
+            for k in range(len(mixing)):
+                z_next[row, places[0, k]] += mixing[k] * z[row, places[1, k]]
 
     return update

@@ -7,8 +7,8 @@ from typing import Protocol
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.compiled import clipped
 from kkl_gym.plant import Plant
+from kkl_gym.rows import clipped
 from observers import Artifact, KKLObserver, LinearFilter, shipped
 from observers.artifact import resolve
 from observers.checks import choice, flag

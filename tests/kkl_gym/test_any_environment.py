@@ -92,7 +92,7 @@ def test_artifacts_keep_the_environment(saved):
 )
 def test_wrong_environments_of_artifacts(changes, told):
     with pytest.raises(ArtifactError, match=told):
-        Artifact(**{**vars(PENDULUM()), **changes})
+        replace(PENDULUM(), **changes)
 
 
 def test_other_environments_are_refused(saved):

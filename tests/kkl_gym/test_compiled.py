@@ -10,10 +10,9 @@ from kinked_systems import SYSTEMS as KINKED
 
 import kkl_gym
 from kkl_gym import SYSTEMS, EquationError, System, get_system
-from kkl_gym.compiled import batch_step, clipped, compiled_step
+from kkl_gym.compiled import batch_step, compiled_step
 from kkl_gym.elementary import cos, sin, tanh
 from kkl_gym.simulate import advance, advance_batch
-from observers.sparse import MANY_ROWS
 
 DT = 0.01
 compiles = pytest.mark.usefixtures("compiler")
@@ -269,25 +268,6 @@ def test_systems_that_count_as_equal_are_told_apart():
     x = np.ones((1, 1))
     steps = [batch_step(Decaying(a))(x, np.zeros((0, 1)), np.zeros((1, 1)), 0.1)[0, 0] for a in (1.0, 5.0)]
     assert steps == pytest.approx([np.exp(-0.1), np.exp(-0.5)], rel=1e-5)
-
-
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_clipped(monkeypatch, compiled, dtype):
-    if compiled:
-        pytest.importorskip("numba")
-    else:
-        monkeypatch.setattr(kkl_gym.compiled, "_clipping", lambda: None)
-    low, high = np.array([-1, 0, -np.inf], np.float32), np.array([1, 0.5, np.inf], np.float32)
-    values = np.random.default_rng(0).normal(size=(MANY_ROWS, 3)).astype(dtype)
-    values[0] = np.nan, -np.inf, np.inf
-    out = clipped(values, low, high)
-    assert out.dtype == np.float32
-    assert np.array_equal(out, np.clip(values.astype(np.float32), low, high), equal_nan=True)
-    assert np.array_equal(out[1], clipped(values[1], low, high))
-    assert (kkl_gym.compiled._clipping() is not None) == compiled
-    with pytest.raises(ValueError, match="broadcast"):
-        clipped(values, low[:2], high[:2])
 
 
 @compiles
