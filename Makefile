@@ -136,7 +136,14 @@ clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our enviro
 	$(@D)/bin/python -m pip install --quiet pytest $(CLIENTS_$*)
 	touch $@
 
-docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
+# With what they print and draw, which the files in examples/ do not hold.
+TALKS := $(patsubst examples/%,runs/%,$(wildcard examples/notebooks/*.ipynb))
+
+runs/notebooks/%.ipynb: examples/notebooks/%.ipynb | $(VENV)/ready
+	mkdir -p $(@D)
+	OMP_NUM_THREADS=1 $(BIN)/jupyter execute $< --output=../../$@
+
+docs: $(VENV)/ready $(TALKS)  ## the site, in runs/site, with the notebooks executed; any doubtful link is an error
 	$(BIN)/python docs/site/commands.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
 	$(BIN)/python docs/demo/build.py runs/site/demo
