@@ -64,7 +64,7 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures
 
-figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, a minute
+figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes
 	$(BIN)/python docs/figures/draw.py
 
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
@@ -93,12 +93,14 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 	cp $(addprefix runs/faults/,faults.csv table.md) docs/results/faults
 	$(MAKE) figures
 
+# The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
+	cp runs/agents/comparison/jobs/van_der_pol-0.5/y/0/agent.safetensors training/agents/shipped/van_der_pol-y.safetensors
 	$(MAKE) figures
 
 HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0
@@ -134,7 +136,14 @@ clients: $(CLIENTS:%=.venv-clients-%/ready)  ## programs of others on our enviro
 	$(@D)/bin/python -m pip install --quiet pytest $(CLIENTS_$*)
 	touch $@
 
-docs: $(VENV)/ready  ## the site, in runs/site; any doubtful link is an error
+# With what they print and draw, which the files in examples/ do not hold.
+TALKS := $(patsubst examples/%,runs/%,$(wildcard examples/notebooks/*.ipynb))
+
+runs/notebooks/%.ipynb: examples/notebooks/%.ipynb | $(VENV)/ready
+	mkdir -p $(@D)
+	OMP_NUM_THREADS=1 $(BIN)/jupyter execute $< --output=../../$@
+
+docs: $(VENV)/ready $(TALKS)  ## the site, in runs/site, with the notebooks executed; any doubtful link is an error
 	$(BIN)/python docs/site/commands.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict -f docs/site/mkdocs.yml
 	$(BIN)/python docs/demo/build.py runs/site/demo

@@ -100,6 +100,8 @@ class Canvas:
         Whether there are estimates to show.
     box : tuple of (float, float), length nx, optional
         (low, high) of each state to show, with a margin; None is the training box.
+    title : str, optional
+        What stands above it; by default the system's name.
 
     Raises
     ------
@@ -107,7 +109,9 @@ class Canvas:
         If matplotlib (the extra ``plots``) is not installed.
     """
 
-    def __init__(self, system: System, estimates: bool = False, box: Box | None = None) -> None:
+    def __init__(
+        self, system: System, estimates: bool = False, box: Box | None = None, *, title: str | None = None
+    ) -> None:
         try:
             from matplotlib import rcParams
             from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -125,7 +129,7 @@ class Canvas:
         (left, right), (bottom, top) = ((box or system.X)[i] for i in self._states)
         wide, tall = 0.3 * (right - left), 0.3 * (top - bottom)  # driven or not, motions leave the training box
         ax.set(xlim=(left - wide, right + wide), ylim=(bottom - tall, top + tall), xlabel=names[0], ylabel=names[1])
-        ax.set_title(system.name.replace("_", " "))
+        ax.set_title(system.name.replace("_", " ") if title is None else title)
         (target,) = ax.plot(*(system.target[i] for i in self._states), "+", color=TARGET, markersize=12, label="target")
         (trail,) = ax.plot([], [], color=ink, lw=1.0, animated=True)
         (guesses,) = ax.plot([], [], color=ESTIMATE, lw=0.7, alpha=0.7, animated=True)

@@ -13,6 +13,7 @@ from matplotlib.text import Text
 from PIL import Image
 
 import training.figures as figures
+from training.agents import picture
 from training.agents.any_environment.tables import draw_curves
 from training.commands import coverage, faults, portraits
 
@@ -62,6 +63,8 @@ def results(name, rows=slice(None)):
 
 TINY = {
     "estimates": lambda: DRAW["estimates"](0.3),
+    "agents": DRAW["agents_over_time"],
+    "errors over time": lambda: DRAW["errors_over_time"](trajectories=3, duration=0.5),
     "error bars": lambda: DRAW["error_bars"](duration=1.5),
     "noise levels": DRAW["noise_levels"],
     "faults": lambda: partial(faults.draw, found=results("faults/faults.csv", slice(None, None, 50))),
@@ -69,6 +72,12 @@ TINY = {
     "curves": lambda: partial(draw_curves, found=results("environments/curves.csv", slice(None, None, 10))),
     "scores": DRAW["FIGURES"]["results/agents/scores.png"],
 }
+
+
+def outer(ax):
+    """Whether axes are at the left or the lower edge of their grid, where its labels stand."""
+    place = ax.get_subplotspec()
+    return place.is_first_col() or place.is_last_row()
 
 
 @pytest.mark.parametrize("name", TINY)
@@ -85,7 +94,22 @@ def test_figures_take_their_colours_from_the_style(name, tmp_path, monkeypatch):
             assert len(artists) > 20
             assert {to_hex(artist.get_color()) for artist in artists} <= own
             assert to_hex(figure.get_facecolor()) == figures.GROUNDS[theme]
-            assert all(ax.get_xlabel() or ax.get_ylabel() for ax in figure.axes if ax.get_visible())
+            assert all(ax.get_xlabel() or ax.get_ylabel() for ax in figure.axes if ax.get_visible() and outer(ax))
+
+
+def test_two_agents_move_side_by_side(tmp_path, monkeypatch):
+    """The one that sees y has no estimate to show; both start in the same state and end elsewhere."""
+    monkeypatch.setattr(picture, "FRAMES", 4)
+    task, played = DRAW["agents"]()
+    blind, sighted = played.values()
+    assert blind.x_hat is None
+    assert sighted.x_hat.shape == sighted.x.shape == (task.steps + 1, 1, 2)
+    assert (blind.x[0] == sighted.x[0]).all()
+    late = task.steps // 2
+    assert abs(blind.x[late:]).max() > 2 > 1.5 > abs(sighted.x[late:, 0, 0]).max()
+    picture.animate(task, played, tmp_path / "agents.gif")
+    with Image.open(tmp_path / "agents.gif") as gif:
+        assert (gif.n_frames, gif.size) == (4, (960, 480))
 
 
 def test_pictures_are_written_in_both_themes(tmp_path, monkeypatch, capsys):

@@ -1,9 +1,11 @@
 """The site: its reference is whole and new, and its links hold where GitHub's do."""
 
+import json
 import re
 import runpy
 import subprocess
 import sys
+from base64 import b64encode
 from pathlib import Path
 
 import pytest
@@ -43,6 +45,7 @@ def test_the_reference_has_every_public_name(package):
         ("docs/guides/check.md", "guides/check.md", "../../training", f"{REPOSITORY}/tree/main/training"),
         ("docs/guides/check.md", "guides/check.md", "../results/agents", f"{REPOSITORY}/tree/main/docs/results/agents"),
         ("docs/guides/check.md", "guides/check.md", "../../CONTRIBUTING.md", "../development/contributing.md"),
+        ("docs/start/a.md", "start/a.md", "../../examples/notebooks/own_system.ipynb", "../notebooks/own_system.md"),
         ("CONTRIBUTING.md", "development/contributing.md", "docs/guides/check.md#a", "../guides/check.md#a"),
         ("CHANGELOG.md", "development/changes.md", "README.md", f"{REPOSITORY}/blob/main/README.md"),
         ("docs/guides/check.md", "guides/check.md", "https://arxiv.org", "https://arxiv.org"),
@@ -69,6 +72,30 @@ def test_pictures_are_light_and_dark_where_both_are_there(tmp_path):
     )
     text = "One {}\n\n{}\n\n{}, [a link](../figures/a.png)\n\n```md\n![An a](../figures/a.png)\n```\n"
     assert themed(text.format(a, b, code), tmp_path / "guides") == text.format(twice, b, code)
+
+
+def test_notebooks_are_pages():
+    """Their words, code, and what that printed and drew; of all of them, executed or not."""
+    hooks = runpy.run_path(str(DOCS / "site" / "hooks.py"))
+    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (800).to_bytes(4, "big") + (400).to_bytes(4, "big")
+    drawn = {"output_type": "display_data", "data": {"image/png": b64encode(png).decode(), "text/plain": ["<Figure>"]}}
+    printed = {"output_type": "stream", "name": "stdout", "text": ["4\n", "5\n"]}
+    warned = {"output_type": "stream", "name": "stderr", "text": ["a warning\n"]}
+    cells = [
+        {"cell_type": "markdown", "source": ["# A title\n", "words"]},
+        {"cell_type": "code", "source": ["a = 2\n", "print(2 * a)"], "outputs": [warned, printed, drawn]},
+    ]
+    text, pictures = hooks["talk"]({"cells": cells}, "mine")
+    assert text == (
+        "# A title\nwords\n\n```python\na = 2\nprint(2 * a)\n```\n\n```text\n4\n5\n```\n\n"
+        '<img alt="What this code draws" class="wide" loading="lazy" src="mine-0.png">\n'
+    )
+    assert pictures == {"mine-0.png": png}
+    site = (DOCS / "site" / "mkdocs.yml").read_text()
+    assert len(hooks["NOTEBOOKS"]) == 5
+    for path in hooks["NOTEBOOKS"]:
+        assert hooks["talk"](json.loads(path.read_text()), path.stem)[0].startswith("# ")
+        assert f": notebooks/{path.stem}.md\n" in site
 
 
 @pytest.mark.slow

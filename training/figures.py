@@ -35,6 +35,7 @@ ALIKE: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.titlesize": "medium",
     "figure.constrained_layout.use": True,
+    "figure.dpi": 110,
     "figure.titlesize": "medium",
     "font.size": 10.0,
     "grid.linewidth": 0.6,
@@ -71,22 +72,44 @@ def style(theme: Theme | None = None) -> Iterator[None]:
         If there is no such theme.
     """
     import matplotlib
-    from cycler import cycler
 
     chosen = _around.get() if theme is None else theme
-    if chosen not in get_args(Theme):
-        raise ValueError(f"theme must be one of {', '.join(get_args(Theme))}, got {theme!r}")
-    ground, ink, rule = GROUNDS[chosen], CYCLES[chosen][int(TRUTH[1])], RULES[chosen]
-    grounds = dict.fromkeys(("axes.facecolor", "figure.facecolor", "legend.facecolor"), ground)
-    inks = dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), ink)
-    rules = dict.fromkeys(("grid.color", "legend.edgecolor"), rule)
-    looks: Any = {**ALIKE, **grounds, **inks, **rules, "axes.prop_cycle": cycler(color=CYCLES[chosen])}
+    chosen_looks = looks(chosen)
     outer = _around.set(chosen)
     try:
-        with matplotlib.rc_context(looks):
+        with matplotlib.rc_context(chosen_looks):
             yield
     finally:
         _around.reset(outer)
+
+
+def looks(theme: Theme = "light") -> dict[Any, Any]:
+    """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``.
+
+    Parameters
+    ----------
+    theme : "light" or "dark"
+        The ground.
+
+    Returns
+    -------
+    dict
+        Values by the names that ``matplotlib.rcParams`` has for them.
+
+    Raises
+    ------
+    ValueError
+        If there is no such theme.
+    """
+    from cycler import cycler
+
+    if theme not in get_args(Theme):
+        raise ValueError(f"theme must be one of {', '.join(get_args(Theme))}, got {theme!r}")
+    ink = CYCLES[theme][int(TRUTH[1])]
+    grounds = dict.fromkeys(("axes.facecolor", "figure.facecolor", "legend.facecolor"), GROUNDS[theme])
+    inks = dict.fromkeys(("axes.edgecolor", "axes.labelcolor", "text.color", "xtick.color", "ytick.color"), ink)
+    rules = dict.fromkeys(("grid.color", "legend.edgecolor"), RULES[theme])
+    return {**ALIKE, **grounds, **inks, **rules, "axes.prop_cycle": cycler(color=CYCLES[theme])}
 
 
 @contextmanager
@@ -166,6 +189,7 @@ __all__ = [
     "TRUTH",
     "Theme",
     "drawing",
+    "looks",
     "save",
     "save_moving",
     "style",

@@ -26,7 +26,7 @@ from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
 from training.agents.any_environment.tables import draw_curves
-from training.agents.play import play
+from training.agents.play import Episodes, play
 from training.benchmark.results import draw_results as draw_benchmark
 from training.commands import certify, coverage, demo, faults, sizes
 from training.commands.agent_files import find
@@ -34,9 +34,12 @@ from training.commands.compare import draw_results as draw_agents
 from training.commands.options import shown
 from training.commands.portraits import animate
 from training.evaluation.certificates.settled import record_settled
-from training.evaluation.metrics import chi_square
+from training.evaluation.errors import estimates as estimates_of
+from training.evaluation.errors import kalman_estimates, unseen_trajectories
+from training.evaluation.metrics import chi_square, percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
 from training.seeds import agent_evaluation_seed
+from training.systems import ControlTask
 
 DOCS = Path(__file__).resolve().parents[1]
 RESULTS = DOCS / "results"
@@ -45,6 +48,10 @@ COLOURS = 256  # of a picture, which a third of the bytes then holds
 SEED = 7  # of the moving pictures
 RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
 BAND = 0.9  # of the errors lie in a band
+LEVELS = (0.0, 0.5)  # of measurement noise, in the figure of errors over time
+SMALLEST = 0.01  # percent that is shown of errors under noise
+QUANTILES = (0.1, 0.5, 0.9)  # of the runs, in the same figure
+AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
 FIRST = 1.0  # s, in which bands may be wider than their panels
 # What the colours of docs/figures/kkl.svg are on a dark ground.
 DARK = {
@@ -66,11 +73,25 @@ def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
     return lambda path: animate(path, [episode.motion for episode in episodes])
 
 
-def agent() -> Draw:
-    """The agent on x_hat that ships for Van der Pol: the first episode of ``kkl-gym agent evaluate van_der_pol``."""
-    player = Agent.read(find("van_der_pol"))
-    episodes = play(player.make(1), player, steps=player.task.steps, seed=agent_evaluation_seed(0, 1))
-    return lambda path: picture.animate(player.task, episodes, path)
+def agents() -> tuple[ControlTask, Mapping[str, Episodes]]:
+    """The first episode of ``kkl-gym agent evaluate``, of an agent that sees y and of one that sees an estimate."""
+    played = {}
+    for title, name in AGENTS.items():
+        player = Agent.read(find(name))
+        played[title] = play(player.make(1), player, steps=player.task.steps, seed=agent_evaluation_seed(0, 1))
+    return player.task, played
+
+
+def agents_moving() -> Draw:
+    """Phase portraits of both agents, which move."""
+    task, played = agents()
+    return lambda path: picture.animate(task, played, path)
+
+
+def agents_over_time() -> Draw:
+    """States and inputs of both agents."""
+    task, played = agents()
+    return lambda path: picture.draw_agents(task, played, path)
 
 
 def certificate(name: str, trajectories: int = 200) -> Draw:
@@ -143,11 +164,55 @@ def draw_noise_levels(path: Path, *, ours: pd.DataFrame, rivals: pd.DataFrame) -
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2 + len(RIVALS))
 
 
+def errors_over_time(trajectories: int = 100, duration: float | None = None) -> Draw:
+    """Errors at each step of the runs of ``kkl-gym evaluate SYSTEM --ekf`` from X, whose means the tables have."""
+    found = {}
+    for name, kind in SYSTEMS.items():
+        system, artifact = kind(), Artifact.read(resolve(name))
+        dt, seconds = artifact.filter.dt, duration or system.duration
+        runs = unseen_trajectories(system, dt, n=trajectories, duration=seconds, seed=0)
+        for level in LEVELS:
+            how = {"measurement_noise": level, "seed": 0}
+            ours = estimates_of(artifact, system, runs, **how)
+            kalman = kalman_estimates(system, runs, dt, **how)
+            found[name, level] = tuple(percentage_error(runs.x, x_hat) for x_hat in (ours, kalman))
+    return partial(draw_errors_over_time, found=found, dt=dt)
+
+
+def draw_errors_over_time(
+    path: Path, *, found: Mapping[tuple[str, float], tuple[np.ndarray, np.ndarray]], dt: float
+) -> None:
+    """Draw medians and bands of errors, (steps, n) of observer and Kalman filter: a column a system, a row a level."""
+    with drawing(path, 10, 4.6) as figure:
+        axes = figure.subplots(len(LEVELS), len(SYSTEMS), sharex=True, sharey="row")
+        for row, level in zip(axes, LEVELS, strict=True):
+            for ax, name in zip(row, SYSTEMS, strict=True):
+                for errors, color, label in zip(
+                    found[name, level], (ESTIMATE, RIVAL), ("observer", "EKF with the exact equations"), strict=True
+                ):
+                    t = dt * np.arange(1, len(errors))
+                    low, middle, high = np.quantile(errors[1:], QUANTILES, axis=1)
+                    ax.fill_between(t, low, high, color=color, alpha=0.25, lw=0)
+                    ax.plot(t, middle, color=color, lw=0.9, label=label)
+                ax.set(xscale="log", yscale="log", ylim=(SMALLEST if level else SMALLEST / 100, 200.0))
+                ax.xaxis.set_major_formatter("{x:g}")
+                ax.yaxis.set_major_formatter("{x:g}")
+        for ax, name in zip(axes[0], SYSTEMS, strict=True):
+            ax.set_title(name.replace("_", " "))
+        for ax in axes[-1]:
+            ax.set_xlabel("t in s")
+        for ax, level in zip(axes[:, 0], LEVELS, strict=True):
+            ax.set_ylabel(f"error in %, noise {level:g}" if level else "error in %, no noise")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+
 FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/estimates.png": estimates,
     "figures/portraits.gif": portraits,
     **{f"figures/{name}.gif": partial(portraits, name) for name in SYSTEMS},
-    "figures/van_der_pol-x_hat-0.5-0.gif": agent,
+    "figures/agents.gif": agents_moving,
+    "figures/agents.png": agents_over_time,
+    "figures/errors_over_time.png": errors_over_time,
     "figures/error_bars.png": error_bars,
     "results/noise_levels/noise_levels.png": noise_levels,
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),

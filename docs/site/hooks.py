@@ -1,9 +1,13 @@
-"""What the site does beyond mkdocs: pages for files of the root, links that lead out of ``docs/``, pictures on dark."""
+"""What the site does beyond mkdocs: pages that lie elsewhere, links that lead out of ``docs/``, pictures on dark."""
 
+import json
 import posixpath
 import re
+import struct
+from base64 import b64decode
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import get_plugin_logger
@@ -12,8 +16,15 @@ from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
 BRANCH = "main"
-# Files of the root that are pages of the site, each with its place under docs/.
-SHOWN: Mapping[str, str] = {"CONTRIBUTING.md": "development/contributing.md", "CHANGELOG.md": "development/changes.md"}
+NOTEBOOKS = sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))
+EXECUTED = ROOT / "runs" / "notebooks"  # where make docs leaves them with what they print and draw
+# Files elsewhere that are pages of the site, each with its place under docs/.
+SHOWN: Mapping[str, str] = {
+    "CONTRIBUTING.md": "development/contributing.md",
+    "CHANGELOG.md": "development/changes.md",
+    **{f"examples/notebooks/{path.name}": f"notebooks/{path.stem}.md" for path in NOTEBOOKS},
+}
+WIDE = 1.5  # times as wide as high: such pictures scroll on phones
 ROLE = re.compile(r":(?:attr|class|data|exc|func|meth|mod):<code>~?")  # of Sphinx, in docstrings
 # Code of both kinds, in which nothing is a link; then the target of a link or an image.
 LINK = re.compile(r"^```.*?^```|`[^`\n]*`|\]\(([^)\s]+)\)", re.DOTALL | re.MULTILINE)
@@ -24,9 +35,16 @@ log = get_plugin_logger(__name__)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that show files of the root."""
+    """Add the pages that show files from elsewhere, and the pictures of notebooks."""
     for source, page in SHOWN.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+        executed = EXECUTED / Path(source).name
+        text = (executed if executed.exists() else ROOT / source).read_text(encoding="utf-8")
+        pictures: Mapping[str, bytes] = {}
+        if source.endswith(".ipynb"):
+            text, pictures = talk(json.loads(text), Path(source).stem)
+        files.append(File.generated(config, page, content=text))
+        for name, content in pictures.items():
+            files.append(File.generated(config, f"{posixpath.dirname(page)}/{name}", content=content))
     return files
 
 
@@ -41,6 +59,43 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Show as code what docstrings refer to by Sphinx's roles, which Markdown does not know."""
     return ROLE.sub("<code>", html)
+
+
+def talk(notebook: Mapping[str, Any], name: str) -> tuple[str, dict[str, bytes]]:
+    """Make a page of a notebook.
+
+    Parameters
+    ----------
+    notebook : mapping of str to object
+        What a file ``.ipynb`` holds, whose sources are lists of lines. It may have been executed or not.
+    name : str
+        What its pictures are called, with a number behind it.
+
+    Returns
+    -------
+    text : str
+        Markdown: its words, its code, and what that printed and drew.
+    pictures : dict of str to bytes
+        PNG files by name, which lie beside the page.
+    """
+    parts: list[str] = []
+    pictures: dict[str, bytes] = {}
+    for cell in notebook["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            if output.get("name") == "stdout":
+                parts.append("```text\n" + "".join(output["text"]).rstrip() + "\n```")
+            elif "image/png" in output.get("data", {}):
+                picture = f"{name}-{len(pictures)}.png"
+                content = pictures[picture] = b64decode("".join(output["data"]["image/png"]))
+                width, height = struct.unpack(">II", content[16:24])
+                shape = "wide" if width > WIDE * height else "narrow"
+                parts.append(f'<img alt="What this code draws" class="{shape}" loading="lazy" src="{picture}">')
+    return "\n\n".join(parts) + "\n", pictures
 
 
 def relinked(markdown: str, source: str, page: str, *, repository: str) -> str:

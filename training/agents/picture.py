@@ -1,5 +1,6 @@
 """Pictures of closed-loop episodes."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,55 +26,80 @@ def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
     task : ControlTask
         What was played.
     episodes : Episodes
-        The first few are shown.
+        The first few are shown, a column for each.
     path : Path
         Of the figure.
     """
+    shown = [("", episodes.row(i)) for i in range(min(SHOWN, episodes.x.shape[1]))]
+    _draw(path, task, shown, width=2.6)
+
+
+def draw_agents(task: ControlTask, played: Mapping[str, Episodes], path: Path) -> None:
+    """Draw the first episode of several agents side by side, as :func:`draw` draws several of one.
+
+    Parameters
+    ----------
+    task : ControlTask
+        What all of them played.
+    played : mapping of str to Episodes
+        What each agent is called, and its episodes from the same seed.
+    path : Path
+        Of the figure.
+    """
+    _draw(path, task, [(name, episodes.row(0)) for name, episodes in played.items()], width=4.6)
+
+
+def _draw(path: Path, task: ControlTask, columns: Sequence[tuple[str, Episodes]], *, width: float) -> None:
+    """Draw the one episode of each column, below its title."""
     system = get_system(task.system)
-    shown = min(SHOWN, episodes.x.shape[1])
-    t = np.arange(len(episodes.x)) * task.period
-    with drawing(path, 2.6 * shown, 1.6 * (system.nx + system.nu)) as figure:
-        axes = figure.subplots(system.nx + system.nu, shown, sharex=True, sharey="row", squeeze=False)
-        for column in range(shown):
-            for i in range(system.nx):
-                ax = axes[i, column]
+    with drawing(path, width * len(columns), 1.6 * (system.nx + system.nu)) as figure:
+        axes = figure.subplots(system.nx + system.nu, len(columns), sharex=True, sharey="row", squeeze=False)
+        for (title, episode), column in zip(columns, axes.T, strict=True):
+            t = np.arange(len(episode.x)) * task.period
+            for i, ax in enumerate(column[: system.nx]):
                 ax.axhline(system.target[i], color=TARGET, lw=1.0, label="target")
-                if episodes.x_hat is not None:
-                    ax.plot(t, episodes.x_hat[:, column, i], color=ESTIMATE, lw=0.8, label="estimate")
-                ax.plot(t, episodes.x[:, column, i], color=TRUTH, lw=1.0, label="state")
-            for j in range(system.nu):
-                ax = axes[system.nx + j, column]
-                ax.step(t[:-1], episodes.u[:, column, j], where="post", color=RIVAL, lw=0.8)
+                if episode.x_hat is not None:
+                    ax.plot(t, episode.x_hat[:, 0, i], color=ESTIMATE, lw=0.8, label="estimate")
+                ax.plot(t, episode.x[:, 0, i], color=TRUTH, lw=1.0, label="state")
+            for j, ax in enumerate(column[system.nx :]):
+                ax.step(t[:-1], episode.u[:, 0, j], where="post", color=RIVAL, lw=0.8)
                 ax.set_ylim(-1.1 * system.u_max[j], 1.1 * system.u_max[j])
-            axes[-1, column].set_xlabel("t in s")
+            column[0].set_title(title)
+            column[-1].set_xlabel("t in s")
         for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
             axes[i, 0].set_ylabel(name)
-        axes[0, 0].legend(loc="upper right")
+        figure.legend(*axes[0, -1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
 
 
-def animate(task: ControlTask, episodes: Episodes, path: Path) -> None:
-    """Draw the phase portrait of the first episode, moving.
+def animate(task: ControlTask, played: Mapping[str, Episodes], path: Path) -> None:
+    """Draw the phase portrait of an agent's first episode, moving, and those of several side by side.
 
     Parameters
     ----------
     task : ControlTask
         What was played.
-    episodes : Episodes
-        The first is shown.
+    played : mapping of str to Episodes
+        The title of each portrait, and the episodes whose first it shows.
     path : Path
         Of the GIF.
     """
     system = get_system(task.system)
-    x = episodes.x[:, 0]
-    x_hat = None if episodes.x_hat is None else episodes.x_hat[:, 0]
-    shown = np.concatenate([x, [system.target], *([] if x_hat is None else [x_hat])])
-    box = tuple(zip(shown.min(0).tolist(), shown.max(0).tolist(), strict=True))
-    every = max(1, round(len(x) / FRAMES))
+    shown = {title: episodes.row(0) for title, episodes in played.items()}
+    points = [found[:, 0] for one in shown.values() for found in (one.x, one.x_hat) if found is not None]
+    reached = np.concatenate([*points, [system.target]])
+    box = tuple(zip(reached.min(0).tolist(), reached.max(0).tolist(), strict=True))
+    every = max(1, round(task.steps / FRAMES))
     with style():
-        canvas = Canvas(system, x_hat is not None, box)
+        canvases = [(Canvas(system, one.x_hat is not None, box, title=title), one) for title, one in shown.items()]
         frames = [
-            Image.fromarray(canvas.draw(x[:k], () if x_hat is None else x_hat[:k], episodes.u[k - 1, 0]))
-            for k in range(1, len(x), every)
+            Image.fromarray(np.hstack([_frame(canvas, one, k) for canvas, one in canvases]))
+            for k in range(1, task.steps + 1, every)
         ]
     save_moving(path, frames, seconds=SECONDS)
+
+
+def _frame(canvas: Canvas, episode: Episodes, k: int) -> np.ndarray:
+    """What has happened in one episode before its instant k."""
+    estimates = () if episode.x_hat is None else episode.x_hat[:k, 0]
+    return canvas.draw(episode.x[:k, 0], estimates, episode.u[k - 1, 0])

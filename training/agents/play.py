@@ -32,6 +32,11 @@ class Episodes:
     u: np.ndarray
     escaped: np.ndarray
 
+    def row(self, i: int) -> "Episodes":
+        """One of them, as a batch of one."""
+        x_hat = None if self.x_hat is None else self.x_hat[:, [i]]
+        return Episodes(self.x[:, [i]], x_hat, self.u[:, [i]], self.escaped[[i]])
+
 
 def play(
     env: VectorEnv, policy: Policy, *, steps: int, seed: int, report: Callable[[int], object] = lambda done: None

@@ -166,7 +166,7 @@ class Evaluate:
     """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")]
-    """A system whose agent ships with the package, or an agent.safetensors file."""
+    """An agent that ships, by its system's name, or an agent.safetensors file."""
     episodes: int = 500
     """Number of episodes."""
     seed: int = 0
@@ -208,7 +208,7 @@ class Evaluate:
             with progress.phase("drawing", 2) as report:
                 draw(task, episodes, self.out / f"{name}.png")
                 report(1)
-                animate(task, episodes, self.out / f"{name}.gif")
+                animate(task, {system.replace("_", " "): episodes}, self.out / f"{name}.gif")
             progress.say(f"wrote {name}.png and {name}.gif in {self.out}")
 
 

@@ -20,7 +20,7 @@ class Export:
     """
 
     agent: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="AGENT")]
-    """A system whose agent ships with the package, or an agent.safetensors file."""
+    """An agent that ships, by its system's name, or an agent.safetensors file."""
     out: Path
     """The zip."""
     system: Annotated[str | None, tyro.conf.arg(metavar="CLASS", help_behavior_hint="")] = None
@@ -88,7 +88,7 @@ def find(name: str) -> Path:
     Parameters
     ----------
     name : str
-        A system whose agent ships, or a path that ends in ``.safetensors``.
+        An agent that ships, such as ``van_der_pol``, or a path that ends in ``.safetensors``.
 
     Returns
     -------

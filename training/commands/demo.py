@@ -14,7 +14,7 @@ from rich.table import Table
 import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
-from training.commands.options import NoiseLevel, OneObserver, OneSystem, Seconds, Shown, shown
+from training.commands.options import NoiseLevel, OneObserver, OneSystem, OwnPolicy, Seconds, Shown, read_policy, shown
 from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
 from training.evaluation.metrics import smape
@@ -41,6 +41,7 @@ class Demo:
     """Length of each episode in seconds."""
     seed: int = 0
     """Seed of the starts and the noise."""
+    policy: OwnPolicy = None
     gif: bool = False
     """Draw a moving picture as well: phase portraits of the first 12 s, of slow and fast systems at the pace of the
     shipped ones; estimates.gif beside the figure."""
@@ -70,6 +71,8 @@ class Demo:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         if self.live and (self.duration is not None or self.gif):
             raise ValueError("a window stays open until it is closed: leave out --duration and --gif beside --live")
+        if self.live and self.policy is not None:
+            raise ValueError("in a window the input is yours, by a slider and keys: leave out --policy beside --live")
         environments = shown(self.system or ("van_der_pol" if self.live else None), self.observer)
         for one in environments:
             if not one.observed:
@@ -87,7 +90,8 @@ class Demo:
                 check_duration(duration, dt)
                 steps = round(duration / dt)
                 with progress.phase(f"running {one.label}", steps) as report:
-                    episodes.append(play(one, steps, self.measurement_noise, seed=self.seed, report=report))
+                    noise, seed = self.measurement_noise, self.seed
+                    episodes.append(play(one, steps, noise, seed=seed, policy=self.policy, report=report))
             console.print(table(episodes))
             path = self.out / ("estimates.png" if self.system is None else f"estimates-{episodes[0].name}.png")
             with progress.phase("drawing"):
@@ -156,9 +160,10 @@ def play(
     measurement_noise: Level | None,
     *,
     seed: int,
+    policy: str | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
-    """Play one undriven episode with an observer.
+    """Play one episode with an observer, undriven unless it was trained under a policy.
 
     Parameters
     ----------
@@ -170,6 +175,8 @@ def play(
         Standard deviation of the noise on each sample of y; None for the system's own.
     seed : int
         Seed of start and noise.
+    policy : str, optional
+        What acts, on the true state: as for :func:`training.commands.options.read_policy`.
     report : callable, optional
         Told now and then the number of steps that are done.
 
@@ -177,19 +184,25 @@ def play(
     -------
     Episode
         It ends early where the state leaves the system's bounds.
+
+    Raises
+    ------
+    ValueError
+        If the observer was trained under a policy of the user's that is not named.
     """
     made = gym.make(
         environment.env_id, **environment.options, measurement_noise=measurement_noise, max_episode_steps=steps
     )
     env = kkl_gym.KKLObservation(made, environment.observer)
+    acting = read_policy(env.observer.artifact, environment.system, policy)
     _, info = env.reset(seed=seed)
     infos = [info]
-    action = np.zeros(env.action_space.shape or (), np.float32)
+    idle = np.zeros(env.action_space.shape or (), np.float32)
     seconds = 0.0
     for first in range(0, steps, EVERY):
         started = time.perf_counter()
         for _ in range(first, min(first + EVERY, steps)):
-            _, _, terminated, _, info = env.step(action)
+            _, _, terminated, _, info = env.step(idle if acting is None else acting(info["x"][None])[0])
             infos.append(info)
             if terminated:
                 break

@@ -260,11 +260,47 @@ def errors(
     ValueError
         If the level of noise is none, or beyond the map's range.
     """
+    x_hat = estimates(artifact, system, trajectories, measurement_noise=measurement_noise, seed=seed)
+    return _errors(trajectories, x_hat, artifact.filter.dt, skip)
+
+
+def estimates(
+    artifact: Artifact,
+    system: System,
+    trajectories: UnseenTrajectories,
+    *,
+    measurement_noise: Level,
+    seed: int,
+) -> np.ndarray:
+    """What an observer makes of test trajectories: its errors are what :func:`errors` measures.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    system : System
+        What it was made for.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
+    seed : int
+        Seed of the measurement noise.
+
+    Returns
+    -------
+    ndarray, shape (steps + 1, n, nx)
+        Estimates.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or beyond the map's range.
+    """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
     y = measured(system, trajectories, level, seed)
-    x_hat = observer.estimate(y, trajectories.u if artifact.nu else None)
-    return _errors(trajectories, x_hat, artifact.filter.dt, skip)
+    return observer.estimate(y, trajectories.u if artifact.nu else None)
 
 
 def kalman_errors(
@@ -305,6 +341,38 @@ def kalman_errors(
     ValueError
         If the level of noise is none, or the equations take no symbols.
     """
+    x_hat = kalman_estimates(system, trajectories, dt, measurement_noise=measurement_noise, seed=seed)
+    return _errors(trajectories, x_hat, dt, skip)
+
+
+def kalman_estimates(
+    system: System, trajectories: UnseenTrajectories, dt: float, *, measurement_noise: Level, seed: int
+) -> np.ndarray:
+    """What the filter of :func:`kalman_errors` makes of test trajectories.
+
+    Parameters
+    ----------
+    system : System
+        What it takes for what moves.
+    trajectories : UnseenTrajectories
+        What it is to follow.
+    dt : float
+        Sampling interval in seconds.
+    measurement_noise : float or sequence of float, length ny
+        Standard deviation of the noise on each sample of y, of all outputs or each.
+    seed : int
+        Seed of the measurement noise.
+
+    Returns
+    -------
+    ndarray, shape (steps + 1, n, nx)
+        Estimates.
+
+    Raises
+    ------
+    ValueError
+        If the level of noise is none, or the equations take no symbols.
+    """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = measured(system, trajectories, level, seed)
     kalman = kalman_filter(system, dt, trajectories.process_noise, level)
@@ -312,7 +380,7 @@ def kalman_errors(
     x_hat[0] = kalman.reset(y[0])
     for k in range(1, len(y)):
         x_hat[k] = kalman.step(y[k], trajectories.u[k - 1])
-    return _errors(trajectories, x_hat, dt, skip)
+    return x_hat
 
 
 def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:

@@ -260,7 +260,7 @@ def test_metadata_nested_without_end(tmp_path):
         Agent.read(path)
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "van_der_pol-y", "rossler", "lorenz"])
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
     with safe_open(find(name), framework="numpy") as opened:
         assert len(opened.metadata()["kkl-gym-agent-sha256"]) == 64
@@ -408,3 +408,13 @@ def test_shipped_agents_act_on_estimates(name, least):
     system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
     assert not episodes.escaped.any()
+
+
+def test_the_one_that_sees_y_differs_from_the_shipped_one_in_that_alone():
+    blind, sighted = Agent.read(find("van_der_pol-y")), Agent.read(find("van_der_pol"))
+    assert (blind.information, blind.observer) == ("y", None)
+    assert (blind.task, blind.seed) == (sighted.task, sighted.seed)
+    for setting in ("algorithm", "timesteps"):
+        assert blind.training[setting] == sighted.training[setting]
+    x = play(blind.make(20), blind, steps=blind.task.steps, seed=0).x
+    assert scores(get_system("van_der_pol"), x).mean() < -0.5

@@ -1,14 +1,18 @@
 """``kkl-gym demo``."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import linear_system
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
+from random_artifacts import random_artifact
 
 from training.cli import main
 from training.commands import portraits
+from training.commands.demo import play
+from training.commands.options import shown
 
 OWN = f"{linear_system.__file__}:Oscillator"
 AUTONOMOUS = f"{linear_system.__file__}:Autonomous"
@@ -62,6 +66,37 @@ def test_one_that_ships_with_another_observer(tmp_path, capsys):
 def test_what_cannot_be_shown(command, arguments, message):
     with pytest.raises(SystemExit, match=message):
         main([command, *arguments])
+
+
+@pytest.mark.parametrize(("policy", "rest"), [(None, 0.0), ("controller", 0.0), (f"{__file__}:push", 0.5)])
+def test_the_policy_of_its_training_acts(policy, rest, tmp_path):
+    """An oscillator without damping comes to rest under its regulator, pushed at u = 0.5, alone nowhere."""
+    artifact = random_artifact(system=OWN, dt=0.02)
+    trained = replace(artifact, training={**artifact.training, "policy": policy} if policy else artifact.training)
+    trained.save(tmp_path / "map.safetensors")
+    (environment,) = shown(OWN, str(tmp_path / "map.safetensors"))
+    named = policy if policy and policy != "controller" else None
+    x = play(environment, 2000, 0.1, seed=0, policy=named).x
+    late = x[1500:]
+    if policy is None:
+        assert np.ptp(late, axis=0).min() > 0.5
+    elif named:
+        assert late.mean(0) == pytest.approx([rest, 0.0], abs=0.1)
+        assert np.ptp(x[:500], axis=0).min() > 0.5
+        with pytest.raises(ValueError, match=r"was trained under the policy .*, which acts"):
+            play(environment, 2000, 0.1, seed=0)
+    else:
+        assert np.abs(late).max() < 0.3
+
+
+def push(x):
+    """Push as far as the input goes."""
+    return np.ones((len(x), 1))
+
+
+def test_a_window_takes_no_policy():
+    with pytest.raises(SystemExit, match="leave out --policy beside --live"):
+        main(["demo", "lorenz", "--live", "--policy", f"{__file__}:push"])
 
 
 def test_a_demo_needs_an_observer():
