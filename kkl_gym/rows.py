@@ -90,9 +90,10 @@ def judged(
     kernels = _kernels() if x.shape[1] >= MANY_ROWS else None
     if kernels is None:
         low, high = (bound[:, None] for bound in bounds)
-        deviation = x - target[:, None]
         inside = np.all((x >= low) & (x <= high), axis=0)
-        return inside, 1.0 / (1.0 + 4.0 * (weights @ (deviation * deviation)))
+        with np.errstate(over="ignore", invalid="ignore"):  # of states that have escaped
+            deviation = x - target[:, None]
+            return inside, 1.0 / (1.0 + 4.0 * (weights @ (deviation * deviation)))
     inside, reward = np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1])
     kernels["judge"](np.ascontiguousarray(x), *bounds, target, weights, inside, reward)
     return inside, reward

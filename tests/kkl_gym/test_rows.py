@@ -65,6 +65,17 @@ def test_judged(compiled, rows):
     assert reward[2] == 0.0
 
 
+@pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
+@pytest.mark.parametrize("far", [1e200, -1e200, np.inf, np.nan])
+def test_what_escapes_far_warns_of_nothing(compiled, rows, far):
+    """A discrete system's step may lead anywhere, and a weight may be zero."""
+    x = np.zeros((2, rows))
+    x[0, 1] = far
+    inside, reward = judged(x, (np.full(2, -1.0), np.ones(2)), target=np.zeros(2), weights=np.array([0.0, 1.0]))
+    assert np.flatnonzero(~inside).tolist() == [1]
+    assert (reward[inside] == 1.0).all()
+
+
 def test_the_two_agree():
     pytest.importorskip("numba")
     rng = np.random.default_rng(1)
