@@ -30,7 +30,8 @@ def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
     many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
     kernels = _kernels() if many else None
     if kernels is None:
-        out = values.astype(np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+            out = values.astype(np.float32)
         np.maximum(out, low, out=out)
         np.minimum(out, high, out=out)
         return out

@@ -31,6 +31,13 @@ def test_clipped(compiled, dtype):
         clipped(values, low[:2], high[:2])
 
 
+@pytest.mark.parametrize("rows", [3, MANY_ROWS])
+def test_clipped_beyond_float32(compiled, rows):
+    high = np.array([1.0, np.inf], np.float32)
+    out = clipped(np.full((rows, 2), [1e39, -1e300]), -high, high)
+    assert np.array_equal(out, np.full((rows, 2), [1.0, -np.inf]))
+
+
 @pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
 @pytest.mark.parametrize("nu", [0, 1, 2])
 def test_held(compiled, rows, nu):
