@@ -65,6 +65,7 @@ def held(actions: np.ndarray, u_max: np.ndarray) -> np.ndarray:
     return u
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of states that have escaped; a block would take twice as long
 def judged(
     x: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], *, target: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -92,9 +93,8 @@ def judged(
     if kernels is None:
         low, high = (bound[:, None] for bound in bounds)
         inside = np.all((x >= low) & (x <= high), axis=0)
-        with np.errstate(over="ignore", invalid="ignore"):  # of states that have escaped
-            deviation = x - target[:, None]
-            return inside, 1.0 / (1.0 + 4.0 * (weights @ (deviation * deviation)))
+        deviation = x - target[:, None]
+        return inside, 1.0 / (1.0 + 4.0 * (weights @ (deviation * deviation)))
     inside, reward = np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1])
     kernels["judge"](np.ascontiguousarray(x), *bounds, target, weights, inside, reward)
     return inside, reward
