@@ -30,7 +30,8 @@ def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
     many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
     kernels = _kernels() if many else None
     if kernels is None:
-        out = values.astype(np.float32)
+        with np.errstate(over="ignore"):  # what float32 cannot hold is infinite
+            out = values.astype(np.float32)
         np.maximum(out, low, out=out)
         np.minimum(out, high, out=out)
         return out
@@ -64,6 +65,7 @@ def held(actions: np.ndarray, u_max: np.ndarray) -> np.ndarray:
     return u
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of states that have escaped; a block would take twice as long
 def judged(
     x: np.ndarray, bounds: tuple[np.ndarray, np.ndarray], *, target: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -90,8 +92,8 @@ def judged(
     kernels = _kernels() if x.shape[1] >= MANY_ROWS else None
     if kernels is None:
         low, high = (bound[:, None] for bound in bounds)
-        deviation = x - target[:, None]
         inside = np.all((x >= low) & (x <= high), axis=0)
+        deviation = x - target[:, None]
         return inside, 1.0 / (1.0 + 4.0 * (weights @ (deviation * deviation)))
     inside, reward = np.ones(x.shape[1], dtype=bool), np.zeros(x.shape[1])
     kernels["judge"](np.ascontiguousarray(x), *bounds, target, weights, inside, reward)

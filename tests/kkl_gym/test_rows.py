@@ -31,6 +31,13 @@ def test_clipped(compiled, dtype):
         clipped(values, low[:2], high[:2])
 
 
+@pytest.mark.parametrize("rows", [3, MANY_ROWS])
+def test_clipped_beyond_float32(compiled, rows):
+    high = np.array([1.0, np.inf], np.float32)
+    out = clipped(np.full((rows, 2), [1e39, -1e300]), -high, high)
+    assert np.array_equal(out, np.full((rows, 2), [1.0, -np.inf]))
+
+
 @pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
 @pytest.mark.parametrize("nu", [0, 1, 2])
 def test_held(compiled, rows, nu):
@@ -63,6 +70,17 @@ def test_judged(compiled, rows):
         [1 / (1 + 1.2 * (a - 0.1) ** 2 + 8 * (b + 0.2) ** 2) for a, b in x.T[inside]]
     )
     assert reward[2] == 0.0
+
+
+@pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
+@pytest.mark.parametrize("far", [1e200, -1e200, np.inf, np.nan])
+def test_what_escapes_far_warns_of_nothing(compiled, rows, far):
+    """A discrete system's step may lead anywhere, and a weight may be zero."""
+    x = np.zeros((2, rows))
+    x[0, 1] = far
+    inside, reward = judged(x, (np.full(2, -1.0), np.ones(2)), target=np.zeros(2), weights=np.array([0.0, 1.0]))
+    assert np.flatnonzero(~inside).tolist() == [1]
+    assert (reward[inside] == 1.0).all()
 
 
 def test_the_two_agree():

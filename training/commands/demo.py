@@ -200,13 +200,14 @@ def play(
     idle = np.zeros(env.action_space.shape or (), np.float32)
     seconds = 0.0
     for first in range(0, steps, EVERY):
-        started = time.perf_counter()
         for _ in range(first, min(first + EVERY, steps)):
-            _, _, terminated, _, info = env.step(idle if acting is None else acting(info["x"][None])[0])
+            action = idle if acting is None else np.asarray(acting(info["x"][None]), dtype=float)[0]
+            started = time.perf_counter()
+            _, _, terminated, _, info = env.step(action)
+            seconds += time.perf_counter() - started
             infos.append(info)
             if terminated:
                 break
-        seconds += time.perf_counter() - started
         report(len(infos) - 1)
         if terminated:
             break

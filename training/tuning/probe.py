@@ -118,7 +118,10 @@ class Probe:
             last = x[-1]
         inside = np.isfinite(last).all(-1)
         if 2 * inside.sum() < self.motions:
-            raise ValueError(f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds")
+            raise ValueError(
+                f"of {len(x0)} motions from X only {inside.sum()} stayed within the bounds; widen the bounds, shrink X "
+                "or shorten the motions, or give a policy that holds the system (--policy)"
+            )
         x0, u = x0[inside][: self.motions], None if u is None else u[:, inside][:, : self.motions]
         low, high = system.box()
         half = (high - low) / 2

@@ -1,5 +1,6 @@
 """``kkl-gym demo``."""
 
+import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -92,6 +93,20 @@ def test_the_policy_of_its_training_acts(policy, rest, tmp_path):
 def push(x):
     """Push as far as the input goes."""
     return np.ones((len(x), 1))
+
+
+def test_what_a_policy_returns_and_how_long_it_takes(saved):
+    """Training takes actions of any type that counts as numbers; the time of a step is not the policy's."""
+    (environment,) = shown(OWN, saved(system=OWN, dt=0.02))
+    episode = play(environment, 20, 0.1, seed=0, policy=f"{__file__}:slow_switch")
+    assert len(episode.x) == 21
+    assert episode.seconds < 0.2
+
+
+def slow_switch(x):
+    """On or off, after a while."""
+    time.sleep(0.02)
+    return x[:, :1] > 0
 
 
 def test_a_window_takes_no_policy():
