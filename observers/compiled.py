@@ -403,7 +403,7 @@ def _kernels(activation: str) -> tuple[Any, Any]:
 
 
 def _tanh(compiled: Any) -> Callable[[Any], Any]:
-    """A quotient of polynomials in x^2 that is tanh(x)/x to 2e-8, and to 3e-7 with the rounding of float32.
+    """A quotient of polynomials in x^2 that is tanh(x)/x to 2e-8, and to 4e-7 with the rounding of float32.
 
     Loops take many values of it at a time. The coefficients are those of the least relative error.
     """
