@@ -109,6 +109,9 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
+	$(BIN)/kkl-gym agent compare Pendulum-v1 --noise 0.3 0.1 --information state x_hat z stacked --aggregate 4 --seeds 5 \
+		--out runs/agents/noise
+	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(MAKE) figures
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
