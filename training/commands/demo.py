@@ -121,7 +121,8 @@ class Episode:
     x, x_hat : ndarray, shape (steps + 1, nx)
         States and their estimates.
     spinn : ndarray, shape (steps + 1, nx), or None
-        What the paper's observer makes of the same outputs, if it ships.
+        What the paper's observer makes of the same outputs, if it ships and nothing acts on
+        the system, of which it would not know.
     y : ndarray, shape (steps + 1, ny)
         Noisy outputs.
     seconds : float
@@ -213,7 +214,8 @@ def play(
             break
     x, x_hat, y = (np.array([info[key] for info in infos]) for key in ("x", "x_hat", "y"))
     system, level = environment.system, env.unwrapped.measurement_noise  # type: ignore[attr-defined]
-    paper = f"{system.name}-spinn" if type(system) in kkl_gym.SYSTEMS.values() else None
+    ships = acting is None and type(system) in kkl_gym.SYSTEMS.values()  # SPINN's maps know no inputs
+    paper = f"{system.name}-spinn" if ships else None
     return Episode(
         label=environment.label,
         chosen=environment.observer is not None,

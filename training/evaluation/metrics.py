@@ -34,28 +34,30 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     ValueError
         If the shapes differ, or no step is left.
     """
-    return np.asarray(percentage_error(*_compared(x, x_hat, skip)).mean(0))
+    return np.asarray(percentage_error(x, x_hat, skip).mean(0))
 
 
-def percentage_error(x: np.ndarray, x_hat: np.ndarray) -> np.ndarray:
+def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Symmetric absolute percentage error at each step, whose mean over the steps is :func:`smape`.
 
     Parameters
     ----------
     x, x_hat : ndarray, shape (steps, n, nx)
         States and estimates.
+    skip : int
+        Number of first steps left out.
 
     Returns
     -------
-    ndarray, shape (steps, n)
+    ndarray, shape (steps - skip, n)
         Percent, between 0 and 200.
 
     Raises
     ------
     ValueError
-        If the shapes differ.
+        If the shapes differ, or no step is left.
     """
-    x, x_hat = _compared(x, x_hat, 0)
+    x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
     return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size))
 

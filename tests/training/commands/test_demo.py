@@ -109,6 +109,14 @@ def slow_switch(x):
     return x[:, :1] > 0
 
 
+@pytest.mark.parametrize("policy", [None, f"{__file__}:push"])
+def test_spinn_is_shown_where_it_is_told_as_much(policy):
+    """Its maps know no inputs."""
+    (environment,) = shown("reverse_duffing", None)
+    episode = play(environment, 5, 0.1, seed=0, policy=policy)
+    assert (episode.spinn is None) == (policy is not None)
+
+
 def test_a_window_takes_no_policy():
     with pytest.raises(SystemExit, match="leave out --policy beside --live"):
         main(["demo", "lorenz", "--live", "--policy", f"{__file__}:push"])
