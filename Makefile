@@ -46,12 +46,12 @@ maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; 
 		$(BIN)/kkl-gym train $$system --size small --resume || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
 	for system in $(CLOSED); do \
-		$(BIN)/kkl-gym train $$system --closed-loop --config training/version1.json --threads 2 --resume || exit 1; done
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym train $$system --config training/version1.json --threads 2 \
-		--out runs/$$system-v1 --resume || exit 1; done
+		$(BIN)/kkl-gym train $$system --closed-loop --threads 2 --resume || exit 1; \
+		$(BIN)/kkl-gym errorbars runs/$$system-closed-loop/$$system-closed-loop.safetensors --policy controller \
+			|| exit 1; done
 
 results: $(VENV)/ready  ## the accuracy in the README and in docs/
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) $(SYSTEMS:%=%-v1) \
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
 		--csv docs/results/accuracy.csv
 	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system $$system-spinn --noise 0.05 0.1 0.2 1 \
 		--csv docs/results/noise_levels/$$system.csv || exit 1; done
@@ -60,7 +60,7 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	mkdir -p docs/results/error_bars
 	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-v1) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures
 
@@ -96,6 +96,7 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
+	$(BIN)/kkl-gym agent compare --systems $(CLOSED) --information x_hat_std --no-more-noise
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \

@@ -695,7 +695,7 @@ def load(
     ----------
     name_or_path : str or PathLike
         A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file. A name without a version is
-        the newest; ``"van_der_pol-v1"`` is that version for good.
+        the newest; ``"van_der_pol-v2"`` is that version for good.
     measurement_noise : float or sequence of float, length ny, optional
         As for :class:`KKLObserver`.
     process_noise : float, optional

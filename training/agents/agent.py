@@ -12,7 +12,15 @@ from gymnasium.vector import AutoresetMode
 from kkl_gym import SYSTEMS, System, get_system
 from observers import MLP, storage
 from observers.artifact import ArtifactError, resolve, shipped
-from training.agents.information import EKF_PROCESS_NOISE, INFORMATION, STACKED, Features, Information, make
+from training.agents.information import (
+    EKF_PROCESS_NOISE,
+    INFORMATION,
+    OBSERVED,
+    STACKED,
+    Features,
+    Information,
+    make,
+)
 from training.jobs import describe
 from training.systems import ControlTask
 
@@ -36,7 +44,7 @@ class Agent:
         Whether tanh bounds the actions (SAC) or a cut at -1 and 1 (PPO).
     task : ControlTask
         Where it acts.
-    information : {"state", "x_hat", "z", "y", "stacked", "ekf"}
+    information : {"state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"}
         What it is shown.
     observer : str, optional
         Name and version of the shipped map, or path of the file, that it was trained on.
@@ -140,7 +148,7 @@ class Agent:
                 f"the agent's system is {task.system!r}, and system={system!r}: give system={task.system!r} if you "
                 "trust the agent's file with what that imports, or give the class"
             )
-        if self.information in ("x_hat", "z") and self.observer is None:
+        if self.information in OBSERVED and self.observer is None:
             raise AgentError(f"an agent that knows {self.information} must name its observer")
         if self.observer is not None and fingerprint(self.observer) != self.fingerprint:
             raise AgentError(f"the agent was trained on another version of the observer {self.observer!r}")

@@ -13,7 +13,7 @@ import kkl_gym
 from kkl_gym import get_system
 from observers.storage import explained, write
 from training.agents.agent import fingerprint, rules, versioned
-from training.agents.information import make, observer_of
+from training.agents.information import OBSERVED, make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
 from training.evaluation.levels import Level, as_cell, as_name
@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
 # What agents know: an information set of training.agents.information, or y or the state with a policy that remembers.
-Compared = Literal["state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"]
-COMPARED: tuple[Compared, ...] = get_args(Compared)
+Compared = Literal["state", "ekf", "x_hat", "x_hat_std", "z", "stacked", "y", "recurrent", "recurrent-state"]
+ALL: tuple[Compared, ...] = get_args(Compared)
+ASKED_FOR = ("x_hat_std",)  # compared where somebody asks for it: not every observer has error bars
+COMPARED: tuple[Compared, ...] = tuple(knows for knows in ALL if knows not in ASKED_FOR)
 
 MORE_NOISE = {name: found.second_noise for name, found in PROFILES.items() if found.second_noise}
 SEEDS = 5
@@ -49,7 +51,7 @@ class Case:
         A shipped system, or a class of the user's as "module:Class" or "script.py:Class".
     measurement_noise : float or tuple of float, length ny
         Standard deviation of the noise on each sample of y.
-    information : {"state", "ekf", "x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"}
+    information : {"state", "ekf", "x_hat", "x_hat_std", "z", "stacked", "y", "recurrent", "recurrent-state"}
         What the agent knows.
     seed : int
         The agent's.
@@ -100,7 +102,7 @@ class Case:
 
     @property
     def _observes(self) -> bool:
-        return self.information in ("x_hat", "z")
+        return self.information in OBSERVED
 
     @property
     def done(self) -> bool:
@@ -330,7 +332,15 @@ def collect(
     import pandas as pd
 
     systems = (*TASKS, *own)
-    plan = planned(out, systems=systems, seeds=MANY, episodes=episodes, timesteps=timesteps, observers=observers)
+    plan = planned(
+        out,
+        systems=systems,
+        information=ALL,
+        seeds=MANY,
+        episodes=episodes,
+        timesteps=timesteps,
+        observers=observers,
+    )
     idle_scores: dict[tuple[str, Level], float] = {}
     rows = []
     for case in plan:

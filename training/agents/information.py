@@ -14,14 +14,17 @@ from kkl_gym.system import System
 from kkl_gym.vector import with_mask
 from kkl_gym.wrappers.vector import VectorEnv, VectorEstimate, VectorWrapper, column, plant_of
 from observers import KKLObserver, load, shipped
+from observers.spread import deviations
 from training.agents.tasks import deviation
 from training.kalman import ExtendedKalmanFilter, measurement_covariance
 from training.systems import ControlTask, profile
 from training.trajectories.derivatives import linearised
 
-Information = Literal["state", "x_hat", "z", "y", "stacked", "ekf"]
+Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
+OBSERVED = ("x_hat", "x_hat_std", "z")  # what a learned observer tells
 STACKED = 8  # outputs, each with the action before it
+SUREST = 1e-6  # standard deviation in multiples of a state's scale, below which agents see no difference
 EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second of its pace
 
 Infos = dict[str, Any]
@@ -191,11 +194,11 @@ def make(
     ----------
     task : ControlTask
         What the agent is to do.
-    information : {"state", "x_hat", "z", "ekf", "y", "stacked"}
-        "state": the true state. "x_hat": the learned observer's estimate. "z": its filter's state as its network sees
-        it, with the time since reset. "ekf": the estimate of an extended Kalman filter with the exact model. These
-        observers see every sample. "y": the noisy output when the agent acts. "stacked": the last ``STACKED`` of
-        those, each with the action before it.
+    information : {"state", "x_hat", "x_hat_std", "z", "ekf", "y", "stacked"}
+        "state": the true state. "x_hat": the learned observer's estimate. "x_hat_std": the same, with how sure the
+        observer is of each state. "z": its filter's state as its network sees it, with the time since reset. "ekf": the
+        estimate of an extended Kalman filter with the exact model. These observers see every sample. "y": the noisy
+        output when the agent acts. "stacked": the last ``STACKED`` of those, each with the action before it.
     num_envs : int
         Rows.
     autoreset_mode : str or AutoresetMode
@@ -213,7 +216,8 @@ def make(
     Raises
     ------
     ValueError
-        On an unknown name, or if no observer is named and none ships for the system.
+        On an unknown name, if no observer is named and none ships for the system, or if "x_hat_std" is asked of one
+        without error bars.
     """
     if information not in INFORMATION:
         raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
@@ -243,6 +247,9 @@ def make(
     if information == "x_hat":
         env = task.make(num_envs, partial(KKLVectorObservation, observer=observer), autoreset_mode)
         return Features(env, ["x_hat"], feature=of("x_hat"), width=system.nx)
+    if information == "x_hat_std":
+        env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, uncertainty=True), autoreset_mode)
+        return Features(env, ["x_hat", "x_cov"], feature=estimate_and_spread(system), width=2 * system.nx)
     env = task.make(num_envs, partial(KKLVectorObservation, observer=observer, estimate="z"), autoreset_mode)
     feature, width = modes(load(observer, task.measurement_noise), system)
     return Features(env, ["z", "sample"], feature=feature, width=width)
@@ -270,6 +277,30 @@ def observer_of(system: System) -> str:
     if name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
     return name
+
+
+def estimate_and_spread(system: System) -> Feature:
+    """Make the feature of an estimate from the target, and of its standard deviations, both in units of the scale.
+
+    Standard deviations differ by orders of magnitude in the course of an episode, so that their logarithms are shown.
+
+    Parameters
+    ----------
+    system : System
+        Whose target and scale are meant.
+
+    Returns
+    -------
+    callable
+        A mapping with "x_hat" of shape (n, nx) and "x_cov" of shape (n, nx, nx) in, an array of shape (n, 2 nx) out.
+    """
+    scale = np.array(system.scale)
+
+    def feature(info: Mapping[str, np.ndarray]) -> np.ndarray:
+        sizes = np.log10(np.maximum(deviations(info["x_cov"]) / scale, SUREST))
+        return np.concatenate([deviation(system, info["x_hat"]), sizes], axis=1)
+
+    return feature
 
 
 def output_deviation(system: System) -> Feature:

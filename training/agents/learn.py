@@ -27,7 +27,7 @@ from training.agents.agent import Agent, fingerprint, rules, versioned
 from training.agents.bridge import SB3VecEnv
 from training.agents.checkpoint import CURVE, Checkpoint
 from training.agents.cost import Cost
-from training.agents.information import Features, Information, make, observer_of
+from training.agents.information import OBSERVED, Features, Information, make, observer_of
 from training.agents.play import Policy
 from training.agents.policy import linear, perceptron
 from training.checkpoints import SUFFIX
@@ -59,7 +59,7 @@ def learn(
     ----------
     task : ControlTask
         What it is to do.
-    information : {"state", "x_hat", "z", "y", "stacked", "ekf"}
+    information : {"state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"}
         What it knows, as for :func:`training.agents.information.make`.
     folder : Path
         Receives agent.safetensors, the learning curve, progress.csv, and agent.checkpoint.pt.
@@ -68,7 +68,7 @@ def learn(
     timesteps : int, optional
         Actions in all rows together; by default what hyperparameters/ALGORITHM.yml says.
     observer : str, optional
-        A shipped map or a ``.safetensors`` file, for an agent that knows "x_hat" or "z"; by default
+        A shipped map or a ``.safetensors`` file, for an agent that knows "x_hat", "x_hat_std" or "z"; by default
         :func:`training.agents.information.observer_of` the system.
     algorithm : {"ppo", "sac"}, optional
         By default that of the system's profile.
@@ -90,10 +90,10 @@ def learn(
     """
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
-    if observer is not None and information not in ("x_hat", "z"):
+    if observer is not None and information not in OBSERVED:
         raise ValueError(f"an agent that knows {information!r} has no use for the observer {observer!r}")
     name, settings = hyperparameters(task, algorithm)
-    named = versioned(observer or observer_of(get_system(task.system))) if information in ("x_hat", "z") else None
+    named = versioned(observer or observer_of(get_system(task.system))) if information in OBSERVED else None
     env = make(task, information, settings["n_envs"], observer=named)
     timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
     seen: dict[str, Any] = {

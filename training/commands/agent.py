@@ -27,7 +27,7 @@ from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
 
-Knows = Literal["state", "x_hat", "z", "y", "stacked", "ekf", "recurrent"]
+Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf", "recurrent"]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,8 @@ from observers.storage import write
 from training import markdown
 from training.agents.any_environment.information import SHOWN
 from training.agents.comparison import (
+    ALL,
+    ASKED_FOR,
     COMPARED,
     Compared,
     collect,
@@ -23,7 +25,7 @@ from training.agents.comparison import (
     planned,
     run_case,
 )
-from training.agents.information import observer_of
+from training.agents.information import OBSERVED, observer_of
 from training.agents.statistics import draw_scores, interval, middle, normalised
 from training.agents.tasks import TASKS
 from training.commands.compare_environments import compare_environments
@@ -39,6 +41,7 @@ LABELS = {
     "state": "full state",
     "ekf": "EKF estimate",
     "x_hat": "x̂",
+    "x_hat_std": "x̂ and its standard deviations",
     "z": "ẑ",
     "stacked": "8 y and actions",
     "y": "y",
@@ -65,7 +68,8 @@ class Compare:
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
-        tuple[Compared, ...] | None, tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all)")
+        tuple[Compared, ...] | None,
+        tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all but x_hat_std)"),
     ] = None
     """What agents know (docs/guides/agents.md). In environments: state, x_hat, z, stacked, recurrent, y."""
     seeds: int = 5
@@ -77,7 +81,7 @@ class Compare:
     more_noise: bool = True
     """Compare also at noise 0.2 on Van der Pol and at noise 2 on Lorenz."""
     observers: tuple[str, ...] = ()
-    """Observers for agents that know x_hat or z: a .safetensors file for each system of yours, or shipped maps."""
+    """Observers for agents that know of one: a .safetensors file for each system of yours, or shipped maps."""
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
     out: Annotated[
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
@@ -105,8 +109,9 @@ class Compare:
         """
         if min(self.seeds, self.episodes) < 1:
             raise ValueError(f"seeds and episodes must be positive, got {self.seeds} and {self.episodes}")
-        known: tuple[Any, ...] = SHOWN if self.environments else COMPARED
-        information = known if self.information is None else self.information
+        known: tuple[Any, ...] = SHOWN if self.environments else ALL
+        usual: tuple[Any, ...] = SHOWN if self.environments else COMPARED
+        information = usual if self.information is None else self.information
         for what, given in (
             ("systems", self.systems),
             ("environments", self.environments),
@@ -175,7 +180,7 @@ class Compare:
                     f"the observer {name} is for {system}: name one for each of {', '.join(systems)} at most"
                 )
             found[system] = name
-        if {"x_hat", "z"} & set(information):
+        if {*OBSERVED} & set(information):
             for name in self.systems:
                 if (own := get_system(name)).name not in found:
                     observer_of(own)  # an error now, not when their turn comes
@@ -202,7 +207,7 @@ def report(out: Path) -> None:
     ]
     cells = _cells(results, tasks)
     rows = []
-    for knows in COMPARED:
+    for knows in _shown(results):
         row = [LABELS[knows]]
         for task in tasks:
             cell = cells.get((*task, knows))
@@ -215,7 +220,7 @@ def report(out: Path) -> None:
         rows.append(row)
     lines += markdown.table(["", *(f"{system.replace('_', ' ')}, noise {noise}" for system, noise in tasks)], rows)
     minutes = results.groupby("knows").seconds.mean() / 60
-    spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in COMPARED if knows in minutes)
+    spent = ", ".join(f"{LABELS[knows]} {minutes[knows]:.1f}" for knows in ALL if knows in minutes)
     lines += ["", f"CPU minutes for one training: {spent}."]
     write(out / "table.md", "\n".join(lines) + "\n")
     draw_results(out, out / "scores.png")
@@ -232,7 +237,7 @@ def draw_results(out: Path, path: Path) -> None:
         Of the figure.
     """
     results, partial = _read(out)
-    tasks, shown = _tasks(results), COMPARED[::-1]
+    tasks, shown = _tasks(results), _shown(results)[::-1]
     cells = _cells(results, tasks)
     panels = {
         f"{system.replace('_', ' ')}, noise {noise}": [cells.get((system, noise, knows)) for knows in shown]
@@ -256,6 +261,11 @@ def _read(out: Path) -> tuple["pd.DataFrame", str]:
     plan = set(kinds(levels))
     missing = plan - set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
     return results, f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
+
+
+def _shown(results: "pd.DataFrame") -> list[Compared]:
+    """What agents know, row by row: all that is usual, and what else was asked for."""
+    return [knows for knows in ALL if knows not in ASKED_FOR or knows in set(results.knows)]
 
 
 def _tasks(results: "pd.DataFrame") -> list[tuple[str, str]]:

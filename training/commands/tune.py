@@ -1,5 +1,6 @@
 """``kkl-gym tune``: a spectrum for a system and a noise level, and what others would have given."""
 
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -93,7 +94,7 @@ class Tune:
         runs = _Runs.of(self, system)
         given = "".join(f" {name} {value:g}" for name, value in self.parameters.items())
         name = system.name if self.pipeline == "input-aware" else f"{system.name}-{self.pipeline}"
-        name += "-policy" if self.policy else ""
+        name += f"-{_of_function(self.policy)}" if self.policy else ""
         folder = (
             self.out
             or Path("runs") / "tuning" / f"{name}-{show_level(runs.noise).replace(', ', '-')}{given.replace(' ', '-')}"
@@ -238,3 +239,8 @@ class _Runs:
         others = np.divide(about, 5), np.multiply(2 if asked else 1, about)
         found = {0.0, self.noise, *(noise_levels("measurement_noise", level, system.ny) for level in others)}
         return sorted(found, key=lambda level: np.atleast_1d(level).tolist())
+
+
+def _of_function(policy: str) -> str:
+    """The name of a policy's function as a folder can have it: ``script.py:act`` is ``act``."""
+    return re.sub(r"\W+", "-", policy.rpartition(":")[2])

@@ -13,7 +13,6 @@ PROFILE = Profile(
     settings={"measurement_noise_max": 3.0},  # its output is the largest of the four
     fault_deadline=2.0,
     task=ControlTask("lorenz", duration=5.0),  # the input is weak
-    agent_observer="lorenz-v1",  # on which the results in docs/guides/agents.md rest
     second_noise=2.0,
     printed={"spinn": 8.64, "ae": 88.1, "dmf": 8.76, "node": 11.0},
 )

@@ -12,6 +12,5 @@ PROFILE = Profile(
     spinn_settings={"eigenvalues": evenly_spaced(9, -3.0, -20.0)},
     fault_deadline=2.0,
     task=ControlTask("rossler", period=0.1, duration=30.0),
-    agent_observer="rossler-v1",  # on which the results in docs/guides/agents.md rest
     printed={"spinn": 4.77, "ae": 79.9, "dmf": 23.5, "node": 24.7},
 )

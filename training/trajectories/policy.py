@@ -8,6 +8,7 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from kkl_gym.user_lines import user_line
 from training.trajectories.controllers import Controller
 from training.trajectories.signals import random_signals
 
@@ -92,7 +93,7 @@ def under_policy(
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
-    """Raise an error unless a policy does on some states what a policy should.
+    """Raise an error unless a policy does on some states what a policy should, and wherever it fails later.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     Returns
     -------
     callable
-        The same.
+        The same, whose errors are ValueErrors that say where in the user's code they come from.
 
     Raises
     ------
@@ -115,18 +116,25 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
     """
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
+
+    def act(x: np.ndarray) -> np.ndarray:
+        try:
+            actions = np.asarray(policy(x), dtype=float)
+        except Exception as error:  # whatever a user's function does wrong
+            line = user_line(error)
+            raise ValueError(
+                f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}"
+                + (f" ({line})" if line else "")
+            ) from error
+        if actions.shape != (len(x), system.nu):
+            raise ValueError(
+                f"the policy {name!r} must turn states of shape {x.shape} into actions of shape "
+                f"{(len(x), system.nu)}, got {actions.shape}"
+            )
+        return actions
+
     x = _states(system)
-    try:
-        actions = np.asarray(policy(x), dtype=float)
-    except Exception as error:  # whatever a user's function does wrong
-        raise ValueError(
-            f"the policy {name!r} fails on states of shape {x.shape}: {type(error).__name__}: {error}"
-        ) from error
-    if actions.shape != (len(x), system.nu):
-        raise ValueError(
-            f"the policy {name!r} must turn states of shape {x.shape} into actions of shape {(len(x), system.nu)}, got "
-            f"{actions.shape}"
-        )
+    actions = act(x)
     wrong = ~(np.abs(actions) <= 1.0).all(-1)
     if wrong.any():
         at = int(wrong.argmax())
@@ -134,7 +142,7 @@ def checked_policy(policy: Controller, system: System, name: str) -> Controller:
             f"the policy {name!r} must give actions in [-1, 1], which stand for inputs up to u_max = {system.u_max}; "
             f"at x = {x[at].tolist()} it gives {actions[at].tolist()}"
         )
-    return policy
+    return act
 
 
 def policy_fingerprint(policy: Controller, system: System) -> str:

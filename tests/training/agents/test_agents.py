@@ -71,7 +71,7 @@ def test_equal_seeds_give_equal_agents(learned, tmp_path):
 def test_a_saved_agent_plays_the_same(learned):
     agent, folder = learned
     read = Agent.read(folder / "agent.safetensors")
-    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-closed-loop-v1")
+    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-closed-loop-v2")
     assert read.fingerprint == fingerprint("van_der_pol-closed-loop")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
@@ -144,7 +144,7 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         find("nothing")
 
 
-@pytest.mark.parametrize("name", ["van_der_pol-closed-loop-v1", "lorenz-v1"])
+@pytest.mark.parametrize("name", ["van_der_pol-closed-loop-v2", "lorenz-v2"])
 def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
     """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
     with safe_open(resolve(name), framework="numpy") as opened:
@@ -181,7 +181,7 @@ def parts():
     lambda t, d: d["task"].update(system=3),
     lambda t, d: d["task"].update(duration=float("inf")),
     lambda t, d: d.update(observer=3),
-    lambda t, d: d.update(observer=["lorenz-v1"]),
+    lambda t, d: d.update(observer=["lorenz-v2"]),
     lambda t, d: d.update(fingerprint=3),
     lambda t, d: d.update(rules=[]),
     lambda t, d: d.update(training="sac"),

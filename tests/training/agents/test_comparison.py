@@ -85,6 +85,11 @@ def test_table_and_figure_from_the_results_alone(tmp_path):
     assert "| y, recurrent agent | 0.72, 50 %, 1 |" in table  # too few for an interval
     assert "full state 1.0" in table.splitlines()[-1]
     assert (tmp_path / "scores.png").stat().st_size > 1000
+    assert "standard deviations" not in table  # which nobody asked for
+    unsure = pd.DataFrame(rows[:4]).assign(knows="x_hat_std", score=-0.3)
+    pd.concat([pd.DataFrame(rows), unsure]).to_csv(tmp_path / "results.csv", index=False)
+    report(tmp_path)
+    assert "| x̂ and its standard deviations | 0.72 [0." in (tmp_path / "table.md").read_text()
     only_y = pd.DataFrame(rows).query("knows != 'state'")
     only_y.to_csv(tmp_path / "results.csv", index=False)
     report(tmp_path)
@@ -176,7 +181,7 @@ def test_wrong_numbers(tmp_path):
     for wrong, message in (
         ({"systems": ("mine.py:Mine",)}, "no file mine.py"),
         ({"observers": ("rossler",)}, "the observer rossler is for rossler: name one for each of lorenz at most"),
-        ({"observers": ("lorenz", "lorenz-v1")}, "the observer lorenz-v1 is for lorenz"),
+        ({"observers": ("lorenz", "lorenz-v2")}, "the observer lorenz-v2 is for lorenz"),
     ):
         with pytest.raises(ValueError, match=message):
             toy(tmp_path, **wrong).run(Console())

@@ -48,6 +48,20 @@ def test_actions_that_are_no_numbers_are_an_error():
                      dt=SYSTEM.dt, rng=rng, own=own)  # fmt: skip
 
 
+def test_a_policy_that_fails_on_the_way_says_where(tmp_path):
+    script = tmp_path / "mine.py"
+    script.write_text("def hold(x):\n    gain = [1.0] if len(x) < 30 else []\n    return gain[0] * x[:, :1]\n")
+    policy, own = named_policy(SYSTEM, f"{script}:hold"), np.ones(40, dtype=bool)
+    with pytest.raises(ValueError, match=r"hold' fails on states of shape \(40, 2\): IndexError: .*line 3 \(`return"):
+        under_policy(SYSTEM, policy, np.full((40, 2), 0.3), steps=3, dt=SYSTEM.dt, rng=np.random.default_rng(0),
+                     own=own)  # fmt: skip
+    script = tmp_path / "other.py"
+    script.write_text("def hold(x):\n    return x[:, :1] if len(x) < 30 else x\n")
+    policy = named_policy(SYSTEM, f"{script}:hold")
+    with pytest.raises(ValueError, match=r"into actions of shape \(40, 1\), got \(40, 2\)"):
+        policy(np.zeros((40, 2)))
+
+
 def test_an_unstable_plant_is_held_by_a_policy_alone():
     sizes = {"n": 30, "steps": 1000, "dt": SYSTEM.dt}
     with pytest.raises(ValueError, match="--policy"):

@@ -1,7 +1,7 @@
 """Choosing a spectrum, against closed forms on a linear system."""
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,11 +15,11 @@ from scipy.stats import spearmanr
 
 import training.tuning.check
 import training.tuning.probe
-from kkl_gym import get_system
+from kkl_gym import SYSTEMS, get_system
 from kkl_gym.simulate import simulate
 from observers import load
 from training.cli import main
-from training.config import Config, current_names, override, read_changes
+from training.config import current_names, read_changes
 from training.kalman import ExtendedKalmanFilter
 from training.presets import preset
 from training.seeds import Stream, generator
@@ -251,7 +251,7 @@ def test_plants_that_run_away_take_a_policy(tmp_path, capsys, monkeypatch):
         main(tune)
     main([*tune, "--policy", "controller"])
     again = "".join(capsys.readouterr().out.split()).rpartition("withit:")[2]  # lines break anywhere
-    config = "runs/tuning/saddle-policy-0.01/config.json"
+    config = "runs/tuning/saddle-controller-0.01/config.json"
     assert again == "".join(f"kkl-gym train {__file__}:Unstable --config {config} --policy controller".split())
     assert len(json.loads((tmp_path / config).read_text())["eigenvalues"]) == 2
 
@@ -353,30 +353,14 @@ def test_files_that_hold_no_settings(text, message, tmp_path):
         read_changes(tmp_path / "c.json")
 
 
-def test_settings_of_the_first_version_of_the_maps_are_still_known():
-    file = Path(training.__file__).with_name("version1.json")
-    config = override(preset(get_system("van_der_pol"), "input-aware", "fast"), read_changes(file))
-    made = load("van_der_pol-v1").artifact.training
-    made, now = current_names(made), asdict(config)
-    for name, value in made.items():
-        if name in now:
-            assert now[name] == (tuple(value) if isinstance(value, list) else value), name
-    # What had no setting then: one map of free and driven motion, trained by Adam, without process noise.
-    later = {
-        entry.name: {} if entry.name == "uncertain" else entry.default
-        for entry in fields(Config)
-        if entry.name not in made
-    }
-    later |= {"free_inverse": False, "optimiser": "adam", "process_noise_share": 0.0}
-    assert {
-        "noise_free_share",
-        "high_noise_emphasis",
-        "process_noise_share",
-        "lead_in_input",
-        "pairs",
-        "optimiser",
-    } <= set(later)
-    assert {name: now[name] for name in later} == later
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_the_command_trains_as_the_shipped_maps_were_trained(name):
+    config = preset(get_system(name), "input-aware", "fast")
+    made, now = current_names(load(name).artifact.training), json.loads(json.dumps(asdict(config)))
+    same = {entry: value for entry, value in now.items() if entry in made}
+    assert {"eigenvalues", "pairs", "inverse_steps", "learning_rate", "process_noise_share", "members"} & set(same)
+    for entry, value in same.items():
+        assert value == made[entry], entry
 
 
 def test_a_file_of_settings(tmp_path):
