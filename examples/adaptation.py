@@ -20,7 +20,7 @@ from rich.console import Console
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from training import train
 from training.config import override, settings_of
 from training.evaluation.errors import errors, unseen_trajectories

@@ -18,7 +18,7 @@ from rich.console import Console
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from training.evaluation.errors import errors, unseen_trajectories
 from training.identification import identify
 from training.records import Record

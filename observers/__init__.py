@@ -1,9 +1,13 @@
 """Learned KKL observers at run time: arrays and artifacts, NumPy alone (and Numba for large batches, if installed)."""
 
-from observers.artifact import Artifact, ArtifactError, ForwardMap, InverseMap, shipped
+from observers.artifact import Artifact
+from observers.errors import ArtifactError
 from observers.expression import Expression
 from observers.filter import LinearFilter
+from observers.forward import ForwardMap
+from observers.inverse import InverseMap
 from observers.monitor import Limits, Monitor
+from observers.names import shipped
 from observers.network import MLP
 from observers.observer import KKLObserver, load
 from observers.spread import Spread

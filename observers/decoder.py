@@ -5,8 +5,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from observers.artifact import Artifact, InverseMap
+from observers.artifact import Artifact
 from observers.compiled import CompiledDecoder
+from observers.inverse import InverseMap
 from observers.sparse import MANY_ROWS
 from observers.spread import Covariance
 

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact, ArtifactError, resolve
+from observers.artifact import Artifact
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.compiled import available
 from observers.decoder import Decoders, Read
+from observers.errors import ArtifactError
 from observers.monitor import Monitor
+from observers.names import resolve
 from observers.replacement import check_replacement
 from observers.spread import deviations
 

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from observers.artifact import Artifact, ArtifactError
+from observers.artifact import Artifact
 from observers.checks import shown
+from observers.errors import ArtifactError
 
 
 def check_replacement(artifact: Artifact, other: Artifact) -> None:

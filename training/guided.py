@@ -10,8 +10,8 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers import Artifact, KKLObserver
-from observers.artifact import resolve
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array, shown
+from observers.names import resolve
 from training.kalman import LEAST_VARIANCE, UnscentedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
 from training.trajectories.noise import draw_process_noise, noisy_output

@@ -20,7 +20,7 @@ from PIL import Image
 
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
-from observers.artifact import resolve
+from observers.names import resolve
 from observers.spread import deviations
 from observers.storage import replacing, write
 from training.agents import picture

@@ -10,8 +10,8 @@ import numpy as np
 from kkl_gym.plant import Plant
 from kkl_gym.rows import clipped
 from observers import Artifact, KKLObserver, LinearFilter, shipped
-from observers.artifact import resolve
 from observers.checks import choice, flag
+from observers.names import resolve
 from observers.spread import deviations
 
 

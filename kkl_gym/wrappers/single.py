@@ -15,8 +15,8 @@ from kkl_gym.rendering import TRAIL
 from kkl_gym.wrappers.estimator import KKLEstimator, observation
 from kkl_gym.wrappers.named import NamedEstimator, Samples
 from observers import Artifact
-from observers.artifact import resolve
 from observers.checks import integer, shown
+from observers.names import resolve
 
 _FEW = 8  # numbers that are compared one by one more quickly than NumPy clips them
 _FLOAT32 = np.dtype(np.float32)

@@ -16,8 +16,8 @@ from kkl_gym.vector import Infos, KKLVectorEnv, autoreset_mode_of, last_of_episo
 from kkl_gym.wrappers.estimator import Estimator, KKLEstimator, observation
 from kkl_gym.wrappers.named import NamedEstimator, Samples
 from observers import Artifact
-from observers.artifact import resolve
 from observers.checks import integer, shown
+from observers.names import resolve
 
 VectorEnv = gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from observers import Artifact, ArtifactError, shipped
-from observers.artifact import resolve
+from observers.names import resolve
 from training.agents.agent import Agent, AgentError
 from training.commands.agent import find
 from training.systems import PROFILES

@@ -31,6 +31,11 @@ N = 4
 ESCAPING = [-44.0, -17.0, 212.0]  # for Rossler, within a few steps
 
 
+# What rounding in float32 makes of values of some ten, which hangs on the size of the batch and on the processor.
+# It is that of T_inv, and of T where starts are known.
+NETWORK = 1e-4
+
+
 def actions(steps, n=N, seed=0):
     return np.random.default_rng(seed).uniform(-1.5, 1.5, (steps, n, 1)).astype(np.float32)
 
@@ -73,10 +78,10 @@ def assert_same(ours, theirs, at=""):
             assert (a is None) == (b is None)
             if b is not None:
                 assert a.dtype == b.dtype
-                assert np.allclose(a, b, rtol=1e-5, atol=1e-5), at
+                assert np.allclose(a, b, rtol=NETWORK, atol=NETWORK), at
     else:
         assert ours.dtype == theirs.dtype, at
-        tolerance = 1e-5 if ours.dtype == np.float32 or "x_hat" in at else 1e-9
+        tolerance = NETWORK if ours.dtype == np.float32 or at.endswith(("x_hat", "z")) else 1e-9
         assert np.allclose(ours, theirs, rtol=tolerance, atol=tolerance), (at, np.abs(ours - theirs).max())
 
 
@@ -127,9 +132,9 @@ def test_many_rows_are_as_few(name, estimate, mode):
     waits, halves = count(), count()
     for action in actions(60, MANY_ROWS):
         (obs, *_, info), (obs_few, *_, info_few) = results
-        assert np.allclose(obs[:N], obs_few, rtol=1e-5, atol=1e-5)
+        assert np.allclose(obs[:N], obs_few, rtol=NETWORK, atol=NETWORK)
         for key in info_few.keys() - {"final_obs", "final_info"}:
-            tolerance = 1e-5 if key == "x_hat" else 1e-9
+            tolerance = NETWORK if key == "x_hat" else 1e-9
             assert np.allclose(info[key][:N], info_few[key], rtol=tolerance, atol=tolerance), key
         ended = results[1][2] | results[1][3] if len(results[1]) == 5 else np.zeros(N, dtype=bool)
         if mode is AutoresetMode.DISABLED and ended.any() and next(waits) % 3 == 2:  # some steps after the end

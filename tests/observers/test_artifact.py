@@ -9,10 +9,10 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-import observers.artifact
+import observers.names
 from kkl_gym import SYSTEMS, get_system
 from observers import Artifact, ArtifactError, KKLObserver, Limits, load, shipped
-from observers.artifact import resolve
+from observers.names import resolve
 
 KINDS = [
     {},
@@ -488,7 +488,7 @@ def shelf(tmp_path, monkeypatch, saved):
     ):
         shutil.copy(saved(system=system), tmp_path / "maps" / f"{name}.safetensors")
     (tmp_path / "maps" / "README.md").write_text("no map")
-    monkeypatch.setattr(observers.artifact, "files", lambda package: tmp_path)
+    monkeypatch.setattr(observers.names, "files", lambda package: tmp_path)
 
 
 def test_names_of_what_ships(shelf):

@@ -14,7 +14,8 @@ from error_bars import with_error_bars
 import observers
 from kkl_gym import get_system
 from observers import compiled as machine
-from observers.artifact import Artifact, resolve
+from observers.artifact import Artifact
+from observers.names import resolve
 from observers.observer import SOON
 from observers.sparse import MANY_ROWS
 

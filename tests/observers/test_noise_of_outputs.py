@@ -8,7 +8,7 @@ import pytest
 from linear_system import exact_observer
 
 from observers import Artifact, ArtifactError, Expression, KKLObserver, Limits, Monitor, load
-from observers.artifact import resolve
+from observers.names import resolve
 from observers.network import MLP
 
 

@@ -5,7 +5,7 @@ from safetensors import safe_open
 import observers
 from kkl_gym import SYSTEMS, get_system
 from kkl_gym.simulate import simulate
-from observers.artifact import resolve
+from observers.names import resolve
 
 NAMES = sorted(SYSTEMS)
 

@@ -11,7 +11,8 @@ from gymnasium.vector import AutoresetMode
 
 from kkl_gym import SYSTEMS, System, get_system
 from observers import MLP, storage
-from observers.artifact import ArtifactError, resolve, shipped
+from observers.errors import ArtifactError
+from observers.names import resolve, shipped
 from training.agents.information import (
     EKF_PROCESS_NOISE,
     INFORMATION,

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from kkl_gym import get_system
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from observers.storage import write
 from training import markdown
 from training.agents.any_environment.information import SHOWN

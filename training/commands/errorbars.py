@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from training.commands.options import OwnPolicy, OwnSystem, read_observers, read_policy
 from training.progress import progress_bars
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from kkl_gym.system import System
 from kkl_gym.systems import get_system, system_of
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from training.commands.data import DataOptions
 from training.commands.options import OwnSystem, Parameters, SystemName, Unknowns
 from training.commands.settings import Settings

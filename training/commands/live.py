@@ -9,7 +9,7 @@ import numpy as np
 
 import kkl_gym
 from observers import Artifact
-from observers.artifact import resolve
+from observers.names import resolve
 from training.commands.options import Shown
 from training.evaluation.faults import BIAS, FAULTS, Fault
 from training.evaluation.levels import Level

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from observers import Artifact, shipped
-from observers.artifact import resolve
+from observers.names import resolve
 from training.config import current_names
 
 LEAST_WIDTH = 80  # of the table

@@ -11,7 +11,7 @@ from kkl_gym import ENV_IDS, OWN_ID, SYSTEMS, get_system
 from kkl_gym.system import System
 from kkl_gym.systems import system_of
 from observers import Artifact, shipped
-from observers.artifact import resolve
+from observers.names import resolve
 from training.evaluation.levels import Level, read_level
 from training.systems import named_policy
 from training.trajectories.controllers import Controller

@@ -17,7 +17,7 @@ import kkl_gym
 from kkl_gym.compiled import batch_step
 from observers import Artifact, KKLObserver
 from observers import shipped as shipped_maps
-from observers.artifact import resolve
+from observers.names import resolve
 from training.commands.options import OneObserver, OneSystem, Shown, shown
 from training.commands.speed_observers import in_turns, limit, observer_tasks, table_rows
 from training.presets import SMALL

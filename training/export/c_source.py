@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
-from observers.artifact import InverseMap
+from observers.inverse import InverseMap
 from training.export import c_templates
 from training.export.exported import Exported
 

@@ -10,8 +10,10 @@ import numpy as np
 
 from kkl_gym.systems import SYSTEMS
 from observers import Artifact, KKLObserver
-from observers.artifact import ArtifactError, InverseMap, resolve
 from observers.checks import choice
+from observers.errors import ArtifactError
+from observers.inverse import InverseMap
+from observers.names import resolve
 from observers.storage import checksum
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and

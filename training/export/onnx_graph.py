@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
-from observers.artifact import InverseMap
+from observers.inverse import InverseMap
 from training.export.exported import Exported
 
 OPSET, IR = 13, 7  # of 2020 and 2021; what reads ONNX reads these

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from observers import storage
-from observers.artifact import InverseMap
+from observers.inverse import InverseMap
 from training.export.exported import Exported
 
 KEY = "kkl_step"  # of the metadata

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.artifact import resolve
+from observers.names import resolve
 from training.config import Config
 from training.evaluation.levels import Level
 from training.methods.base import Budget, CausalObserver, Configuration, Method, Task, WrongParameters

@@ -20,7 +20,7 @@ from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
 from observers import MLP
-from observers.artifact import resolve
+from observers.names import resolve
 from training.agents import SB3VecEnv
 from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.cost import WORST, Cost

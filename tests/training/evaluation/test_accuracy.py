@@ -8,7 +8,7 @@ import pytest
 
 import observers
 from kkl_gym import SYSTEMS, get_system
-from observers.artifact import resolve
+from observers.names import resolve
 from training.config import Config, current_names
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape

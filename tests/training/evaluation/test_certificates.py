@@ -18,7 +18,7 @@ import training.evaluation.certificates.certificate
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import MLP, Artifact, ForwardMap, InverseMap, LinearFilter
-from observers.artifact import resolve
+from observers.names import resolve
 from training import certify
 from training.cli import main
 from training.evaluation.certificates.certificate import parts

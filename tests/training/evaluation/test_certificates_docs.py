@@ -9,7 +9,7 @@ import pytest
 
 from kkl_gym import get_system
 from observers import Artifact, LinearFilter
-from observers.artifact import resolve
+from observers.names import resolve
 from training import certify
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -16,7 +16,7 @@ import training.evaluation.faults
 from kkl_gym import VanDerPol
 from kkl_gym.elementary import sin
 from observers import Artifact, KKLObserver, Limits
-from observers.artifact import resolve
+from observers.names import resolve
 from training.cli import main
 from training.commands.faults import report
 from training.evaluation.faults import FAULTS, PARTS, simulate_faults

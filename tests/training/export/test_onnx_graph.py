@@ -8,7 +8,8 @@ from exported_steps import apart, exported_of, in_doubles, motion, noise
 from rollout_observers import observer_of
 
 from observers import shipped
-from observers.artifact import ArtifactError, resolve
+from observers.errors import ArtifactError
+from observers.names import resolve
 from observers.storage import checksum
 from training.export import Exported
 

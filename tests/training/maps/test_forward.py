@@ -10,7 +10,7 @@ from small_runs import CPU
 from kkl_gym import ReverseDuffing, get_system
 from kkl_gym.simulate import simulate
 from observers import Artifact, LinearFilter
-from observers.artifact import resolve
+from observers.names import resolve
 from training.maps.forward import ForwardProblem, on_tensors, transients, truncation_time
 from training.maps.networks import Network
 from training.maps.scaling import StateScale

@@ -1,0 +1,229 @@
+"""T_inv: from the filter's state, and what else it is told, to the state estimate."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from observers.checks import is_finite
+from observers.errors import ArtifactError, check_shapes
+from observers.network import MLP
+from observers.spread import Spread
+
+FEATURES = ("z_y", "z_u", "measurement_noise", "process_noise", "age")
+_CONDITIONS = FEATURES[2:]  # of an estimate; each has a unit and an end
+
+
+@dataclass(frozen=True)
+class InverseMap:
+    """T_inv: the filter's state, and what else it is told, to the state estimate.
+
+    The network's inputs are, in the order of ``features`` (of which "z_y" comes first and the rest may be missing):
+
+    - ``z_y``, ``z_u``: together ``whiten @ (z - z_offset)``, divided by 1 + (sigma_v * noise_gain)^2: over the training
+      data each has unit variance without measurement noise, so this shrinks it to its linear conditional mean;
+    - ``measurement_noise``: log(1 + sigma_v / measurement_noise_unit), for each output that has a level of its own;
+    - ``process_noise``: log(1 + min(level, process_noise_max) / process_noise_unit), the level being that of the
+      environments, a multiple of the system's scale per second;
+    - ``age``: log(1 + min(t, age_max) / age_unit) with t the time in seconds since the filter was reset.
+
+    The output is x_offset + x_scale * mlp(inputs).
+
+    A map for several outputs may be told a level for each: ``noise_gain`` then has a row for each output, whose squares
+    add up, and unit and largest level of the measurement noise are tuples. Other maps are told one level for all.
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network.
+    features : tuple of str
+        What it is told, an ordered selection of ``FEATURES``.
+    z_offset : ndarray, shape (size,)
+        Mean of the filter's state.
+    whiten : ndarray, shape (modes, size)
+        The coordinates of the filter's state that the network sees.
+    noise_gain : ndarray, shape (modes,) or (ny, modes)
+        Standard deviation of each of them per unit of sigma_v, or of that of each of several outputs.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the estimate.
+    measurement_noise_unit : float or tuple of float, length ny, default 1
+        Standard deviation that counts as one; a tuple where ``noise_gain`` has rows, which a number becomes.
+    measurement_noise_max : float or tuple of float, length ny, default inf
+        The largest sigma_v in training, likewise. A map without the feature takes any.
+    process_noise_unit : float, default 1
+        Level of process noise that counts as one.
+    process_noise_max : float, default inf
+        The highest level of process noise in training.
+    age_unit : float, default 1
+        Seconds that count as one.
+    age_max : float, default 0
+        Seconds after which the age no longer matters.
+    spread : Spread, optional
+        The covariance of the state's error, where it was learned.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit the network, which has no outputs, or the spread does not, a unit is not positive and
+        finite, or nor is the end of what is told.
+    """
+
+    mlp: MLP
+    features: tuple[str, ...]
+    z_offset: np.ndarray
+    whiten: np.ndarray
+    noise_gain: np.ndarray
+    x_offset: np.ndarray
+    x_scale: np.ndarray
+    measurement_noise_unit: float | tuple[float, ...] = 1.0
+    measurement_noise_max: float | tuple[float, ...] = math.inf
+    process_noise_unit: float = 1.0
+    process_noise_max: float = math.inf
+    age_unit: float = 1.0
+    age_max: float = 0.0
+    spread: Spread | None = None
+
+    def __post_init__(self) -> None:
+        if self.features != tuple(name for name in FEATURES if name in self.features) or not self.features:
+            raise ArtifactError(f"inverse features {self.features} are not an ordered selection of {FEATURES}")
+        if self.features[0] != "z_y":
+            raise ArtifactError(f"the first inverse feature must be z_y, got {self.features}")
+        if self.whiten.ndim != 2:
+            raise ArtifactError(f"whiten must have shape (modes, size), got {self.whiten.shape}")
+        modes, size = self.whiten.shape
+        outputs = len(self.noise_gain) if self.noise_gain.ndim == 2 else 1
+        check_shapes(self, {"noise_gain": (outputs, modes) if outputs > 1 else (modes,)})
+        for name in _CONDITIONS:
+            for unit in self._each(f"{name}_unit"):
+                if not is_finite(unit) or unit <= 0:
+                    raise ArtifactError(f"{name}_unit must be a positive, finite number, got {unit!r}")
+            for end in self._each(f"{name}_max"):
+                if name in self.features and (not is_finite(end) or end <= 0):
+                    raise ArtifactError(
+                        f"{name}_max must be a positive, finite number for a map that is told, got {end!r}"
+                    )
+                if end != math.inf and (not is_finite(end) or end < 0):
+                    raise ArtifactError(f"{name}_max must be a number, not negative, got {end!r}")
+        conditions = sum(name in self.features for name in _CONDITIONS)
+        if "measurement_noise" in self.features:
+            conditions += outputs - 1
+        if self.mlp.inputs != modes + conditions:
+            raise ArtifactError(
+                f"a network of {self.mlp.inputs} inputs does not fit {modes} modes and {conditions} conditions"
+            )
+        nx = self.mlp.outputs
+        if not nx:
+            raise ArtifactError("a map must estimate one state at least, its network has no outputs")
+        check_shapes(self, {"z_offset": (size,), "x_offset": (nx,), "x_scale": (nx,)})
+        spread = self.spread
+        if spread is not None and spread.mlp.inputs != self.mlp.inputs:
+            raise ArtifactError(
+                f"error bars of {spread.mlp.inputs} inputs do not fit a network of {self.mlp.inputs} inputs"
+            )
+        told = spread is not None and "measurement_noise" in self.features
+        if spread is not None and (not told or (spread.factors.ndim == 3) != ("process_noise" in self.features)):
+            raise ArtifactError(
+                f"error bars with factors of shape {spread.factors.shape} do not fit a map that is told {self.features}"
+            )
+
+    def _each(self, name: str) -> tuple[Any, ...]:
+        """A unit or an end: of each output where noise_gain has rows, else the only one there is."""
+        value = getattr(self, name)
+        if self.noise_gain.ndim != 2 or not name.startswith("measurement_noise"):
+            return (value,)
+        if not isinstance(value, tuple):
+            value = (value,) * len(self.noise_gain)
+            object.__setattr__(self, name, value)
+        if len(value) != len(self.noise_gain):
+            raise ArtifactError(f"{name} = {value} does not fit a noise_gain of shape {self.noise_gain.shape}")
+        return value
+
+    def part(self, outputs: slice) -> "InverseMap":
+        """Return the same map with some of its outputs alone.
+
+        Parameters
+        ----------
+        outputs : slice
+            Which of them.
+
+        Returns
+        -------
+        InverseMap
+            One that shares its arrays with this; this one if all are meant.
+        """
+        if range(self.mlp.outputs)[outputs] == range(self.mlp.outputs):
+            return self
+        x_offset, x_scale = self.x_offset[outputs], self.x_scale[outputs]
+        spread = self.spread if self.spread and range(self.spread.nx) == range(self.mlp.outputs)[outputs] else None
+        return replace(self, mlp=self.mlp.part(outputs), x_offset=x_offset, x_scale=x_scale, spread=spread)
+
+    def within(self, measurement_noise: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        """Cut levels of measurement noise at the largest that the map is told.
+
+        Parameters
+        ----------
+        measurement_noise : float or tuple of float, length ny
+            Standard deviations of the noise, of all outputs or each.
+
+        Returns
+        -------
+        float or tuple of float, length ny
+            The levels, those beyond the range at its end; a float if all are the same.
+
+        Raises
+        ------
+        ValueError
+            If the levels differ and the map is told one for all outputs.
+        """
+        if isinstance(measurement_noise, tuple) and self.noise_gain.ndim == 1 and self.noise_gain.any():
+            raise ValueError(
+                f"this map is told one level of measurement noise for all outputs, got {measurement_noise}: pass one "
+                "number, or train it again, which makes a map that is told a level for each"
+            )
+        if "measurement_noise" not in self.features:
+            return measurement_noise
+        levels = np.minimum(measurement_noise, self.measurement_noise_max).tolist()
+        return levels if isinstance(levels, float) else levels[0] if len({*levels}) == 1 else tuple(levels)
+
+    def gain(self, measurement_noise: float | tuple[float, ...]) -> np.ndarray:
+        """What the whitened modes are multiplied with at these standard deviations of the noise, shape (modes,)."""
+        sigma = np.reshape(measurement_noise, (-1, 1))
+        return 1.0 / (1.0 + ((sigma * np.atleast_2d(self.noise_gain)) ** 2).sum(0))
+
+    def shares(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> tuple[float, float]:
+        """Return levels of noise in multiples of the highest that the map is told, of the noisiest output."""
+        return float(np.max(np.divide(measurement_noise, self.measurement_noise_max))), (
+            process_noise / self.process_noise_max
+        )
+
+    def noise_features(self, measurement_noise: float | tuple[float, ...], process_noise: float) -> list[float]:
+        """Return what the network is told of noise.
+
+        Parameters
+        ----------
+        measurement_noise : float or tuple of float, length ny
+            Standard deviations, of all outputs or each.
+        process_noise : float
+            Level in multiples of the system's scale per second.
+
+        Returns
+        -------
+        list of float
+            What there is of the features, in order.
+        """
+        told = []
+        if "measurement_noise" in self.features:
+            told += np.atleast_1d(np.log1p(np.divide(measurement_noise, self.measurement_noise_unit))).tolist()
+        if "process_noise" in self.features:
+            told.append(math.log1p(min(process_noise, self.process_noise_max) / self.process_noise_unit))
+        return told
+
+    def age_feature(self, age: Any) -> Any:
+        """The network's input for a time since reset, in seconds; for an array, as many inputs."""
+        if isinstance(age, float):  # a single step: numpy's own overhead would be felt
+            return math.log1p(min(age, self.age_max) / self.age_unit)
+        return np.log1p(np.minimum(age, self.age_max) / self.age_unit)
+
+
+__all__ = ["FEATURES", "InverseMap"]
