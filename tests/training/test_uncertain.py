@@ -158,7 +158,8 @@ def test_parameters_leave_states_as_they_are():
     torch.testing.assert_close(alone.x, beside.x[:, :2])
     with torch.no_grad():  # the same map of states, and one of parameters that is far off
         for mine, other in zip(states.network.parameters(), both.network.parameters()):
-            other.copy_(mine if mine.shape == other.shape else torch.cat([mine, 100.0 + 0.0 * mine[:1]]))
+            far_off = 0.0 * mine[:1] + (100.0 if mine.ndim == 1 else 0.0)
+            other.copy_(mine if mine.shape == other.shape else torch.cat([mine, far_off]))
     for each in (states, both):
         each.loss(torch.Generator().manual_seed(0))
     cells = states.sampler.cells

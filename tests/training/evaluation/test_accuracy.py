@@ -99,6 +99,6 @@ def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
 def test_maps_fitted_in_closed_loop(name):
     system, runs = get_system(name), unseen_trajectories(get_system(name), 0.01, n=100, duration=50.0, seed=0)
     fitted = observers.Artifact.read(resolve(f"{name}-closed-loop"))
-    assert fitted.training["closed_loop"] == 2000
-    assert np.median(errors(fitted, system, runs, measurement_noise=0.0, seed=0).full) <= 1.5
-    assert np.median(errors(fitted, system, runs, measurement_noise=0.5, seed=0).full) <= 5.0
+    assert fitted.training["closed_loop_trajectories"] == 2000
+    assert np.median(errors(fitted, system, runs, measurement_noise=0.0, seed=0).full) <= 0.2
+    assert np.median(errors(fitted, system, runs, measurement_noise=0.5, seed=0).full) <= 3.6

@@ -20,7 +20,7 @@ def test_an_observer_from_recorded_states(tmp_path):
     config = recorded_config(records, {**SMALL, "untold_noise": 0.01})
     result = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu"))
     assert len(result.held_out) == 1
-    assert result.errors.relative["speed"] < 0.1  # held out; the derivative of a driven position
+    assert result.errors.relative["speed"] < 0.2  # held out; the derivative of a driven position
     result.artifact.save(tmp_path / "spring.safetensors")
     artifact = Artifact.read(tmp_path / "spring.safetensors")
     assert artifact.signals == {"measured": ["position"], "inputs": ["force"], "hidden": ["speed"]}
@@ -28,7 +28,7 @@ def test_an_observer_from_recorded_states(tmp_path):
     new = resampled(swing(100), config.dt)
     x_hat = KKLObserver(artifact).estimate(new.y, new.u)
     late = slice(200, None)
-    assert np.sqrt(np.mean((x_hat - new.x)[late] ** 2)) < 0.1 * new.x.std()
+    assert np.sqrt(np.mean((x_hat - new.x)[late] ** 2)) < 0.2 * new.x.std()
     with pytest.raises(ValueError, match=r"recorded states: speed from position and force, every 0.05 s.*environment"):
         artifact.check("spring", {}, dt=0.05, ny=1, nu=1)
 

@@ -84,9 +84,10 @@ def test_a_refit_lowers_the_error(learned, tmp_path):
     assert in_use(env) == [refits.artifact] * 4
     assert [refit.steps for refit in told] == [1024, 2048]
     assert told[0].taken
-    assert told[-1].error < 0.4 * told[0].before
-    assert told[-1].artifact is refits.artifact
-    assert refits.artifact.training["held_out_errors"]["obs[2]"] == pytest.approx(told[-1].error)
+    last = [refit for refit in told if refit.taken][-1]  # a second refit may be no better, and is then left alone
+    assert last.error < 0.4 * told[0].before
+    assert told[-1].artifact is last.artifact is refits.artifact
+    assert refits.artifact.training["held_out_errors"]["obs[2]"] == pytest.approx(last.error)
     assert refits.artifact.training["eigenvalues"] == tuple(first.training["eigenvalues"])
     assert Artifact.read(path).training["held_out_errors"] == refits.artifact.training["held_out_errors"]
 
