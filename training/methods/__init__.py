@@ -26,8 +26,10 @@ from training.methods.base import Budget, CausalObserver, Configuration, Data, M
 from training.methods.dmf import DMF, DMFNoise
 from training.methods.gru import GRU
 from training.methods.kalman import EKF, UKF, Guided, UntunedEKF, WrongEKF
+from training.methods.kalmannet import KalmanNet
 from training.methods.kkl import SPINN, Default, Shipped, ShippedSPINN, WrongDefault, WrongSPINN
 from training.methods.node import NODE, NODENoise
+from training.methods.rkn import RKN
 
 METHODS: dict[str, type[Method[Any]]] = {
     cls.name: cls
@@ -40,6 +42,8 @@ METHODS: dict[str, type[Method[Any]]] = {
         NODE,
         NODENoise,
         GRU,
+        KalmanNet,
+        RKN,
         EKF,
         UKF,
         WrongEKF,
