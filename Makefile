@@ -38,7 +38,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/; those with error bars, which ship, into runs/errorbars. A new version ships as observers/maps/NAME-vN.safetensors, beside the old ones.
+# Into runs/; those with error bars, which ship, into runs/errorbars. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
 maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \

@@ -15,7 +15,7 @@ def shipped() -> dict[str, str]:
     Returns
     -------
     dict of str to str
-        The name of a file, without its ending, by name. Every version that ever shipped is there under its full name;
+        The name of a file, without its ending, by name. Every version that was released is there under its full name;
         the name without a version is the newest.
     """
     versions: dict[str, list[int]] = {}

@@ -24,7 +24,8 @@ Information = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"]
 INFORMATION: tuple[Information, ...] = get_args(Information)
 OBSERVED = ("x_hat", "x_hat_std", "z")  # what a learned observer tells
 STACKED = 8  # outputs, each with the action before it
-SUREST = 1e-6  # standard deviation in multiples of a state's scale, below which agents see no difference
+# Standard deviation in multiples of a state's scale, below which agents see no difference. Files of agents rely on it.
+SUREST = 1e-6
 EKF_PROCESS_NOISE = 1e-2  # in multiples of each state's scale per square root of a second of its pace
 
 Infos = dict[str, Any]

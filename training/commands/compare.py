@@ -18,6 +18,7 @@ from training.agents.comparison import (
     ALL,
     ASKED_FOR,
     COMPARED,
+    SEEDS,
     Compared,
     collect,
     kinds,
@@ -181,9 +182,11 @@ class Compare:
                 )
             found[system] = name
         if {*OBSERVED} & set(information):
-            for name in self.systems:
-                if (own := get_system(name)).name not in found:
-                    observer_of(own)  # an error now, not when their turn comes
+            for name in self.systems:  # an error now, not when their turn comes
+                own = get_system(name)
+                observer = found.get(own.name) or observer_of(own)
+                if "x_hat_std" in information:
+                    Artifact.read(resolve(observer)).require_spread()
         return found
 
 
@@ -258,8 +261,11 @@ def _read(out: Path) -> tuple["pd.DataFrame", str]:
     for name, group in results.groupby("system", sort=False):
         if name not in TASKS:
             levels[str(name)] = tuple(group.noise.unique())
-    plan = set(kinds(levels))
-    missing = plan - set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
+    there = set(results[["system", "noise", "knows", "seed"]].itertuples(index=False, name=None))
+    # What was asked for is planned where there is some of it.
+    further = {(system, noise, knows) for system, noise, knows, _ in there if knows in ASKED_FOR}
+    plan = {*kinds(levels), *((*kind, seed) for kind in further for seed in range(SEEDS))}
+    missing = plan - there
     return results, f" Partial: {len(missing)} of {len(plan)} agents are missing." if missing else ""
 
 

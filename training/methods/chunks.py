@@ -72,8 +72,8 @@ class Chunks(nn.Module):
     ) -> None:
         super().__init__()
         device = device or torch.device("cpu")
-        self.x_offset, self.x_scale = data.x.mean((0, 1)), data.x.std((0, 1))
-        self.y_offset, self.y_scale = data.y.mean((0, 1), dtype=float), data.y.std((0, 1), dtype=float)
+        self.x_offset, self.x_scale = data.x.mean((0, 1)), varying(data.x.std((0, 1)))
+        self.y_offset, self.y_scale = data.y.mean((0, 1), dtype=float), varying(data.y.std((0, 1), dtype=float))
         self._samples = min(samples, len(data.y))
         self._y, self._x = tensor(data.y, device), tensor((data.x - self.x_offset) / self.x_scale, device)
         self._noise = tensor(np.broadcast_to(measurement_noise, data.y.shape[-1:]), device)
@@ -123,15 +123,20 @@ class Chunks(nn.Module):
         return Chunk(fresh, y, told(self.level.expand(-1, y.shape[-1])), recorded, x)
 
 
+def varying(scale: np.ndarray) -> np.ndarray:
+    """Standard deviations as scales: 1 where nothing varies."""
+    return np.where(scale > 0, scale, 1.0)
+
+
 def told(level: torch.Tensor) -> torch.Tensor:
     """What observers are told of levels of noise, in multiples of the system's own."""
     return torch.asinh(level / FAINT_NOISE)
 
 
 def told_of(noise: Level, system: System) -> torch.Tensor:
-    """The same, (ny,), of standard deviations in the outputs' units, of all of them or each."""
+    """The same, (ny,), of standard deviations in the outputs' units, of all or each; cut at the highest in training."""
     own = np.broadcast_to(np.asarray(system.measurement_noise, dtype=float), (system.ny,))
-    level = np.divide(noise, own, out=np.zeros(system.ny), where=own > 0)
+    level = np.minimum(np.divide(noise, own, out=np.zeros(system.ny), where=own > 0), 1.0)
     return told(torch.as_tensor(level, dtype=torch.float32))
 
 

@@ -6,18 +6,19 @@ import numpy as np
 import torch
 from torch import nn
 
-from kkl_gym.simulate import advance_batch
+from kkl_gym.simulate import SubstepsError, advance_batch
 from kkl_gym.system import System
 from training.evaluation.levels import Level
 from training.kalman import unknown_start
 from training.maps.pde import on_tensors
 from training.methods.base import Arrays, CausalObserver, Configuration, Data, Method, Task
-from training.methods.chunks import Chunks, error, told_of
+from training.methods.chunks import Chunks, error, told_of, varying
 
 ROWS = 64
 LEARNING_RATE = 5e-3
 FAINT = 1e-3  # of a standard deviation: innovations and corrections below it are told by their size, others by its log
 TIMID = 0.1  # part of the usual first weights with which the gain begins
+MOVED = 100_000  # states of which the size of a sample's motion is taken, at most twice as many
 STEP = 1e-6  # of X's half-width, in numerical derivatives of the motion
 STEEPEST = 1e3  # gradient that is led back through a sample; errors that explode say nothing of what came before
 
@@ -76,7 +77,10 @@ class KalmanNet(Method[Arrays]):
         """The network and its scaling."""
         torch.manual_seed(task.seed)
         problem = _Problem(task, **configuration)
-        task.fit("kalmannet", problem, problem.loss, LEARNING_RATE)
+        try:
+            task.fit("kalmannet", problem, problem.loss, LEARNING_RATE)
+        except SubstepsError as found:  # estimates go where no motion does, and one of them may be too fast to follow
+            raise FloatingPointError(str(found)) from found
         return {key: value.detach().numpy() for key, value in problem.filter.state_dict().items()}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
@@ -175,7 +179,8 @@ class Gain(nn.Module):
     def scale(self, data: Data) -> None:
         """Take units from training data."""
         x, y = data.x.reshape(-1, data.x.shape[-1]), data.y.astype(float)
-        x_scale, y_scale = x.std(0), y.std((0, 1))
+        x_scale, y_scale = varying(x.std(0)), varying(y.std((0, 1)))
+        x = x[:: max(1, len(x) // MOVED)]
         y_units = np.maximum(np.diff(y, axis=0).std((0, 1)), FAINT * y_scale)
         x_units = np.maximum((self._motion(x) - x).std(0), FAINT * x_scale)
         units = np.concatenate([y_units, FAINT * y_scale, x_units, FAINT * x_scale])

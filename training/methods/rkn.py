@@ -73,7 +73,8 @@ def predict(belief: Belief, transition: torch.Tensor, noise: torch.Tensor) -> Be
     variance = (scaled * transition).sum((2, 3)) + 2.0 * crossed + noise
     side = (scaled[:, 0] * transition[:, 1]).sum((1, 2))
     side = side + ((upper_upper * lower_lower + upper_lower * lower_upper) * sides).sum(1)
-    return Belief(mean.clamp(-LARGEST, LARGEST), variance.clamp(max=LARGEST), side.clamp(-LARGEST, LARGEST))
+    kept = (LARGEST / variance).clamp(max=1.0)  # both halves are cut with what they share, which stays a covariance
+    return Belief(mean.clamp(-LARGEST, LARGEST), kept * variance, kept.prod(1).sqrt() * side)
 
 
 def update(belief: Belief, w: torch.Tensor, variance: torch.Tensor) -> Belief:

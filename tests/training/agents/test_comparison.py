@@ -69,6 +69,11 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, capsys):
         toy(out, information=("y",), episodes=4).run(Console())
 
 
+def missing(table):
+    """How many agents a table says to be missing."""
+    return int(re.search(r"Partial: (\d+) of", table)[1])
+
+
 def test_table_and_figure_from_the_results_alone(tmp_path):
     rows = [
         {"system": "lorenz", "noise": 0.5, "knows": knows, "seed": seed, "score": score + 0.01 * seed, "success": 0.5,
@@ -90,6 +95,7 @@ def test_table_and_figure_from_the_results_alone(tmp_path):
     pd.concat([pd.DataFrame(rows), unsure]).to_csv(tmp_path / "results.csv", index=False)
     report(tmp_path)
     assert "| x̂ and its standard deviations | 0.72 [0." in (tmp_path / "table.md").read_text()
+    assert missing((tmp_path / "table.md").read_text()) == missing(table) + 1  # the fifth seed
     only_y = pd.DataFrame(rows).query("knows != 'state'")
     only_y.to_csv(tmp_path / "results.csv", index=False)
     report(tmp_path)
@@ -111,6 +117,15 @@ def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path
         with pytest.raises(ValueError, match="of another comparison: hyperparameters"):
             assert not case.done
     assert case.done
+
+
+def test_maps_without_error_bars_are_refused_before_anything_is_trained(tmp_path):
+    command = Compare(
+        systems=("lorenz",), information=("x_hat", "x_hat_std"), observers=("lorenz-small",), out=tmp_path
+    )
+    with pytest.raises(ValueError, match="holds no error bars"):
+        command.run(Console())
+    assert not (tmp_path / "jobs").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"scores": [0.0]}', '{"scores": [0.0], "successes": [1], "seconds": '])

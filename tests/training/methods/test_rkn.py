@@ -99,6 +99,20 @@ def test_a_row_that_is_not_finite_begins_anew():
     np.testing.assert_allclose(x_hat[:, 1:], run(untrained(), y[:, 1:]), atol=1e-4)
 
 
+def test_what_is_cut_stays_a_covariance():
+    shape = (1, 2, 2, 1, 1)
+    large = torch.tensor([40.0, 0.0, 0.0, 1.0], dtype=torch.float64).reshape(shape)
+    one = Belief(
+        torch.zeros(1, 2, 1).double(), torch.tensor([[[900.0], [100.0]]]).double(), torch.full((1, 1), 290.0).double()
+    )
+    found = predict(one, large, torch.zeros(2, 1).double())
+    for each in (found, update(found, torch.zeros(1, 1).double(), torch.full((1, 1), 0.1).double())):
+        assert each.variance.min() > 0
+        assert (each.side**2 <= each.variance.prod(1) * (1 + 1e-9)).all()
+    correlation = found.side / found.variance.prod(1).sqrt()
+    np.testing.assert_allclose(correlation, 290.0 / 300.0)  # which no cut changes
+
+
 def test_an_unstable_transition_stays_finite():
     observer = untrained()
     with torch.no_grad():
