@@ -63,7 +63,8 @@ class KalmanNet(Method[Arrays]):
 
     The authors' code scales each of the four to unit length, which would leave the sign alone of a single output. Here
     they are scaled by their size in the data, and compressed by asinh. The loss is the mean length of the scaled error
-    in place of its square, which transients rule.
+    in place of its square, which transients rule. It is taken at every sample, as the model tells the states between
+    the recorded ones.
     """
 
     name: ClassVar[str] = "kalmannet"
@@ -239,7 +240,7 @@ class _Problem(nn.Module):
         self.memory: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Error at the recorded points of the next chunk."""
+        """Mean error over the next chunk."""
         chunk = self.chunks.draw(generator)
         y = chunk.y.double()
         x, prior, before, last = torch.split(self.state.clone(), self._parts, -1)
