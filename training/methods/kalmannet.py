@@ -18,7 +18,7 @@ ROWS = 64
 LEARNING_RATE = 5e-3
 FAINT = 1e-3  # of a standard deviation: innovations and corrections below it are told by their size, others by its log
 TIMID = 0.1  # part of the usual first weights with which the gain begins
-MOVED = 100_000  # states of which the size of a sample's motion is taken, at most twice as many
+MOVED = 500_000  # states of which the size of a sample's motion is taken, at most twice as many
 STEP = 1e-6  # of X's half-width, in numerical derivatives of the motion
 STEEPEST = 1e3  # gradient that is led back through a sample; errors that explode say nothing of what came before
 
@@ -161,7 +161,7 @@ class Gain(nn.Module):
     def __init__(self, system: System, dt: float, *, hidden: int) -> None:
         super().__init__()
         nx, ny = system.nx, system.ny
-        self._h, self._motion = system.h, Motion(system, dt)
+        self._h, self.motion = system.h, Motion(system, dt)
         self.inlet = nn.Linear(3 * ny + 2 * nx, hidden)
         self.gru = nn.GRUCell(hidden, hidden)
         self.outlet = nn.Linear(hidden, hidden)
@@ -174,7 +174,7 @@ class Gain(nn.Module):
         self.register_buffer("ratio", torch.ones(nx, ny, dtype=torch.float64))
         self.units: torch.Tensor
         self.ratio: torch.Tensor
-        self._start = torch.as_tensor(self._motion.start)
+        self._start = torch.as_tensor(self.motion.start)
         self._low, self._high = torch.tensor(system.bounds, dtype=torch.float64).T
 
     def scale(self, data: Data) -> None:
@@ -183,7 +183,7 @@ class Gain(nn.Module):
         x_scale, y_scale = varying(x.std(0)), varying(y.std((0, 1)))
         x = x[:: max(1, len(x) // MOVED)]
         y_units = np.maximum(np.diff(y, axis=0).std((0, 1)), FAINT * y_scale)
-        x_units = np.maximum((self._motion(x) - x).std(0), FAINT * x_scale)
+        x_units = np.maximum((self.motion(x) - x).std(0), FAINT * x_scale)
         units = np.concatenate([y_units, FAINT * y_scale, x_units, FAINT * x_scale])
         self.units.copy_(torch.as_tensor(units))
         self.ratio.copy_(torch.as_tensor(x_scale[:, None] / y_scale))
@@ -196,9 +196,9 @@ class Gain(nn.Module):
     def predicted(self, state: State) -> torch.Tensor:
         """Prior of the next sample, (n, nx)."""
         if torch.is_grad_enabled():
-            prior: torch.Tensor = _Advance.apply(state.x, self._motion)  # type: ignore[no-untyped-call]
+            prior: torch.Tensor = _Advance.apply(state.x, self.motion)  # type: ignore[no-untyped-call]
             return prior
-        return torch.as_tensor(self._motion(state.x.numpy()))
+        return torch.as_tensor(self.motion(state.x.numpy()))
 
     def corrected(self, state: State, prior: torch.Tensor, y: torch.Tensor, told: torch.Tensor) -> State:
         """Take in samples (n, ny), given their prior, and what is told of their noise, (n, ny)."""
@@ -229,7 +229,7 @@ class _Problem(nn.Module):
         self.chunks = Chunks(data, system.measurement_noise, samples=chunk, rows=ROWS)
         self.filter = Gain(system, task.budget.dt, hidden=hidden)
         self.filter.scale(data)
-        self._motion, self._x0 = Motion(system, task.budget.dt), torch.as_tensor(data.x[0])
+        self._motion, self._x0 = self.filter.motion, torch.as_tensor(data.x[0])
         self._x_scale = torch.as_tensor(self.chunks.x_scale)
         self._parts = [system.nx, system.nx, system.nx, system.ny]
         self.register_buffer("state", torch.zeros(ROWS, sum(self._parts), dtype=torch.float64))

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from drawn_chunks import two_chunks
 from linear_system import F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
@@ -129,21 +130,11 @@ def test_a_row_that_is_not_finite_begins_anew():
 
 def test_training_goes_on_as_the_observer_does(tmp_path):
     """From chunk to chunk; rows that are lost begin anew."""
-    problem, drawn = _Problem(Task(Oscillator(), SMALL, tmp_path), hidden=8, chunk=20), []
-    draw = problem.chunks.draw
-
-    def spy(generator):
-        drawn.append(draw(generator))
-        return drawn[-1]
-
-    problem.chunks.draw, generator = spy, torch.Generator().manual_seed(0)
-    for _ in range(2):
-        problem.loss(generator)["loss"].backward()
-    kept = ~drawn[1].fresh.numpy()
-    y = torch.cat([chunk.y for chunk in drawn]).numpy()[:, kept]
+    problem = _Problem(Task(Oscillator(), SMALL, tmp_path), hidden=8, chunk=20)
+    generator, kept, y, told = two_chunks(problem)
     arrays = {key: value.detach().numpy() for key, value in problem.filter.state_dict().items()}
     observer = KalmanNetFilter(arrays, Oscillator(), SMALL.dt, 0.0)
-    observer._told = drawn[1].told[kept]
+    observer._told = told
     x_hat = run(observer, y)
     np.testing.assert_allclose(problem.state[kept, :2], x_hat[-1], rtol=1e-4, atol=1e-5)
     problem.state[kept.argmax(), 0] = torch.nan

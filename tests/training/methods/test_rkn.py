@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import torch
+from drawn_chunks import two_chunks
 from linear_system import Oscillator
 from scipy.linalg import block_diag
 
@@ -122,21 +123,11 @@ def test_an_unstable_transition_stays_finite():
 
 def test_training_goes_on_as_the_observer_does(tmp_path):
     """From chunk to chunk; rows that are lost begin anew."""
-    problem, drawn = _Problem(Task(Oscillator(), SMALL, tmp_path), latent=8, chunk=20), []
-    draw = problem.chunks.draw
-
-    def spy(generator):
-        drawn.append(draw(generator))
-        return drawn[-1]
-
-    problem.chunks.draw, generator = spy, torch.Generator().manual_seed(0)
-    for _ in range(2):
-        problem.loss(generator)["loss"].backward()
-    kept = ~drawn[1].fresh.numpy()
-    y = torch.cat([chunk.y for chunk in drawn]).numpy()[:, kept]
+    problem = _Problem(Task(Oscillator(), SMALL, tmp_path), latent=8, chunk=20)
+    generator, kept, y, told = two_chunks(problem)
     arrays = {key: value.detach().numpy() for key, value in problem.cell.state_dict().items()}
     scaling = {"x_offset": problem.chunks.x_offset, "x_scale": problem.chunks.x_scale}
-    observer = RKNObserver({**arrays, **scaling}, drawn[1].told[kept])
+    observer = RKNObserver({**arrays, **scaling}, told)
     run(observer, y)
     for found, expected in zip((problem.mean, problem.variance, problem.side), observer._belief, strict=True):
         np.testing.assert_allclose(found[kept], expected, rtol=1e-3, atol=1e-4)
