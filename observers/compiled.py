@@ -16,7 +16,7 @@ PIECE = 2**15  # values of a layer that a batch computes at once: they fit into 
 _TILE = 256  # biases that lie one after another for some rows: in loops as short as a narrow layer much would be lost
 _UNROLLED = 4  # inputs that a single sample's loop takes at once
 _LINE = 16  # numbers of float32 in a line of the cache
-_FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
+FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
 
 Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 """Weights (inputs, outputs) and biases (outputs,) in float32."""
@@ -183,13 +183,9 @@ class CompiledDecoder:
         x_scale: np.ndarray,
     ) -> None:
         self._network = CompiledNetwork(layers[1:], activation)
-        weight, bias = (part.astype(float) for part in layers[0])
-        modes, told = len(offset), len(offset) + len(conditions)
-        # Few arrays, for each that is handed over takes as long as a hundred multiplications.
-        self._first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[told], whiten @ weight[:modes]])
-        self._first[0] += offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:told]
+        self._first = first_layer(layers[0], whiten=whiten, offset=offset, conditions=conditions, age=age)
         self._age_unit, self._age_max = age or (1.0, 0.0)
-        self._sums = np.empty(len(bias))
+        self._sums = np.empty(self._first.shape[1])
         self._units = np.array([x_offset, x_scale], dtype=float)
         network = self._network
         self._one = functools.partial(
@@ -266,6 +262,36 @@ def available() -> bool:
     return True
 
 
+def first_layer(
+    layer: tuple[np.ndarray, np.ndarray],
+    *,
+    whiten: np.ndarray,
+    offset: np.ndarray,
+    conditions: Sequence[float],
+    age: tuple[float, float] | None,
+) -> np.ndarray:
+    """A network's first layer on the filter's state, in float64.
+
+    Parameters
+    ----------
+    layer : (ndarray, ndarray)
+        Weights (inputs, outputs) and biases (outputs,).
+    whiten, offset, conditions, age
+        As for :class:`CompiledDecoder`.
+
+    Returns
+    -------
+    ndarray, shape (2 + size, outputs)
+        Biases, the weights of the age and those of z: one array, for each that is handed over to machine code takes as
+        long as a hundred multiplications.
+    """
+    weight, bias = (part.astype(float) for part in layer)
+    modes, told = len(offset), len(offset) + len(conditions)
+    first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[told], whiten @ weight[:modes]])
+    first[0] += offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:told]
+    return first
+
+
 def _aligned(values: np.ndarray) -> np.ndarray:
     """A copy that begins with a line of the cache: one that lies across two costs a single sample a quarter."""
     memory = np.empty(len(values) + _LINE, np.float32)
@@ -280,13 +306,34 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 
 
 @functools.cache
+def entering_kernel() -> Callable[..., None]:
+    """What :func:`first_layer` makes of a filter's state and an age, before the activation."""
+    import numba
+
+    @numba.njit(fastmath=FAST, error_model="numpy")
+    def enter(first: np.ndarray, told: float, z: np.ndarray, sums: np.ndarray) -> None:
+        width, size = len(sums), len(z)
+        for j in range(width):
+            sums[j] = first[0, j] + told * first[1, j]
+        for i in range(0, size - 1, 2):
+            a, b = z[i], z[i + 1]
+            for j in range(width):
+                sums[j] += a * first[i + 2, j] + b * first[i + 3, j]
+        if size % 2:
+            for j in range(width):
+                sums[j] += z[size - 1] * first[size + 1, j]
+
+    return enter
+
+
+@functools.cache
 def _decode(activation: str) -> Callable[..., None]:
     """The first layer on z and age, and the network behind it, for one sample."""
     import numba
 
-    active, evaluate = _active(activation), _kernels(activation)[1]
+    active, evaluate, enter = active_kernel(activation), _kernels(activation)[1], entering_kernel()
 
-    @numba.njit(fastmath=_FAST, error_model="numpy")
+    @numba.njit(fastmath=FAST, error_model="numpy")
     def decode(
         first: np.ndarray,
         sums: np.ndarray,
@@ -300,17 +347,8 @@ def _decode(activation: str) -> Callable[..., None]:
         age: float,
         out: np.ndarray,
     ) -> None:
-        width, size, entered, found = len(sums), len(z), between[0], between[2]
-        told = math.log1p(min(age, age_max) / age_unit)
-        for j in range(width):
-            sums[j] = first[0, j] + told * first[1, j]
-        for i in range(0, size - 1, 2):
-            a, b = z[i], z[i + 1]
-            for j in range(width):
-                sums[j] += a * first[i + 2, j] + b * first[i + 3, j]
-        if size % 2:
-            for j in range(width):
-                sums[j] += z[size - 1] * first[size + 1, j]
+        width, entered, found = len(sums), between[0], between[2]
+        enter(first, math.log1p(min(age, age_max) / age_unit), z, sums)
         for j in range(width):
             entered[j] = active(np.float32(sums[j]))
         evaluate(entered[:width], packed, widths, between, found[: len(out)])
@@ -325,9 +363,9 @@ def _batches(activation: str) -> tuple[Callable[..., None], Callable[..., None]]
     """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
     import numba
 
-    active = _active(activation)
+    active = active_kernel(activation)
 
-    @numba.njit(fastmath=_FAST, error_model="numpy")
+    @numba.njit(fastmath=FAST, error_model="numpy")
     def enter(sums: np.ndarray, first: np.ndarray, ages: np.ndarray, entered: np.ndarray) -> None:
         bias, of_age = first[0], first[1]
         for row in range(len(ages)):
@@ -345,10 +383,11 @@ def _batches(activation: str) -> tuple[Callable[..., None], Callable[..., None]]
 
 
 @functools.cache
-def _active(activation: str) -> Any:
+def active_kernel(activation: str) -> Any:
+    """An activation of one number in float32."""
     import numba
 
-    compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
+    compiled = functools.partial(numba.njit, fastmath=FAST, error_model="numpy")
     return compiled(_ACTIVATIONS[activation](compiled))
 
 
@@ -357,8 +396,8 @@ def _kernels(activation: str) -> tuple[Any, Any]:
     """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
     import numba
 
-    compiled = functools.partial(numba.njit, fastmath=_FAST, error_model="numpy")
-    active = _active(activation)
+    compiled = functools.partial(numba.njit, fastmath=FAST, error_model="numpy")
+    active = active_kernel(activation)
 
     @compiled
     def activate(h: np.ndarray, tile: np.ndarray) -> None:

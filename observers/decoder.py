@@ -7,12 +7,14 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.compiled import CompiledDecoder
+from observers.compiled_covariance import CompiledCovariance
 from observers.inverse import InverseMap
 from observers.sparse import MANY_ROWS
 from observers.spread import Covariance
 
-# Which decoder is asked, in which rows (None for all), what its networks are given, and the age in seconds.
-Read = list[tuple["Decoder", np.ndarray | None, np.ndarray, Any]]
+# Which decoder is asked, in which rows (None for all), the filter's state and its age in seconds there, and what the
+# networks are given, where that was computed.
+Parts = list[tuple["Decoder", np.ndarray | None, np.ndarray, Any, np.ndarray | None]]
 
 
 class Decoders:
@@ -47,64 +49,57 @@ class Decoders:
 
     def covariances(self, z: np.ndarray, age: Any) -> np.ndarray:
         """Of what the estimates are off by, (..., nx, nx)."""
-        return self.covariance(self.read(z, age))
+        return self.covariance(self.parts(z, age))
 
-    def estimate(self, z: np.ndarray, age: Any) -> tuple[Read | None, np.ndarray]:
-        """The estimates, and what the networks are given where nobody has compiled it away."""
-        parts = self._parts(z, age)
+    def estimate(self, z: np.ndarray, age: Any) -> tuple[Parts, np.ndarray]:
+        """The estimates, (..., nx), and what :meth:`covariance` takes."""
+        parts = self.parts(z, age)
         if len(parts) == 1:  # most often
-            decoder, _, z, age = parts[0]
+            decoder, _, z, age, _ = parts[0]
             x_hat = decoder.compiled(z, age)
             if x_hat is not None:
-                return None, x_hat
+                return parts, x_hat
         else:
-            found = [decoder.compiled(z, age) for decoder, _, z, age in parts]
+            found = [decoder.compiled(z, age) for decoder, _, z, age, _ in parts]
             whole = [x_hat for x_hat in found if x_hat is not None]
             if len(whole) == len(parts):
-                return None, _in_place(parts, whole)
-        read = [(decoder, rows, decoder.read(z, age), age) for decoder, rows, z, age in parts]
-        return read, self.mean(read)
+                return parts, _in_place(parts, whole)
+        inputs = [decoder.read(z, age) for decoder, _, z, age, _ in parts]
+        means = [decoder.mean(each) for (decoder, *_), each in zip(parts, inputs)]
+        return [(*part[:4], each) for part, each in zip(parts, inputs)], _in_place(parts, means)
 
-    def read(self, z: np.ndarray, age: Any) -> Read:
-        """What the networks are given for filter states, (..., size), of these ages in seconds."""
-        return [(decoder, rows, decoder.read(z, age), age) for decoder, rows, z, age in self._parts(z, age)]
+    def covariance(self, parts: Parts) -> np.ndarray:
+        """Of what the estimates are off by, (..., nx, nx)."""
+        return _in_place(parts, [decoder.covariance(z, age, inputs) for decoder, _, z, age, inputs in parts])
 
-    def _parts(self, z: np.ndarray, age: Any) -> Read:
-        """Which decoder is asked in which rows, with the filter states there in place of what networks are given."""
+    def parts(self, z: np.ndarray, age: Any) -> Parts:
+        """Which decoder is asked in which rows, for filter states, (..., size), of these ages in seconds."""
         driven, free = self._driven, self._free
         if free is None:
-            return [(driven, None, z, age)]
+            return [(driven, None, z, age, None)]
         nz = free.size  # behind it lies z_u, exactly 0 until an input acts
         if z.ndim == 1:  # a single sample: every call of numpy would be felt
             if z[-1] or any(z[nz:].tolist()):
-                return [(driven, None, z, age)]
-            return [(free, None, z[:nz], age)]
+                return [(driven, None, z, age, None)]
+            return [(free, None, z[:nz], age, None)]
         moved = z[..., -1] != 0  # most often
         moved = moved if moved.all() else np.asarray(z[..., nz:].any(-1))
         if moved.all():
-            return [(driven, None, z, age)]
+            return [(driven, None, z, age, None)]
         if not moved.any():
-            return [(free, None, z[..., :nz], age)]
+            return [(free, None, z[..., :nz], age, None)]
         age, still = np.broadcast_to(age, moved.shape), ~moved
         return [
-            (driven, moved, z[moved], age[moved]),
-            (free, still, z[still][:, :nz], age[still]),
+            (driven, moved, z[moved], age[moved], None),
+            (free, still, z[still][:, :nz], age[still], None),
         ]
 
-    def mean(self, read: Read) -> np.ndarray:
-        """The estimates, (..., nx)."""
-        return _in_place(read, [decoder.mean(inputs) for decoder, _, inputs, _ in read])
 
-    def covariance(self, read: Read) -> np.ndarray:
-        """Of what they are off by, (..., nx, nx)."""
-        return _in_place(read, [decoder.covariance(inputs, age) for decoder, _, inputs, age in read])
-
-
-def _in_place(read: Read, found: list[np.ndarray]) -> np.ndarray:
+def _in_place(parts: Parts, found: list[np.ndarray]) -> np.ndarray:
     """What decoders say, each in its rows."""
     if len(found) == 1:
         return found[0]
-    rows = [np.asarray(rows) for _, rows, _, _ in read]
+    rows = [np.asarray(rows) for _, rows, _, _, _ in parts]
     out = np.empty((*rows[0].shape, *found[0].shape[1:]))
     for where, values in zip(rows, found):
         out[where] = values
@@ -129,7 +124,7 @@ class Decoder:
         self._told_age, self._singly = inverse.features[-1] == "age", compiled
         if inverse.spread is not None:
             shares = inverse.shares(measurement_noise, process_noise)
-            self.covariance = Covariance(inverse.spread, shares, inverse.x_scale, compiled=compiled)
+            self._covariance = Covariance(inverse.spread, shares, inverse.x_scale)
 
     def compiled(self, z: np.ndarray, age: Any) -> np.ndarray | None:
         """The estimate by machine code, of a large batch or, if so asked, one sample; None where NumPy is to do it."""
@@ -138,6 +133,12 @@ class Decoder:
         if z.ndim == 2 and len(z) >= MANY_ROWS and self._compiled is not None:
             return self._compiled.batch(z, age)
         return None
+
+    def covariance(self, z: np.ndarray, age: Any, inputs: np.ndarray | None) -> np.ndarray:
+        """Of what the estimate is off by, (..., nx, nx); what :meth:`read` says may be known already."""
+        if z.ndim == 1 and self._singly and self._compiled_covariance is not None:
+            return self._compiled_covariance.single(z, age)
+        return self._covariance(self.read(z, age) if inputs is None else inputs, age)
 
     def read(self, z: np.ndarray, age: Any) -> np.ndarray:
         """What the network is given."""
@@ -161,7 +162,8 @@ class Decoder:
         return inverse.x_offset + inverse.x_scale * inverse.mlp(inputs)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+        compiled = "_compiled", "_compiled_covariance"  # Numba is not everywhere
+        return {name: value for name, value in self.__dict__.items() if name not in compiled}
 
     @functools.cached_property
     def _compiled(self) -> CompiledDecoder | None:
@@ -170,14 +172,17 @@ class Decoder:
             return None
         try:
             return CompiledDecoder(
-                mlp.layers,
-                mlp.activation,
-                whiten=self._whiten,
-                offset=self._offset,
-                conditions=self._conditions,
-                age=(inverse.age_unit, inverse.age_max) if self._told_age else None,
-                x_offset=inverse.x_offset,
-                x_scale=inverse.x_scale,
+                mlp.layers, mlp.activation, x_offset=inverse.x_offset, x_scale=inverse.x_scale, **self._inputs
             )
         except ImportError:
             return None
+
+    @functools.cached_property
+    def _compiled_covariance(self) -> CompiledCovariance | None:
+        return self._covariance.compiled(**self._inputs)
+
+    @property
+    def _inputs(self) -> dict[str, Any]:
+        """How the networks' inputs come from z and the age, as compiled maps take it."""
+        age = (self._inverse.age_unit, self._inverse.age_max) if self._told_age else None
+        return {"whiten": self._whiten, "offset": self._offset, "conditions": self._conditions, "age": age}

@@ -119,10 +119,10 @@ class MLP:
             h = self.compiled.batch(h)
         else:
             for w, b in hidden:
-                h = np.dot(h, w)
+                h = h.dot(w)
                 h += b
                 h = activation(h)
-            h = np.dot(h, weight)
+            h = h.dot(weight)
             h += bias
         return h if x.ndim <= 2 else h.reshape(*x.shape[:-1], len(bias))
 

@@ -10,7 +10,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.compiled import available
-from observers.decoder import Decoders, Read
+from observers.decoder import Decoders, Parts
 from observers.errors import ArtifactError
 from observers.monitor import Monitor
 from observers.names import resolve
@@ -88,7 +88,7 @@ class KKLObserver:
         self._samples = 0  # single ones
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
-        self._read: Read | None  # what the networks were given for the last estimate
+        self._parts: Parts | None  # which networks made the last estimate, and from what
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -114,7 +114,7 @@ class KKLObserver:
         if monitor is not None and self._z is not None:
             monitor.reset(self._z.shape[:-1])
         self._measurement_noise, self._monitor = level, monitor
-        self._x_hat, self._read = None, None
+        self._x_hat, self._parts = None, None
         self._tell()
 
     @property
@@ -124,7 +124,7 @@ class KKLObserver:
 
     @process_noise.setter
     def process_noise(self, level: float | None) -> None:
-        self._process_noise, self._x_hat, self._read = self._level(level), None, None
+        self._process_noise, self._x_hat, self._parts = self._level(level), None, None
         self._tell()
 
     def _level(self, process_noise: float | None) -> float:
@@ -223,7 +223,7 @@ class KKLObserver:
             self._compiled = True
             self._tell()
             self._warm_up()
-        self._z, self._y, self._age, self._x_hat, self._read = z0, y0, age, None, None
+        self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -299,7 +299,7 @@ class KKLObserver:
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, age, self._age)
-        self._x_hat, self._read = None, None
+        self._x_hat, self._parts = None, None
         if self._monitor is not None:
             self._monitor.restart(rows)
 
@@ -379,7 +379,7 @@ class KKLObserver:
             kept[rows] = z[rows]
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
-        self._x_hat, self._read = None, None
+        self._x_hat, self._parts = None, None
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]
@@ -410,9 +410,9 @@ class KKLObserver:
         z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        read, x_hat = self._states.estimate(z, age)
+        parts, x_hat = self._states.estimate(z, age)
         if rows is None:
-            self._read = read
+            self._parts = parts
         return x_hat
 
     @property
@@ -476,9 +476,9 @@ class KKLObserver:
             If ``rows`` does not fit the batch, or the artifact holds no error bars.
         """
         self.artifact.require_spread()
-        if rows is not None or self._read is None:
-            return self._states.covariance(self._states.read(*self._moment(rows)))
-        return self._states.covariance(self._read)
+        if rows is None and self._parts is not None:
+            return self._states.covariance(self._parts)
+        return self._states.covariances(*self._moment(rows))
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""

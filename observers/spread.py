@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from observers.checks import shown
+from observers.compiled_covariance import CompiledCovariance
 from observers.network import MLP
 
 COVERAGE = 0.9  # of the regions that the factors make true
@@ -81,19 +82,14 @@ class Covariance:
         Of measurement noise and process noise, in multiples of the highest that the map is told.
     scale : ndarray, shape (nx,)
         Of the states.
-    compiled : bool, default False
-        Whether single samples go through Numba.
     """
 
-    def __init__(
-        self, spread: Spread, levels: tuple[float, float], scale: np.ndarray, *, compiled: bool = False
-    ) -> None:
+    def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
         nx = self._nx = spread.nx
         *weights, last = spread.mlp.weights
         *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
         bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
         self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
-        self._singly = compiled
         tables, (measurement, process) = np.log(spread.factors) / 2, levels
         if tables.ndim == 3:
             share = min(process, 1.0)
@@ -116,8 +112,7 @@ class Covariance:
         ndarray, shape (..., nx, nx)
             In units of the states.
         """
-        nx, compiled = self._nx, self._mlp.compiled if self._singly and inputs.ndim == 1 else None
-        out = self._mlp(inputs) if compiled is None else compiled.single(inputs)
+        nx, out = self._nx, self._mlp(inputs)
         if out.ndim == 1:  # a single sample: every call of numpy would be felt
             values, factor = out.tolist(), self._log_factor(float(age))
             scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
@@ -131,6 +126,27 @@ class Covariance:
         for i, entry in enumerate(_product(values[:nx], values[nx:])):
             covariance[..., i] = entry
         return covariance.reshape(*out.shape[:-1], nx, nx)
+
+    def compiled(self, **inputs: Any) -> CompiledCovariance | None:
+        """The same for single samples as machine code; None without Numba, or for a network of other than two layers.
+
+        The arguments are those of :class:`observers.compiled_covariance.CompiledCovariance` that say what the network
+        is given.
+        """
+        layers, table = self._mlp.layers, (np.array(self._ages), np.array(self._log_factors))
+        if len(layers) != 2:
+            return None
+        try:
+            return CompiledCovariance(
+                layers,
+                self._mlp.activation,
+                ages=table[0],
+                log_factors=table[1],
+                largest_log=_LARGEST_LOG,
+                **inputs,
+            )
+        except ImportError:
+            return None
 
     def _log_factor(self, age: float) -> float:
         """As np.interp, without its overhead."""

@@ -14,6 +14,7 @@ from error_bars import with_error_bars
 import observers
 from kkl_gym import get_system
 from observers import compiled as machine
+from observers import compiled_covariance
 from observers.artifact import Artifact
 from observers.names import resolve
 from observers.observer import SOON
@@ -32,9 +33,9 @@ REFERENCE = {
 
 def forget():
     """Forgets what has been compiled."""
-    for cache in (machine._kernels, machine._decode, machine._batches, machine._active):
+    for cache in (machine._kernels, machine._decode, machine._batches, machine.active_kernel, machine.entering_kernel):
         cache.cache_clear()
-    for cache in (observers.sparse._kernel, observers.sparse._single):
+    for cache in (observers.sparse._kernel, observers.sparse._single, compiled_covariance._covary):
         cache.cache_clear()
 
 
@@ -62,6 +63,25 @@ def along(observer, y, u):
 def apart(found, expected, artifact):
     """Largest difference in units of the states' scales."""
     return np.abs((found - expected) / artifact.inverse.x_scale).max()
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+def test_compiled_error_bars_of_single_samples_are_numpys(name):
+    """Free and driven motion, at levels of noise and ages between those of the factors."""
+    artifact = Artifact.read(resolve(name))
+    y, u = signals(artifact, 120)
+    for level, process_noise in ((0.0, 0.0), (0.37, 0.4), (1.0, 5.0)):
+        found = []
+        for choice in (True, False):
+            observer = observers.KKLObserver(artifact, level, process_noise=process_noise, compiled=choice)
+            covariances = [observer.reset(y[0]) is None or observer.covariance]
+            for k in range(1, len(y)):
+                observer.step(y[k], u[k])
+                covariances.append(observer.covariance)
+            found.append(np.array(covariances))
+        size = np.sqrt(found[1].diagonal(axis1=1, axis2=2))
+        assert np.abs((found[0] - found[1]) / (size[:, :, None] * size[:, None])).max() < 1e-4
+        np.testing.assert_array_equal(found[0], found[0].swapaxes(1, 2))
 
 
 @pytest.mark.parametrize("name", NAMES)

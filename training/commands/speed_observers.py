@@ -67,21 +67,22 @@ def observer_tasks(
     Returns
     -------
     dict of str to callable
-        CPU seconds for each step, by name: "KKL"; "KKL, NumPy" of a single one where Numba is installed; "EKF" of this
-        package, which is for batches; and "EKF of filterpy" where that is installed, one filter for each row.
+        CPU seconds for each step, by name: "KKL"; "KKL, error bars" where the artifact has them; the same followed by
+        ", NumPy" of a single one where Numba is installed; "EKF" of this package, which is for batches; and "EKF of
+        filterpy" where that is installed, one filter for each row.
     """
     rng, n = np.random.default_rng(0), rows or 1
     y = np.array(system.output_range) * rng.uniform(-0.5, 0.5, (steps + 1, n, system.ny))
     u = np.array(system.u_max) * rng.uniform(-1, 1, (steps + 1, n, system.nu))
     known = u[..., : artifact.nu]
+    samples = (y, known) if rows else (y[:, 0], known[:, 0])
+    ways = {", NumPy": False, "": True} if rows is None and available() else {"": None}
     tasks = {}
-    numba = available()
-    if rows is None:
-        if numba:
-            tasks["KKL, NumPy"] = _stepping(KKLObserver(artifact, compiled=False), y[:, 0], known[:, 0])
-        tasks["KKL"] = _stepping(KKLObserver(artifact, compiled=numba or None), y[:, 0], known[:, 0])
-    else:
-        tasks["KKL"] = _stepping(KKLObserver(artifact), y, known)
+    for way, compiled in ways.items():
+        tasks[f"KKL{way}"] = _stepping(KKLObserver(artifact, compiled=compiled), *samples)
+        if artifact.inverse.spread is not None:
+            observer = KKLObserver(artifact, compiled=compiled)
+            tasks[f"KKL, error bars{way}"] = _stepping(observer, *samples, error_bars=True)
     R = measurement_covariance(system, artifact.measurement_noise)
     Q = process_intensity(system, system.process_noise, artifact.filter.dt)
     ekf = ExtendedKalmanFilter(system, artifact.filter.dt, Q=Q, R=R)
@@ -166,12 +167,14 @@ def table_rows(
     return found
 
 
-def _stepping(observer: Any, y: np.ndarray, u: np.ndarray) -> Callable[[], float]:
+def _stepping(observer: Any, y: np.ndarray, u: np.ndarray, *, error_bars: bool = False) -> Callable[[], float]:
     def task() -> float:
         observer.reset(y[0])
         began = time.process_time()
         for k in range(1, len(y)):
             observer.step(y[k], u[k])
+            if error_bars:
+                observer.decode_covariance()
         return (time.process_time() - began) / (len(y) - 1)
 
     return task

@@ -265,8 +265,8 @@ class _Run:
             measurement_noise=_plain(level * largest),
             process_noise=process_noise,
         )
-        read = decoders.read(z, (ages * artifact.filter.dt)[:, None])
-        return squared_distance(x - decoders.mean(read), decoders.covariance(read))
+        parts, x_hat = decoders.estimate(z, (ages * artifact.filter.dt)[:, None])
+        return squared_distance(x - x_hat, decoders.covariance(parts))
 
     def _factors(self, distances: list[np.ndarray], ages: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Factors (levels, knots) from the errors of a group, (ages, n)."""

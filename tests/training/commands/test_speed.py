@@ -99,7 +99,7 @@ def test_speed_measures_every_environment(capsys):
                 assert simulated == (name != reference)
                 assert network == (name in names["x_hat"] | names["small"])
     alone = [[cell.strip() for cell in cells] for cells in lines if len(cells) == 6]
-    assert len(alone) == 4 * 2 * 4
+    assert len(alone) == 4 * (6 + 4)  # the default map has error bars, the small one none
     for name, one, many, *speeds in alone:
         assert float(one) > 0
         assert bool(many) == (not name.endswith("NumPy"))
@@ -162,7 +162,12 @@ def test_products_are_those_of_the_network(saved):
 def test_all_filters_follow_the_same_samples():
     """Those of filterpy, of which there is one for each row, have moved; none is timed without it."""
     artifact, system = observers.load("lorenz").artifact, get_system("lorenz")
-    assert list(observer_tasks(artifact, system, rows=3, steps=4)) == ["KKL", "EKF", "EKF of filterpy"]
+    assert list(observer_tasks(artifact, system, rows=3, steps=4)) == [
+        "KKL",
+        "KKL, error bars",
+        "EKF",
+        "EKF of filterpy",
+    ]
     tasks = observer_tasks(artifact, system, rows=None, steps=4)
     assert {task() >= 0.0 for task in tasks.values()} == {True}
 
@@ -181,4 +186,4 @@ def test_filterpys_filter_is_like_ours():
 def test_without_filterpy(monkeypatch):
     monkeypatch.setitem(sys.modules, "filterpy.kalman", None)
     tasks = observer_tasks(observers.load("lorenz").artifact, get_system("lorenz"), rows=2, steps=2)
-    assert list(tasks) == ["KKL", "EKF"]
+    assert list(tasks) == ["KKL", "KKL, error bars", "EKF"]

@@ -1,0 +1,128 @@
+"""Error bars of single samples as machine code, where Numba is installed: the network, the factor and the product."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from observers.compiled import FAST, Layers, active_kernel, entering_kernel, first_layer
+
+
+class CompiledCovariance:
+    """From the filter's state to the covariance of the estimate's error, by one call.
+
+    Parameters
+    ----------
+    layers : sequence of (ndarray, ndarray)
+        Weights (inputs, outputs) and biases (outputs,) of two layers; the outputs are those of
+        :class:`observers.spread.Spread`, in units of the states.
+    activation : {"tanh", "silu", "relu"}
+        After the first layer.
+    whiten, offset, conditions, age
+        As for :class:`observers.compiled.CompiledDecoder`.
+    ages : ndarray, shape (m,)
+        Seconds since reset, rising from 0.
+    log_factors : ndarray, shape (m,)
+        Added to the logarithms of the standard deviations at each of them, and interpolated between.
+    largest_log : float
+        To which those logarithms are cut before.
+
+    Raises
+    ------
+    ImportError
+        If Numba is not installed.
+    ValueError
+        If there are not two layers.
+    """
+
+    def __init__(
+        self,
+        layers: Layers,
+        activation: str,
+        *,
+        whiten: np.ndarray,
+        offset: np.ndarray,
+        conditions: Sequence[float],
+        age: tuple[float, float] | None,
+        ages: np.ndarray,
+        log_factors: np.ndarray,
+        largest_log: float,
+    ) -> None:
+        if len(layers) != 2:
+            raise ValueError(f"single error bars are compiled for networks of two layers, got {len(layers)}")
+        first = first_layer(layers[0], whiten=whiten, offset=offset, conditions=conditions, age=age)
+        second = np.ascontiguousarray(np.vstack(layers[1]).T, dtype=float)  # a row for each output, the bias last
+        table = np.array([ages, log_factors], dtype=float)
+        self._shape = ((math.isqrt(8 * len(second) + 1) - 1) // 2,) * 2
+        unit, end = age or (1.0, 0.0)
+        self._one = functools.partial(_covary(activation), first, second, table, float(unit), float(end), largest_log)
+
+    def single(self, z: np.ndarray, age: float) -> np.ndarray:
+        """Evaluate for one sample.
+
+        Parameters
+        ----------
+        z : ndarray, shape (size,)
+            The filter's state.
+        age : float
+            Seconds since reset.
+
+        Returns
+        -------
+        ndarray, shape (nx, nx)
+            The covariance.
+        """
+        covariance = np.empty(self._shape)
+        self._one(z, age, covariance)
+        return covariance
+
+
+@functools.cache
+def _covary(activation: str) -> Callable[..., None]:
+    """The whole of it, for one sample."""
+    import numba
+
+    active, enter = active_kernel(activation), entering_kernel()
+
+    @numba.njit(fastmath=FAST, error_model="numpy")
+    def output(row: np.ndarray, h: np.ndarray) -> float:
+        total = row[len(h)]
+        for j in range(len(h)):
+            total += row[j] * h[j]
+        return total
+
+    @numba.njit(fastmath=FAST, error_model="numpy")
+    def covary(
+        first: np.ndarray,
+        second: np.ndarray,
+        table: np.ndarray,
+        age_unit: float,
+        age_max: float,
+        largest_log: float,
+        z: np.ndarray,
+        age: float,
+        out: np.ndarray,
+    ) -> None:
+        width, nx = first.shape[1], len(out)
+        h = np.empty(width)
+        enter(first, math.log1p(min(age, age_max) / age_unit), z, h)
+        for j in range(width):
+            h[j] = active(np.float32(h[j]))
+        factor = np.interp(age, table[0], table[1])
+        entry = nx
+        for i in range(nx):  # D L
+            scale = math.exp(min(output(second[i], h), largest_log) + factor)
+            for j in range(i):
+                out[i, j] = scale * output(second[entry], h)
+                entry += 1
+            out[i, i] = scale
+        for i in range(nx - 1, -1, -1):  # its square takes its place: from the end on, nothing is needed that is gone
+            for j in range(i, -1, -1):
+                total = 0.0
+                for k in range(j + 1):
+                    total += out[i, k] * out[j, k]
+                out[i, j] = total
+                out[j, i] = total
+
+    return covary
