@@ -88,6 +88,9 @@ class Compare:
         Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/agents/comparison, or runs/agents/environments)")
     ] = None
     """Folder of results."""
+    beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
+    """Folder with results.csv and curves.csv of an earlier comparison in environments. Its rows of other environments
+    are taken over, so that new ones stand beside them without training those again."""
     noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
         0.0,
     )
@@ -123,6 +126,8 @@ class Compare:
         for what in information:
             if what not in known:
                 raise ValueError(f"agents are compared by {', '.join(known)} here, got {what!r}")
+        if self.beside is not None and not self.environments:
+            raise ValueError("--beside is for environments; agents on systems are collected from the folder of results")
         if self.environments:
             self._in_environments(information, console)
         else:
@@ -140,6 +145,7 @@ class Compare:
             timesteps=self.timesteps,
             aggregate=self.environment.aggregate,
             workers=self.workers,
+            beside=self.beside,
         )
 
     def _on_systems(self, information: tuple[Compared, ...], out: Path, console: Console) -> None:

@@ -2,16 +2,25 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
-from observers.storage import write
+from observers.storage import explained, write
 from training.agents.any_environment.comparison import MANY, RANDOM, collect, planned, run_case
 from training.agents.any_environment.information import SHOWN, Shown
 from training.agents.any_environment.tables import curves, draw_curves, draw_scores, write_table
 from training.agents.any_environment.task import HiddenTask
 from training.commands.running import Workers, run_missing
 from training.progress import LOG, progress_bars
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+COLUMNS = {
+    "results.csv": ["environment", "noise", "shown", "seed", "return", "seconds"],
+    "curves.csv": ["environment", "noise", "shown", "steps", "seconds", "return"],
+}
 
 
 def compare_environments(
@@ -25,6 +34,7 @@ def compare_environments(
     timesteps: int | None,
     aggregate: int,
     workers: Workers,
+    beside: Path | None = None,
 ) -> None:
     """Run what is missing of a comparison, then report.
 
@@ -46,12 +56,15 @@ def compare_environments(
         How many times observers are fitted again.
     workers : Workers
         Where agents are trained.
+    beside : Path, optional
+        Folder with results.csv and curves.csv of an earlier run, whose rows of other environments are taken over.
 
     Raises
     ------
     ValueError
-        If the folder holds another comparison, or a training failed.
+        If the folder holds another comparison, a file of the earlier run is damaged or missing, or a training failed.
     """
+    earlier = {name: _earlier(beside, name) for name in COLUMNS}  # an error now, not after hours
     cases = planned(tasks, out, kinds=kinds, seeds=seeds, episodes=episodes, timesteps=timesteps, aggregate=aggregate)
     for task in tasks:
         task.make().close()  # an error now, not when its turn comes
@@ -67,7 +80,9 @@ def compare_environments(
             if len(results) and set(results.shown) - {"state", RANDOM}:
                 missing = sum(not case.done for case in cases)
                 partial = f" Partial: {missing} of {len(cases)} agents are missing." if missing else ""
-                learned = curves(there)
+                results, learned = (
+                    _joined(rows, earlier[name]) for name, rows in zip(COLUMNS, (results, curves(there)))
+                )
                 write(out / "results.csv", results.to_csv(index=False))
                 write(out / "curves.csv", learned.to_csv(index=False))
                 write_table(out / "table.md", results, partial)
@@ -76,3 +91,24 @@ def compare_environments(
                 progress.say(f"wrote results.csv, curves.csv, table.md, scores.png and curves.png in {out}")
     if failures:
         raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
+
+
+def _earlier(folder: Path | None, name: str) -> "pd.DataFrame":
+    """Rows of an earlier run, none without one."""
+    import pandas as pd  # which takes half a second that help need not wait for
+
+    if folder is None:
+        return pd.DataFrame(columns=COLUMNS[name])
+    with explained(folder / name, ValueError):
+        rows = pd.read_csv(folder / name)
+        if list(rows.columns) != COLUMNS[name]:
+            raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(COLUMNS[name])}")
+        return rows
+
+
+def _joined(rows: "pd.DataFrame", earlier: "pd.DataFrame") -> "pd.DataFrame":
+    """Those of other environments first, as they are; of one environment all rows are of one run."""
+    import pandas as pd
+
+    others = earlier[~earlier.environment.isin(set(rows.environment))]
+    return pd.concat([others, rows]) if len(others) else rows

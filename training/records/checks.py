@@ -117,12 +117,14 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
     Raises
     ------
     ValueError
-        If an output or a hidden state stands still in all records.
+        If an output or a hidden state is the same in all rows of all records. One that stands still in each, such as a
+        target that is drawn once an episode, may differ between them.
     """
     for letter, role in (("y", "measured"), ("x", "hidden")):
         for j, column in enumerate(getattr(records[0].signals, role)):
-            if not any(_spread(record, letter, j) for record in records):
-                value = np.nanmax(getattr(records[0], letter)[:, j])
+            moves = any(_spread(record, letter, j) for record in records)
+            value, *others = (np.nanmax(getattr(record, letter)[:, j]) for record in records)
+            if not moves and all(other == value for other in others):
                 raise ValueError(
                     f"{records[0].name}: column {column}: {value:g} in all rows, and no other file says more; there is "
                     "nothing to learn from what never moves"
@@ -130,7 +132,7 @@ def check_motion(records: Sequence[Record], warn: Warn) -> None:
             still, wrapped = list[str](), list[str]()
             for record in records:
                 values = getattr(record, letter)[:, j]
-                if not _spread(record, letter, j):
+                if moves and not _spread(record, letter, j):
                     still.append(f"{record.name}: column {column} never moves")
                 jumps = abs(np.diff(values))
                 turns = np.flatnonzero((jumps > WHOLE_TURN) & (jumps < 2 * np.pi + 0.1))

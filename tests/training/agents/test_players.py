@@ -24,6 +24,7 @@ from training.agents.any_environment.tables import cell, curves, write_table
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.commands.agent import Evaluate, Train
 from training.commands.compare import Compare
+from training.commands.compare_environments import COLUMNS
 from training.commands.environment import EnvironmentOptions
 from training.commands.record import RecordCommand
 from training.commands.running import Workers
@@ -301,6 +302,29 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
         assert (tmp_path / name).stat().st_size > 100
     with pytest.raises(ValueError, match="another comparison: episodes = 4 there, 5 here"):
         Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
+
+
+def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_path, small):
+    """Those of this one are of this one alone."""
+    options = {"seeds": 1, "episodes": 2, "workers": Workers(1), "information": ("state", "y")}
+    kept = {
+        "results.csv": ["Ball-v0,0.0,random,0,1.0,0.0", "Ball-v0,0.0,state,0,11.25,3.0", "Ball-v0,0.0,y,0,6.0,3.5"],
+        "curves.csv": ["Ball-v0,0.0,state,10,1.5,2.0", "Ball-v0,0.0,y,10,1.5,0.125"],
+    }
+    for name, rows in kept.items():
+        lines = [",".join(COLUMNS[name]), *rows, rows[-1].replace("Ball-v0", "CartPole-v1")]
+        (tmp_path / name).write_text("\n".join(lines) + "\n")
+    Compare(("CartPole-v1",), **options, out=tmp_path / "out", beside=tmp_path).run(Console())
+    for name, rows in kept.items():
+        assert (tmp_path / "out" / name).read_text().splitlines()[1 : len(rows) + 1] == rows
+    results = pd.read_csv(tmp_path / "out" / "results.csv")
+    assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 3
+    assert "| Ball-v0 | 11.25 (1.00), 1 | 6 (0.49), 1 | 1 |" in (tmp_path / "out" / "table.md").read_text()
+    (tmp_path / "curves.csv").write_text("environment,steps\n")
+    with pytest.raises(ValueError, match=r"curves.csv.*its columns are environment, steps, not environment, noise"):
+        Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path).run(Console())
+    with pytest.raises(ValueError, match="--beside is for environments"):
+        Compare(out=tmp_path / "d", beside=tmp_path).run(Console())
 
 
 def test_full_state_agents_are_shared_by_levels_of_noise(tmp_path):

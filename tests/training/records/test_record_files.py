@@ -188,6 +188,16 @@ def test_files_that_differ(tmp_path):
         read_records([first, npz(tmp_path / "b.npz", y=0 * Y)])
 
 
+def test_what_is_drawn_once_a_record_may_stand_still_in_each(tmp_path):
+    """As a target does; only what is the same everywhere teaches nothing."""
+    ones = np.ones_like(Y)
+    paths = [npz(tmp_path / f"{i}.npz", y=np.column_stack([Y, i * ones])) for i in range(3)]
+    assert [record.y[0, 1] for record in read_records(paths)] == [0.0, 1.0, 2.0]
+    same = [npz(tmp_path / f"same{i}.npz", y=np.column_stack([Y, ones])) for i in range(3)]
+    with pytest.raises(ValueError, match=r"same0.npz: column y2: 1 in all rows, and no other file says more"):
+        read_records(same)
+
+
 def test_wrapped_angles(tmp_path):
     wrapped = np.angle(np.exp(1j * 2 * T))
     with pytest.warns(UserWarning, match=r"column y, row \d+: a jump by a whole turn.*take cos\(y\) and sin\(y\)"):
