@@ -83,6 +83,9 @@ class Speed:
             if one.observed:
                 made = gym.make(one.env_id, **one.options)
                 envs[f"{one.label}, x_hat"] = kkl_gym.KKLObservation(made, one.observer)
+            if _has_error_bars(one):
+                made = gym.make(one.env_id, **one.options)
+                envs[f"{one.label}, x_hat, error bars"] = kkl_gym.KKLObservation(made, one.observer, uncertainty=True)
             if small := _small(one):
                 envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLObservation(gym.make(one.env_id, **one.options), small)
         actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
@@ -109,6 +112,10 @@ class Speed:
                 inner = [make(one.env_id, **one.options) for _ in range(2)]
                 envs[f"{one.label}, z"] = kkl_gym.KKLVectorObservation(inner[0], one.observer, estimate="z")
                 envs[f"{one.label}, x_hat"] = kkl_gym.KKLVectorObservation(inner[1], one.observer)
+            if _has_error_bars(one):
+                made = make(one.env_id, **one.options)
+                wrapped = kkl_gym.KKLVectorObservation(made, one.observer, uncertainty=True)
+                envs[f"{one.label}, x_hat, error bars"] = wrapped
             if small := _small(one):
                 made = make(one.env_id, **one.options)
                 envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLVectorObservation(made, small)
@@ -287,6 +294,11 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
     if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
         shares["network"] = _share(env.observer.decode, step)
     return shares
+
+
+def _has_error_bars(one: Shown) -> bool:
+    """Whether there is a map for a system that says covariances."""
+    return one.observed and Artifact.read(resolve(one.observer or one.system.name)).inverse.spread is not None
 
 
 def _small(one: Shown) -> str | None:
