@@ -74,7 +74,15 @@ def compare_environments(
             failures = run_missing(run_case, cases, workers=workers, what="agents", progress=progress)
     finally:  # also after an interruption
         with progress_bars(console, out / LOG) as progress, progress.phase("collecting results"):
-            every = planned(tasks, out, seeds=MANY, episodes=episodes, timesteps=timesteps, aggregate=aggregate)
+            every = planned(
+                tasks,
+                out,
+                seeds=MANY,
+                recurrent_seeds=MANY,
+                episodes=episodes,
+                timesteps=timesteps,
+                aggregate=aggregate,
+            )
             there = [case for case in every if case.done]  # whichever run it is from
             results = collect(there)
             if len(results) and set(results.shown) - {"state", RANDOM}:

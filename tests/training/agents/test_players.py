@@ -335,6 +335,12 @@ def test_full_state_agents_are_shared_by_levels_of_noise(tmp_path):
     assert len(cases) == 7
 
 
+def test_recurrent_agents_are_fewer(tmp_path):
+    cases = planned([PENDULUM], tmp_path, kinds=("state", "recurrent"), seeds=4)
+    assert [case.seed for case in cases if case.kind == "recurrent"] == [0, 1, 2]
+    assert len([case for case in cases if case.kind == "state"]) == 4
+
+
 def test_a_table_of_known_results(tmp_path):
     rows = [("random", 0.0, 0, 10.0), *(("state", 0.0, i, 110.0 + i) for i in range(-2, 3))]
     rows += [("y", 0.2, i, 60.0 + 2 * i) for i in range(-2, 3)]
