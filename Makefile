@@ -104,7 +104,8 @@ agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that s
 	cp runs/agents/comparison/jobs/van_der_pol-0.5/y/0/agent.safetensors training/agents/shipped/van_der_pol-y.safetensors
 	$(MAKE) figures
 
-HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0
+HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 InvertedPendulum-v5 InvertedDoublePendulum-v5 Reacher-v5 \
+	Hopper-v5 HalfCheetah-v5
 
 environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
