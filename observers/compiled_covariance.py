@@ -21,9 +21,11 @@ class CompiledCovariance:
         After the first layer.
     whiten, offset, conditions, age
         As for :class:`observers.compiled.CompiledDecoder`.
-    ages : ndarray, shape (m,)
+    nx : int
+        Number of states.
+    ages : sequence of float
         Seconds since reset, rising from 0.
-    log_factors : ndarray, shape (m,)
+    log_factors : sequence of float
         Added to the logarithms of the standard deviations at each of them, and interpolated between.
     largest_log : float
         To which those logarithms are cut before.
@@ -32,8 +34,6 @@ class CompiledCovariance:
     ------
     ImportError
         If Numba is not installed.
-    ValueError
-        If there are not two layers.
     """
 
     def __init__(
@@ -45,16 +45,15 @@ class CompiledCovariance:
         offset: np.ndarray,
         conditions: Sequence[float],
         age: tuple[float, float] | None,
-        ages: np.ndarray,
-        log_factors: np.ndarray,
+        nx: int,
+        ages: Sequence[float],
+        log_factors: Sequence[float],
         largest_log: float,
     ) -> None:
-        if len(layers) != 2:
-            raise ValueError(f"single error bars are compiled for networks of two layers, got {len(layers)}")
         first = first_layer(layers[0], whiten=whiten, offset=offset, conditions=conditions, age=age)
         second = np.ascontiguousarray(np.vstack(layers[1]).T, dtype=float)  # a row for each output, the bias last
         table = np.array([ages, log_factors], dtype=float)
-        self._shape = ((math.isqrt(8 * len(second) + 1) - 1) // 2,) * 2
+        self._shape = (nx, nx)
         unit, end = age or (1.0, 0.0)
         self._one = functools.partial(_covary(activation), first, second, table, float(unit), float(end), largest_log)
 
@@ -93,6 +92,17 @@ def _covary(activation: str) -> Callable[..., None]:
         return total
 
     @numba.njit(fastmath=FAST, error_model="numpy")
+    def interpolated(age: float, table: np.ndarray) -> float:  # as np.interp, which takes a second to compile
+        last = table.shape[1] - 1
+        if age >= table[0, last]:
+            return table[1, last]
+        i = 0
+        while age >= table[0, i + 1]:
+            i += 1
+        share = (age - table[0, i]) / (table[0, i + 1] - table[0, i])
+        return table[1, i] + share * (table[1, i + 1] - table[1, i])
+
+    @numba.njit(fastmath=FAST, error_model="numpy")
     def covary(
         first: np.ndarray,
         second: np.ndarray,
@@ -109,7 +119,7 @@ def _covary(activation: str) -> Callable[..., None]:
         enter(first, math.log1p(min(age, age_max) / age_unit), z, h)
         for j in range(width):
             h[j] = active(np.float32(h[j]))
-        factor = np.interp(age, table[0], table[1])
+        factor = interpolated(age, table)
         entry = nx
         for i in range(nx):  # D L
             scale = math.exp(min(output(second[i], h), largest_log) + factor)

@@ -153,7 +153,9 @@ class KKLObserver:
         """Make the machine code for single samples now, by a sample that is forgotten."""
         linear = self.artifact.filter
         y, z = np.zeros(self.artifact.ny), np.zeros(linear.size)
-        self._states(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
+        parts, _ = self._states.estimate(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
+        if self.artifact.inverse.spread is not None:
+            self._states.covariance(parts)
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.

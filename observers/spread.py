@@ -133,15 +133,16 @@ class Covariance:
         The arguments are those of :class:`observers.compiled_covariance.CompiledCovariance` that say what the network
         is given.
         """
-        layers, table = self._mlp.layers, (np.array(self._ages), np.array(self._log_factors))
+        layers = self._mlp.layers
         if len(layers) != 2:
             return None
         try:
             return CompiledCovariance(
                 layers,
                 self._mlp.activation,
-                ages=table[0],
-                log_factors=table[1],
+                nx=self._nx,
+                ages=self._ages,
+                log_factors=self._log_factors,
                 largest_log=_LARGEST_LOG,
                 **inputs,
             )

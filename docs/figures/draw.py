@@ -25,7 +25,7 @@ from observers.spread import deviations
 from observers.storage import replacing, write
 from training.agents import picture
 from training.agents.agent import Agent
-from training.agents.any_environment.tables import draw_curves
+from training.agents.any_environment.tables import draw_curves, draw_scores
 from training.agents.play import Episodes, play
 from training.benchmark.results import draw_results as draw_benchmark
 from training.commands import certify, coverage, demo, faults, sizes
@@ -219,6 +219,9 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
     "results/agents/scores.png": lambda: partial(draw_agents, RESULTS / "agents"),
+    "results/environments/scores.png": lambda: partial(
+        draw_scores, results=pd.read_csv(RESULTS / "environments" / "results.csv")
+    ),
     "results/environments/curves.png": lambda: partial(
         draw_curves, found=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),

@@ -65,23 +65,47 @@ def apart(found, expected, artifact):
     return np.abs((found - expected) / artifact.inverse.x_scale).max()
 
 
+def along_z(observer, y, u):
+    """Filter states."""
+    observer.reset(y[0])
+    found = [observer.z]
+    for k in range(1, len(y)):
+        observer.step(y[k], u[k])
+        found.append(observer.z)
+    return np.array(found)
+
+
 @pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
 def test_compiled_error_bars_of_single_samples_are_numpys(name):
-    """Free and driven motion, at levels of noise and ages between those of the factors."""
+    """Free and driven motion, at levels of noise and ages between those of the factors, at them and beyond."""
     artifact = Artifact.read(resolve(name))
-    y, u = signals(artifact, 120)
+    y, u = signals(artifact, 60)
     for level, process_noise in ((0.0, 0.0), (0.37, 0.4), (1.0, 5.0)):
-        found = []
-        for choice in (True, False):
-            observer = observers.KKLObserver(artifact, level, process_noise=process_noise, compiled=choice)
-            covariances = [observer.reset(y[0]) is None or observer.covariance]
-            for k in range(1, len(y)):
-                observer.step(y[k], u[k])
-                covariances.append(observer.covariance)
-            found.append(np.array(covariances))
-        size = np.sqrt(found[1].diagonal(axis1=1, axis2=2))
-        assert np.abs((found[0] - found[1]) / (size[:, :, None] * size[:, None])).max() < 1e-4
-        np.testing.assert_array_equal(found[0], found[0].swapaxes(1, 2))
+        options = {"process_noise": process_noise}
+        one, other = (observers.KKLObserver(artifact, level, compiled=choice, **options) for choice in (True, False))
+        for z in along_z(other, y, u)[[0, 19, 59]]:
+            ages = artifact.inverse.spread.ages
+            for age in (*ages, *(ages[1:] + ages[:-1]) / 2, 1e3, np.inf):
+                found, expected = (observer._states.covariances(z, float(age)) for observer in (one, other))
+                size = np.sqrt(expected.diagonal())
+                assert 0 < np.abs((found - expected) / np.outer(size, size)).max() < 1e-4  # not the same arithmetic
+                np.testing.assert_array_equal(found, found.T)
+
+
+def test_error_bars_are_compiled_with_the_observer_and_stay_when_it_travels():
+    compiled_covariance._covary.cache_clear()
+    observer = observers.load("van_der_pol", compiled=True)
+    y, u = signals(observer.artifact, 3)
+    along(observer, y, u)
+    kernel = compiled_covariance._covary(observer.artifact.inverse.spread.mlp.activation)
+    assert len(kernel.signatures) == 1
+    before = observer.covariance
+    observer.step(y[1], np.array([0.3]))
+    assert len(kernel.signatures) == 1  # for free and driven motion, and at any age
+    assert not np.array_equal(observer.covariance, before)
+    travelled = pickle.loads(pickle.dumps(observer))
+    np.testing.assert_array_equal(travelled.covariance, observer.covariance)
+    assert b"CompiledCovariance" not in pickle.dumps(observer)
 
 
 @pytest.mark.parametrize("name", NAMES)

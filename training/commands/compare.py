@@ -90,7 +90,8 @@ class Compare:
     """Folder of results."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
     """Folder with results.csv and curves.csv of an earlier comparison in environments. Its rows of other environments
-    are taken over, so that new ones stand beside them without training those again."""
+    are taken over, so that new ones stand beside them without training those again. Give it each time: tables are
+    written anew. That both were made with the same settings is for you to see to."""
     noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
         0.0,
     )

@@ -62,7 +62,9 @@ def compare_environments(
     Raises
     ------
     ValueError
-        If the folder holds another comparison, a file of the earlier run is damaged or missing, or a training failed.
+        If the folder holds another comparison, a file of the earlier run is damaged, or a training failed.
+    OSError
+        If a file of the earlier run is missing.
     """
     earlier = {name: _earlier(beside, name) for name in COLUMNS}  # an error now, not after hours
     cases = planned(tasks, out, kinds=kinds, seeds=seeds, episodes=episodes, timesteps=timesteps, aggregate=aggregate)
@@ -88,9 +90,12 @@ def compare_environments(
             if len(results) and set(results.shown) - {"state", RANDOM}:
                 missing = sum(not case.done for case in cases)
                 partial = f" Partial: {missing} of {len(cases)} agents are missing." if missing else ""
-                results, learned = (
-                    _joined(rows, earlier[name]) for name, rows in zip(COLUMNS, (results, curves(there)))
-                )
+                here = set(results.environment)
+                results = _joined(results, earlier["results.csv"], here)
+                learned = _joined(curves(there), earlier["curves.csv"], here)
+                if beside is not None:
+                    others = sorted(set(results.environment) - here)
+                    progress.say(f"beside them, from {beside}: {', '.join(others) or 'no other environments'}")
                 write(out / "results.csv", results.to_csv(index=False))
                 write(out / "curves.csv", learned.to_csv(index=False))
                 write_table(out / "table.md", results, partial)
@@ -102,21 +107,31 @@ def compare_environments(
 
 
 def _earlier(folder: Path | None, name: str) -> "pd.DataFrame":
-    """Rows of an earlier run, none without one."""
+    """Rows of an earlier run, none without one; raises ValueError or OSError if they cannot be taken over."""
     import pandas as pd  # which takes half a second that help need not wait for
 
+    columns = COLUMNS[name]
     if folder is None:
-        return pd.DataFrame(columns=COLUMNS[name])
+        return pd.DataFrame(columns=columns)
     with explained(folder / name, ValueError):
-        rows = pd.read_csv(folder / name)
-        if list(rows.columns) != COLUMNS[name]:
-            raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(COLUMNS[name])}")
-        return rows
+        rows = pd.read_csv(folder / name, index_col=False)
+        if list(rows.columns) != columns:
+            raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(columns)}")
+        for column in columns:
+            if column not in ("environment", "shown") and not pd.api.types.is_numeric_dtype(rows[column]):
+                raise ValueError(f"column {column} holds something that is no number")
+        if rows.isna().any(axis=None):
+            raise ValueError(f"row {rows.index[rows.isna().any(axis=1)][0] + 2} lacks a value")
+        if unknown := set(rows.shown) - {*SHOWN, RANDOM}:
+            raise ValueError(f"agents are shown {', '.join(sorted(unknown))}; known are {', '.join(SHOWN)}")
+        if (twice := rows.duplicated(columns[:4])).any():
+            raise ValueError(f"row {rows.index[twice][0] + 2} says again what one before it says")
+    return rows
 
 
-def _joined(rows: "pd.DataFrame", earlier: "pd.DataFrame") -> "pd.DataFrame":
-    """Those of other environments first, as they are; of one environment all rows are of one run."""
+def _joined(rows: "pd.DataFrame", earlier: "pd.DataFrame", here: set[str]) -> "pd.DataFrame":
+    """Those of other environments than the ones here first, as they are: of each environment all are of one run."""
     import pandas as pd
 
-    others = earlier[~earlier.environment.isin(set(rows.environment))]
+    others = earlier[~earlier.environment.isin(here)]
     return pd.concat([others, rows]) if len(others) else rows

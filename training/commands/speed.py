@@ -292,8 +292,14 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
         u, w = np.zeros((system.nu, x.shape[1])), np.zeros_like(x)
         shares["simulation"] = _share(lambda: batch_step(system)(x, u, w, base.plant.dt), step)
     if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
-        shares["network"] = _share(env.observer.decode, step)
+        shares["network"] = _share(lambda: _decoded(env.observer, error_bars="x_cov" in info), step)
     return shares
+
+
+def _decoded(observer: KKLObserver, *, error_bars: bool) -> None:
+    observer.decode()
+    if error_bars:
+        observer.decode_covariance()
 
 
 def _has_error_bars(one: Shown) -> bool:

@@ -139,7 +139,7 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of all signals.
+    """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move.
 
     Parameters
     ----------
@@ -150,12 +150,20 @@ def signal_rate(records: Sequence[Record]) -> float:
     -------
     float
         About the angular frequency of what oscillates.
+
+    Raises
+    ------
+    ValueError
+        If each signal stands still in each record.
     """
-    rates = []
+    rates = list[float]()
     for letter in "yx":
         columns = [getattr(record, letter) for record in records if getattr(record, letter) is not None]
         if columns:
             steps = [np.diff(values, axis=0) / np.diff(record.t)[:, None] for values, record in zip(columns, records)]
             change = np.sqrt(np.nanmean(np.concatenate(steps) ** 2, 0))
             rates += (change / np.nanstd(np.concatenate(columns), 0)).tolist()
-    return float(np.median(rates))
+    moving = [rate for rate in rates if rate > 0]
+    if not moving:
+        raise ValueError(f"{records[0].name}: no signal moves, nor in any other record; there is nothing to learn from")
+    return float(np.median(moving))

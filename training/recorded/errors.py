@@ -50,7 +50,7 @@ def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float 
     Returns
     -------
     RecordedErrors
-        NaN where nothing is left to compare.
+        NaN where nothing is left to compare, and of what stands still in all of these records.
     """
     after = settling_time(artifact.filter) if after is None else after
     first = int(np.ceil(after / artifact.filter.dt - 1e-6))  # times are rounded
@@ -65,7 +65,8 @@ def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float 
     names = (artifact.signals or {})["hidden"]
     if not len(error):
         return RecordedErrors(dict.fromkeys(names, float("nan")), after, 0.0)
-    relative = np.sqrt(np.mean(error**2, 0)) / np.where(truth.std(0) > 0, truth.std(0), np.nan)
+    moves = np.ptp(truth, 0) > 0  # rounding may leave a standard deviation of what stands still
+    relative = np.sqrt(np.mean(error**2, 0)) / np.where(moves, truth.std(0), np.nan)
     return RecordedErrors(dict(zip(names, relative.tolist())), after, len(error) * artifact.filter.dt)
 
 

@@ -304,6 +304,16 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
         Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
 
 
+EARLIER = {
+    "Ball-v0,0.0,state,0,much,3.0": "column return holds something that is no number",
+    "Ball-v0,0.0,state,0,,3.0": "row 3 lacks a value",
+    ",0.0,state,0,1.0,3.0": "row 3 lacks a value",
+    "Ball-v0,0.0,everything,0,1.0,3.0": "shown everything; known are state, x_hat",
+    "Ball-v0,0.0,random,0,1.0,0.0": "row 3 says again what one before it says",
+    "Ball-v0,0.0,state,0,1.0,3.0,5,6": "Expected 6 fields in line 3, saw 8",
+}
+
+
 def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_path, small):
     """Those of this one are of this one alone."""
     options = {"seeds": 1, "episodes": 2, "workers": Workers(1), "information": ("state", "y")}
@@ -320,9 +330,18 @@ def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_pa
     results = pd.read_csv(tmp_path / "out" / "results.csv")
     assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 3
     assert "| Ball-v0 | 11.25 (1.00), 1 | 6 (0.49), 1 | 1 |" in (tmp_path / "out" / "table.md").read_text()
-    (tmp_path / "curves.csv").write_text("environment,steps\n")
-    with pytest.raises(ValueError, match=r"curves.csv.*its columns are environment, steps, not environment, noise"):
+    for row, says in EARLIER.items():
+        (tmp_path / "results.csv").write_text(
+            "\n".join([",".join(COLUMNS["results.csv"]), kept["results.csv"][0], row])
+        )
+        with pytest.raises(ValueError, match=rf"results.csv.*{says}"):
+            Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path).run(Console())
+    (tmp_path / "results.csv").write_text("environment,steps\n")
+    with pytest.raises(ValueError, match=r"results.csv.*its columns are environment, steps, not environment, noise"):
         Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path).run(Console())
+    with pytest.raises(OSError, match=r"results.csv"):
+        Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path / "none").run(Console())
+    assert not (tmp_path / "c").exists()
     with pytest.raises(ValueError, match="--beside is for environments"):
         Compare(out=tmp_path / "d", beside=tmp_path).run(Console())
 

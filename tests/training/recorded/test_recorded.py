@@ -103,6 +103,25 @@ def test_the_rate_of_signals_is_their_angular_frequency():
     assert json.dumps(config.eigenvalues)
 
 
+def test_signals_that_stand_still_in_each_record(tmp_path):
+    """They do not slow the filter down, and an error relative to no spread is none."""
+    signals = replace(SIGNALS, measured=("position", "target"), hidden=("speed", "mass"))
+    records = []
+    for seed in range(6):
+        run, ones = swing(seed), np.full((600, 1), 0.1 * (seed + 1))
+        records.append(replace(run, y=np.hstack([run.y, ones]), x=np.hstack([run.x, ones]), signals=signals))
+    alone = recorded_config([swing(seed) for seed in range(6)], SMALL)
+    config = recorded_config(records, SMALL)
+    assert config.eigenvalues == alone.eigenvalues
+    errors = train_recorded(records, config, tmp_path, name="spring", device=torch.device("cpu")).errors.relative
+    assert errors["speed"] < 0.3
+    assert np.isnan(errors["mass"])
+    kept = replace(SIGNALS, measured=("target",), hidden=("mass",))
+    still = [replace(record, y=record.y[:, 1:], x=record.x[:, 1:], signals=kept) for record in records]
+    with pytest.raises(ValueError, match="run0.csv: no signal moves, nor in any other record"):
+        signal_rate(still)
+
+
 def test_errors_are_relative_and_leave_the_transient_out(tmp_path):
     records = [swing(seed, n=300) for seed in range(2)]
     config = recorded_config(records, {**SMALL, "inverse_steps": 20})
