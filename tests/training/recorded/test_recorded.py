@@ -118,7 +118,7 @@ def test_signals_that_stand_still_in_each_record(tmp_path):
     assert np.isnan(errors["mass"])
     kept = replace(SIGNALS, measured=("target",), hidden=("mass",))
     still = [replace(record, y=record.y[:, 1:], x=record.x[:, 1:], signals=kept) for record in records]
-    with pytest.raises(ValueError, match="run0.csv: no signal moves, nor in any other record"):
+    with pytest.raises(ValueError, match=r"run0\.csv: no signal moves, nor in any other record"):
         signal_rate(still)
 
 
