@@ -75,8 +75,8 @@ class Train:
     threads: int = 1
     """CPU threads of the networks."""
     observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
-    """Steps with random actions from which the observer of an agent in an environment is learned first, where none is
-    named; they count as the agent's."""
+    """First steps of an agent in an environment from which its observer is learned, where none is named. The agent
+    learns from them too: it is told the truth where estimates will be."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of an agent in an environment."""
 

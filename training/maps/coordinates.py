@@ -9,6 +9,7 @@ from observers import LinearFilter
 # A mode of z whose variation is smaller than this part of the largest is left out: it holds rounding errors.
 SMALLEST_MODE = 1e-7
 STILL = 1e-12  # of a component's size: a standard deviation below it is rounding
+SETTLED = np.log(1e3)  # time constants after which a filter has forgotten its start to one part in a thousand
 
 
 @dataclass(frozen=True)
@@ -75,4 +76,4 @@ def spread(z: np.ndarray) -> np.ndarray:
 def settling_time(linear: LinearFilter) -> float:
     """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
     slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
-    return float(np.log(1e3) / slowest)
+    return float(SETTLED / slowest)

@@ -88,61 +88,123 @@ def roll_out(
     for what, count in (("episodes", episodes), ("steps", steps)):
         if count is not None:
             integer(what, count, 1)
-    env_identity, source = identity(env), env.spec.id if env.spec else ""
-    signals = Signals(
-        measured=resolved(measured, env.observation_space, role="measured", source=source),
-        hidden=resolved(hidden, env.observation_space, role="hidden", source=source),
-    )
-    if not signals.measured:
-        raise ValueError("say which entries of the observation are measured, as in measured=[0, 1]")
-    readers = [Reader(env.observation_space, names, source=source) for names in (signals.measured, signals.hidden)]
-    InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
-    keys = tuple(dict.fromkeys(key for reader in readers for key in reader.keys))
+    recorder = Recorder(env, measured=measured, hidden=hidden, name=name)
     env.action_space.seed(integer("seed", seed, 0))
-    played, total = list[Episode](), 0
-    found = Rollouts(
-        name or source, env_identity, sampling_interval(env), env.observation_space, env.action_space, played, signals
-    )
-    while (episodes is None or len(played) < episodes) and (steps is None or total < steps):
-        left = None if steps is None else steps - total
-        played.append(_episode(env, policy, keys, seed=None if played else seed, most=left))
-        total += len(played[-1].rewards)
-        if len(played) == 1:
-            found.records()  # an error now, not after hours
+    played = total = 0
+    while (episodes is None or played < episodes) and (steps is None or total < steps):
+        observation, _ = recorder.reset(seed=None if played else seed)
+        over, length = False, 0
+        while not over and (steps is None or total + length < steps):
+            observation, _, terminated, truncated, _ = recorder.step(policy(observation))
+            over, length = terminated or truncated, length + 1
+        played, total = played + 1, total + length
+        if played == 1:
+            recorder.rollouts().records()  # an error now, not after hours
         if report is not None:
-            report(len(played) if steps is None else total)
+            report(played if steps is None else total)
+    found = recorder.rollouts()
     found.records()  # an error now where a signal cannot be read
     return found
 
 
-def _episode(
-    env: gym.Env[Any, Any], policy: Policy, keys: Sequence[str], *, seed: int | None, most: int | None
-) -> Episode:
-    observation, info = env.reset(seed=seed)
-    observations, actions, infos = list[Any](), list[Any](), list[list[Any]]()
-    rewards = list[float]()
+class Recorder(gym.Wrapper[Any, Any, Any, Any]):
+    """Keeps the episodes that are played in an environment: observations, actions and what is asked of ``info``.
 
-    def keep(to: list[Any], value: Any) -> None:
-        to.append(copy.deepcopy(value))  # environments and policies may write into the same array at each step
+    Parameters
+    ----------
+    env : gymnasium.Env
+        The environment, made by ``gym.make``.
+    measured, hidden : sequence of str or int
+        Signals, as :func:`kkl_gym.named.resolved` takes them.
+    name : str
+        Of the rollouts.
 
-    keep(observations, observation)
-    keep(infos, [info.get(key) for key in keys])
-    terminated = truncated = False
-    while not (terminated or truncated or len(rewards) == most):
-        action = policy(observation)
-        keep(actions, action)
-        observation, reward, terminated, truncated, info = env.step(action)
-        keep(observations, observation)
-        rewards.append(float(reward))
-        keep(infos, [info.get(key) for key in keys])
-    asked = {key: _values(list(values), key) for key, values in zip(keys, zip(*infos))}
-    return Episode(
-        _stacked(env.observation_space, observations),
-        _stacked(env.action_space, actions),
-        np.array(rewards),
-        bool(terminated),
-        asked,
-    )
+    Raises
+    ------
+    ValueError
+        If a signal makes no sense, or observations or actions are of a kind that is not recorded.
+    """
+
+    def __init__(
+        self, env: gym.Env[Any, Any], *, measured: Sequence[str | int], hidden: Sequence[str | int], name: str = ""
+    ) -> None:
+        super().__init__(env)
+        source = env.spec.id if env.spec else ""
+        self._name, self._identity = name or source, identity(env)
+        self._signals = Signals(
+            measured=resolved(measured, env.observation_space, role="measured", source=source),
+            hidden=resolved(hidden, env.observation_space, role="hidden", source=source),
+        )
+        if not self._signals.measured:
+            raise ValueError("say which entries of the observation are measured, as in measured=[0, 1]")
+        chosen = (self._signals.measured, self._signals.hidden)
+        readers = [Reader(env.observation_space, names, source=source) for names in chosen]
+        InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
+        self._keys = tuple(dict.fromkeys(key for reader in readers for key in reader.keys))
+        self._played = list[Episode]()
+        self._begin()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Reset the environment; the episode before counts as far as it got."""
+        self._end()
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._keep(observation, info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Step the environment."""
+        self._actions.append(copy.deepcopy(action))
+        observation, reward, self._terminated, truncated, info = self.env.step(action)
+        self._keep(observation, info)
+        self._rewards.append(float(reward))
+        return observation, float(reward), self._terminated, truncated, info
+
+    def rollouts(self) -> Rollouts:
+        """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with.
+
+        Returns
+        -------
+        Rollouts
+            All episodes so far.
+
+        Raises
+        ------
+        ValueError
+            If ``info`` does not hold what is asked of it.
+        """
+        self._end()
+        return Rollouts(
+            self._name,
+            self._identity,
+            sampling_interval(self.env),
+            self.env.observation_space,
+            self.env.action_space,
+            self._played,
+            self._signals,
+        )
+
+    def _begin(self) -> None:
+        self._observations, self._actions, self._infos = list[Any](), list[Any](), list[list[Any]]()
+        self._rewards, self._terminated = list[float](), False
+
+    def _keep(self, observation: Any, info: Mapping[str, Any]) -> None:
+        # Environments and policies may write into the same array at each step.
+        self._observations.append(copy.deepcopy(observation))
+        self._infos.append([copy.deepcopy(info.get(key)) for key in self._keys])
+
+    def _end(self) -> None:
+        if self._rewards:
+            asked = {key: _values(list(values), key) for key, values in zip(self._keys, zip(*self._infos))}
+            self._played.append(
+                Episode(
+                    _stacked(self.env.observation_space, self._observations),
+                    _stacked(self.env.action_space, self._actions),
+                    np.array(self._rewards),
+                    bool(self._terminated),
+                    asked,
+                )
+            )
+        self._begin()
 
 
 def _values(values: list[Any], key: str) -> np.ndarray:

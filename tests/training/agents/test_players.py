@@ -19,6 +19,7 @@ from training.agents.any_environment import learning
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
 from training.agents.any_environment.information import SHOWN, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
+from training.agents.any_environment.observing import Told, learn_observer
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.tables import cell, curves, write_table
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
@@ -28,6 +29,7 @@ from training.commands.compare_environments import COLUMNS
 from training.commands.environment import EnvironmentOptions
 from training.commands.record import RecordCommand
 from training.commands.running import Workers
+from training.progress import ProgressBars
 from training.records import read_records
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
@@ -151,14 +153,22 @@ def test_a_file_acts_as_the_agent_that_was_trained(tmp_path, small, algorithm, t
     assert list(curve) == ["steps", "seconds", "return"]
 
 
-def test_an_agent_on_estimates_pays_for_its_observer(tmp_path, small):
-    learn_to_play(CART, "x_hat", tmp_path, timesteps=1000, observer_steps=900)
+def test_an_agent_on_estimates_is_told_the_truth_until_there_are_some(tmp_path, small, monkeypatch):
+    seen, learned = [], learning.learn_observer
+
+    def noted(task, records, folder, **options):
+        seen.extend(records)
+        return learned(task, records, folder, **options)
+
+    monkeypatch.setattr(learning, "learn_observer", noted)
+    model = learn_to_play(CART, "x_hat", tmp_path, timesteps=1000, observer_steps=900)
     player = Player.read(tmp_path / "agent.safetensors")
     assert player.observer == str(tmp_path / "observer.safetensors")
     obs, _ = player.make().reset(seed=0)
     assert obs.shape == (4,)  # two positions, two estimates
+    assert 900 <= sum(len(record.t) - 1 for record in seen) < 1000 <= model.num_timesteps < 1100
     curve = pd.read_csv(tmp_path / "curve.csv")
-    assert curve.steps.min() > 900
+    assert curve.steps.min() < 900 < curve.steps.max()
     shutil.copy(tmp_path / "observer.safetensors", tmp_path / "moved.safetensors")
     assert player.make(observer=str(tmp_path / "moved.safetensors"))
     content = bytearray((tmp_path / "moved.safetensors").read_bytes())
@@ -166,6 +176,31 @@ def test_an_agent_on_estimates_pays_for_its_observer(tmp_path, small):
     (tmp_path / "moved.safetensors").write_bytes(content)
     with pytest.raises(ValueError, match=r"another observer|checksum|damaged"):
         player.make(observer=str(tmp_path / "moved.safetensors"))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_what_is_told_stands_where_estimates_will(tmp_path, small, noise):
+    task = replace(CART, measurement_noise=noise)
+    told = Told(task)
+    env = told.make()
+    path = learn_observer(task, _played(told, env), tmp_path, seed=0, progress=ProgressBars(None))
+    later = show(task, "x_hat", str(path))
+    assert env.observation_space == later.observation_space
+    truth, _ = env.reset(seed=3)
+    _, info = later.reset(seed=3)
+    np.testing.assert_allclose(truth, np.concatenate([[] if noise else info["y"], info["x"]]), rtol=1e-6)
+
+
+def _played(told, env):
+    """Records of some steps at random, of which the last episode is cut."""
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(60):
+        if env.step(env.action_space.sample())[2]:
+            env.reset()
+    records = told.records()
+    assert sum(len(record.t) - 1 for record in records) == 60
+    return records
 
 
 def player(**changes):

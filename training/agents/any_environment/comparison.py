@@ -85,6 +85,7 @@ class Case:
             "algorithm": algorithm,
             "hyperparameters": hyperparameters(algorithm, self.task.env_id),
             "aggregate": self.aggregate if self.kind == "x_hat" else 0,
+            **({"first_steps": "told the truth"} if self.kind == "x_hat" else {}),
         }
 
     @property

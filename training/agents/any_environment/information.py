@@ -1,7 +1,7 @@
 """What an agent is shown of an environment of which a part is hidden."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -56,21 +56,40 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
             raise ValueError("an agent that is shown x_hat needs an observer")
         env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
         shown: Any = env.observation_space
-        return _part(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
+        return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
         return KKLMemory(env, task.measured)
-    env = _part(env, task.measured)
+    env = part_of(env, task.measured)
     if information == "y":
         return env
     return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
 
 
-def _part(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
-    """Shows some entries of an observation alone."""
+def part_of(
+    env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: Collection[int] | None = None
+) -> gym.Env[np.ndarray, Any]:
+    """Show some entries of an observation alone.
+
+    Parameters
+    ----------
+    env : gymnasium.Env
+        With a row of numbers as its observation.
+    entries : sequence of int
+        Those that are shown, in this order.
+    bounded : collection of int, optional
+        Those that keep their bounds; by default all.
+
+    Returns
+    -------
+    gymnasium.Env
+        The environment, with observations in float32.
+    """
     space: Any = env.observation_space
     chosen = list(entries)
-    part = gym.spaces.Box(space.low[chosen], space.high[chosen], dtype=np.float32)
-    return TransformObservation(env, partial(_taken, chosen), part)
+    keeps = np.isin(chosen, chosen if bounded is None else list(bounded))
+    low, high = np.where(keeps, space.low[chosen], -np.inf), np.where(keeps, space.high[chosen], np.inf)
+    shown = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    return TransformObservation(env, partial(_taken, chosen), shown)
 
 
 def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
@@ -121,4 +140,4 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         return np.concatenate(self._rows, dtype=np.float32)
 
 
-__all__ = ["SHOWN", "Shown", "StackedWithActions", "show"]
+__all__ = ["SHOWN", "Shown", "StackedWithActions", "part_of", "show"]

@@ -3,8 +3,9 @@
 import csv
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from copy import deepcopy
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from observers.storage import replacing
 from training.agents.agent import fingerprint
 from training.agents.any_environment.information import Shown, show
-from training.agents.any_environment.observing import OBSERVER, learn_observer, refitting
+from training.agents.any_environment.observing import OBSERVER, Told, learn_observer, refitting
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
 from training.agents.policy import linear, perceptron
@@ -42,7 +43,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 }
 RECURRENT = "ppo_lstm"
 CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
-OBSERVER_STEPS = 0.1  # of the steps of a training, in which actions are random and an observer is learned
+OBSERVER_STEPS = 0.1  # of the steps of a training, in which an agent on estimates is told the truth in their place
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
 
@@ -140,8 +141,8 @@ def learn_to_play(
 ) -> BaseAlgorithm:
     """Train one agent.
 
-    Every step of the environment counts: where an observer has to be learned first, its steps are the agent's first
-    ones, with random actions.
+    Where an observer has to be learned, the agent's first steps are for both. As there are no estimates yet, the agent
+    is told the truth in their place, and the observer is learned from what happens.
 
     Parameters
     ----------
@@ -161,7 +162,8 @@ def learn_to_play(
     observer : str, optional
         File of an observer, for x_hat; by default one is learned.
     observer_steps : int, optional
-        Steps from which it is learned; by default a tenth of all.
+        The agent's first steps, from which it is learned; by default a tenth of all. They end with what the algorithm
+        collects at a time.
     aggregate : int
         How many times it is fitted again while the agent learns, on the agent's own steps.
     progress : ProgressBars, optional
@@ -189,27 +191,29 @@ def learn_to_play(
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
     if aggregate and information != "x_hat":
         raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
+    spent = 0
+    if information == "x_hat" and observer is None:
+        spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
+        if not 0 < spent < steps:
+            raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
+    newest = folder / OBSERVER
     with progress_bars(progress) as bars:
-        spent = 0
-        if information == "x_hat" and observer is None:
-            spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
-            if not 0 < spent < steps:
-                raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
-            observer = str(learn_observer(task, folder, steps=spent, seed=seed, progress=bars))
-        callbacks: list[BaseCallback] = [Curve(folder / CURVE, spent=spent, began=began)]
-        newest = folder / OBSERVER
-        if aggregate:
-            callbacks.append(refitting(task, aggregate, steps - spent, newest))
-        model = _fit(
-            ALGORITHMS[name],
-            deepcopy(settings),  # to which stable-baselines3 adds
-            lambda: show(task, information, observer),
-            seed=seed,
-            steps=steps - spent,
-            callbacks=callbacks,
-            progress=bars,
-            description=f"{task.name} {information} {seed}",
-        )
+        curve = Curve(folder / CURVE, began=began)
+        description = f"{task.name} {information} {seed}"
+        told = Told(task)
+        first = told.make if spent else partial(show, task, information, observer)
+        with closing(_Learner(ALGORITHMS[name], settings, seed, first)) as learner:
+            if spent:
+                with bars.phase(f"{description}, told the truth", spent) as report:
+                    learner.learn(steps, [Bar(report), curve], until=spent)
+                observer = str(learn_observer(task, told.records(), folder, seed=seed, progress=bars))
+                learner.move(partial(show, task, information, observer))
+            callbacks: list[BaseCallback] = [curve]
+            if aggregate:
+                callbacks.append(refitting(task, aggregate, steps - spent, newest))
+            with bars.phase(description, steps) as report:
+                learner.learn(steps, [Bar(report), *callbacks])
+    model = learner.model
     if name != RECURRENT:
         if newest.exists():  # which is what the agent has seen last
             observer = str(newest)
@@ -232,37 +236,67 @@ def _check_actions(algorithm: str, space: gym.Space[Any], env_id: str) -> None:
         raise ValueError(f"{algorithm} cannot learn in {env_id}, whose actions are {space}: take {others}")
 
 
-def _fit(
-    algorithm: type[BaseAlgorithm],
-    settings: Mapping[str, Any],
-    make: Callable[[], gym.Env[Any, Any]],
-    *,
-    seed: int,
-    steps: int,
-    callbacks: list[BaseCallback],
-    progress: ProgressBars,
-    description: str,
-) -> BaseAlgorithm:
-    """Learn from some steps; what is given of rl-zoo3's settings means what it means there."""
-    given = {key: value for key, value in settings.items() if key not in _OF_THE_RUN}
-    first = agent_training_seed(seed)
-    vec_env = make_vec_env(make, n_envs=settings.get("n_envs", 1), seed=first)
-    for key in ("learning_rate", "clip_range"):
-        if isinstance(given.get(key), str):
-            given[key] = linear(float(given[key].removeprefix("lin_")))
-    if settings.get("noise_type") == "normal":
-        size = np.full(vec_env.action_space.shape or (), settings["noise_std"])
-        given["action_noise"] = NormalActionNoise(np.zeros_like(size), size)
-    if settings.get("normalize"):
-        vec_env = VecNormalize(vec_env, gamma=given.get("gamma", 0.99))
-    model = algorithm(env=vec_env, seed=seed, device="cpu", **given)
-    vec_env.seed(first)  # the model has seeded it with ``seed``
-    try:
-        with progress.phase(description, steps) as report:
-            model.learn(steps, callback=[Bar(report), *callbacks])
-    finally:
-        vec_env.close()
-    return model
+class _Learner:
+    """An algorithm and its environments; what is given of rl-zoo3's settings means what it means there."""
+
+    def __init__(
+        self,
+        algorithm: type[BaseAlgorithm],
+        settings: Mapping[str, Any],
+        seed: int,
+        make: Callable[[], gym.Env[Any, Any]],
+    ) -> None:
+        given = deepcopy({key: value for key, value in settings.items() if key not in _OF_THE_RUN})
+        self._rows, self._seed = settings.get("n_envs", 1), seed
+        vec_env: VecEnv = make_vec_env(make, n_envs=self._rows)
+        for key in ("learning_rate", "clip_range"):
+            if isinstance(given.get(key), str):
+                given[key] = linear(float(given[key].removeprefix("lin_")))
+        if settings.get("noise_type") == "normal":
+            size = np.full(vec_env.action_space.shape or (), settings["noise_std"])
+            given["action_noise"] = NormalActionNoise(np.zeros_like(size), size)
+        if settings.get("normalize"):
+            vec_env = VecNormalize(vec_env, gamma=given.get("gamma", 0.99))
+        self.model = algorithm(env=vec_env, seed=seed, device="cpu", **given)
+        vec_env.seed(agent_training_seed(seed))  # the model has seeded it with its own
+
+    def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
+        """Learn until there were so many steps; ``until`` stops before, at the end of what is collected at a time."""
+        done = self.model.num_timesteps
+        stop = [] if until is None else [_Until(until)]
+        self.model.learn(steps - done, callback=[*callbacks, *stop], reset_num_timesteps=not done)
+
+    def move(self, make: Callable[[], gym.Env[Any, Any]]) -> None:
+        """Go on in other environments, which show what the ones before showed; these are closed."""
+        vec_env: VecEnv = make_vec_env(make, n_envs=self._rows)
+        before = self.model.get_env()
+        if isinstance(before, VecNormalize):
+            moments = before.obs_rms, before.ret_rms
+            vec_env = VecNormalize(vec_env, gamma=before.gamma)
+            vec_env.obs_rms, vec_env.ret_rms = moments
+        vec_env.seed(agent_training_seed(self._seed, resumed=1, rows=self._rows))
+        self.close()
+        self.model.set_env(vec_env)
+
+    def close(self) -> None:
+        """Close the environments."""
+        env = self.model.get_env()
+        assert env is not None
+        env.close()
+
+
+class _Until(BaseCallback):
+    """Stops a training once there were so many steps, where an algorithm begins to collect anew."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self._steps, self._over = steps, False
+
+    def _on_rollout_start(self) -> None:
+        self._over = self.num_timesteps >= self._steps
+
+    def _on_step(self) -> bool:
+        return not self._over
 
 
 class Bar(BaseCallback):
@@ -290,22 +324,20 @@ class Curve(BaseCallback):
     ----------
     path : Path
         The file.
-    spent : int
-        Steps that were spent before.
     began : float
         When the training began, as :func:`time.process_time` says it.
     """
 
-    def __init__(self, path: Path, *, spent: int, began: float) -> None:
+    def __init__(self, path: Path, *, began: float) -> None:
         super().__init__()
-        self._path, self._spent, self._began = path, spent, began
+        self._path, self._began = path, began
         self._rows = list[tuple[int, float, float]]()
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if "episode" in info:  # of the monitor that make_vec_env puts around
                 seconds = round(time.process_time() - self._began, 2)
-                self._rows.append((self.num_timesteps + self._spent, seconds, round(float(info["episode"]["r"]), 4)))
+                self._rows.append((self.num_timesteps, seconds, round(float(info["episode"]["r"]), 4)))
         return True
 
     def _on_training_end(self) -> None:

@@ -1,17 +1,21 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
+from training.agents.any_environment.information import part_of
 from training.agents.any_environment.task import CLEAN_Y, HiddenTask
+from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
 from training.recorded.config import NOISE_SHARE, recorded_config
 from training.recorded.fit import train_recorded
+from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
-from training.rollouts.playing import roll_out
-from training.rollouts.policies import WANDERING, policy_of
+from training.rollouts.playing import Recorder
 from training.spectrum import evenly_spaced
 
 OBSERVER = "observer.safetensors"
@@ -21,19 +25,60 @@ MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
-def learn_observer(task: HiddenTask, folder: Path, *, steps: int, seed: int, progress: ProgressBars) -> Path:
-    """Learn an observer from random actions, each held for a while.
+class Told:
+    """Environments in which an agent is told what an observer is to estimate, and which keep what happens.
 
     Parameters
     ----------
     task : HiddenTask
         Of which environment, and what is measured.
+    """
+
+    def __init__(self, task: HiddenTask) -> None:
+        self._task, self._recorders = task, list[Recorder]()
+
+    def make(self) -> gym.Env[np.ndarray, Any]:
+        """Make one environment.
+
+        Returns
+        -------
+        gymnasium.Env
+            Its observations are those of an agent on estimates, had these no error.
+        """
+        task = self._task
+        env = task.make(noisy=False)
+        space: Any = env.observation_space
+        size = space.shape[0]
+        env = Recorder(env, measured=[str(i) for i in task.measured], hidden=task.estimated(size))
+        self._recorders.append(env)
+        return part_of(env, task.told(size), bounded=() if task.measurement_noise else task.measured)
+
+    def records(self) -> list[Record]:
+        """Read what happened in all of them.
+
+        Returns
+        -------
+        list of Record
+            One of each episode.
+        """
+        return [record for recorder in self._recorders for record in recorder.rollouts().records()]
+
+
+def learn_observer(
+    task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
+) -> Path:
+    """Learn an observer from an agent's first steps.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        Of which environment, and what is measured.
+    records : sequence of Record
+        Of these steps, without noise.
     folder : Path
         Receives observer.safetensors.
-    steps : int
-        Of the environment.
     seed : int
-        Of the environment, the actions and the training.
+        Of the training.
     progress : ProgressBars
         Where bars are shown.
 
@@ -42,26 +87,16 @@ def learn_observer(task: HiddenTask, folder: Path, *, steps: int, seed: int, pro
     Path
         The observer's file.
     """
-    with task.make(noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
-        space: Any = env.observation_space
-        rollouts = roll_out(
-            env,
-            policy_of(WANDERING, env),
-            measured=[str(i) for i in task.measured],
-            hidden=task.estimated(space.shape[0]),
-            steps=steps,
-            seed=seed,
-            report=report,
-        )
-    records = rollouts.records()
     changes: dict[str, Any] = {"seed": seed, **SETTINGS}
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
         changes["measurement_noise_max"] = tuple(np.maximum(NOISE_SHARE * spread, HEADROOM * task.measurement_noise))
-        slowest, fastest = (-rate / rollouts.dt for rate in (SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE))
-        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, slowest, fastest))
-    config = recorded_config(records, changes)
-    artifact = train_recorded(records, config, folder / "observer", name=task.env_id, console=progress).artifact
+        dt = float(np.diff(records[0].t[:2])[0])
+        # The filter has to settle in one episode at least; those of a beginner may be short.
+        slowest = max(SLOWEST_UNDER_NOISE / dt, 1.001 * SETTLED / max(record.duration for record in records))
+        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -FASTEST_UNDER_NOISE / dt))
+    config = recorded_config(list(records), changes)
+    artifact = train_recorded(list(records), config, folder / "observer", name=task.env_id, console=progress).artifact
     path = folder / OBSERVER
     artifact.save(path)
     return path
@@ -90,4 +125,4 @@ def refitting(task: HiddenTask, times: int, steps: int, path: Path) -> KKLTraini
     return KKLTrainingCallback(max(1, steps // (times + 1)), outputs=outputs, path=path, **SETTINGS)
 
 
-__all__ = ["OBSERVER", "learn_observer", "refitting"]
+__all__ = ["OBSERVER", "Told", "learn_observer", "refitting"]

@@ -114,10 +114,29 @@ class HiddenTask:
             Signals as :func:`kkl_gym.named.resolved` takes them, in the order of the entries; under noise as they were
             before it.
         """
-        hidden = tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
         if not self.measurement_noise:
-            return tuple(f"obs[{i}]" for i in hidden)
-        return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*hidden, *self.measured}))
+            return tuple(f"obs[{i}]" for i in self._hidden(size))
+        return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*self._hidden(size), *self.measured}))
+
+    def told(self, size: int) -> tuple[int, ...]:
+        """Which entries an agent on estimates would see if these were right.
+
+        Parameters
+        ----------
+        size : int
+            Entries of a flattened observation.
+
+        Returns
+        -------
+        tuple of int
+            What is measured, then what is estimated; under noise what is estimated alone.
+        """
+        if self.measurement_noise:
+            return tuple(sorted({*self._hidden(size), *self.measured}))
+        return (*self.measured, *self._hidden(size))
+
+    def _hidden(self, size: int) -> tuple[int, ...]:
+        return tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
 
 
 class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
