@@ -89,9 +89,9 @@ class Compare:
     ] = None
     """Folder of results."""
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
-    """Folder with results.csv and curves.csv of an earlier comparison in environments. Its rows of other environments
-    are taken over, so that new ones stand beside them without training those again. Give it each time: tables are
-    written anew. That both were made with the same settings is for you to see to."""
+    """Folder with results.csv and curves.csv of an earlier comparison in environments. What it has of other
+    environments, and of what this one's agents are not shown, is taken over without training it again. Give it each
+    time: tables are written anew. That both were made with the same settings is for you to see to."""
     noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
         0.0,
     )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from rich.console import Console
 
 from observers.storage import explained, write
@@ -57,7 +58,7 @@ def compare_environments(
     workers : Workers
         Where agents are trained.
     beside : Path, optional
-        Folder with results.csv and curves.csv of an earlier run, whose rows of other environments are taken over.
+        Folder with results.csv and curves.csv of an earlier run, of which is taken over what this one does not train.
 
     Raises
     ------
@@ -90,12 +91,13 @@ def compare_environments(
             if len(results) and set(results.shown) - {"state", RANDOM}:
                 missing = sum(not case.done for case in cases)
                 partial = f" Partial: {missing} of {len(cases)} agents are missing." if missing else ""
-                here = set(results.environment)
-                results = _joined(results, earlier["results.csv"], here)
-                learned = _joined(curves(there), earlier["curves.csv"], here)
+                learned, here = curves(there), results
+                results, learned = (
+                    _joined(here, earlier["results.csv"], here),
+                    _joined(learned, earlier["curves.csv"], here),
+                )
                 if beside is not None:
-                    others = sorted(set(results.environment) - here)
-                    progress.say(f"beside them, from {beside}: {', '.join(others) or 'no other environments'}")
+                    progress.say(f"beside these {len(here)} agents, {len(results) - len(here)} from {beside}")
                 write(out / "results.csv", results.to_csv(index=False))
                 write(out / "curves.csv", learned.to_csv(index=False))
                 write_table(out / "table.md", results, partial)
@@ -129,9 +131,13 @@ def _earlier(folder: Path | None, name: str) -> "pd.DataFrame":
     return rows
 
 
-def _joined(rows: "pd.DataFrame", earlier: "pd.DataFrame", here: set[str]) -> "pd.DataFrame":
-    """Those of other environments than the ones here first, as they are: of each environment all are of one run."""
+def _joined(rows: "pd.DataFrame", earlier: "pd.DataFrame", here: "pd.DataFrame") -> "pd.DataFrame":
+    """Those of an earlier run first, but for what agents of this run are shown in the same environment and noise."""
     import pandas as pd
 
-    others = earlier[~earlier.environment.isin(here)]
-    return pd.concat([others, rows]) if len(others) else rows
+    what = ["environment", "noise", "shown"]
+    others = earlier[~pd.MultiIndex.from_frame(earlier[what]).isin(pd.MultiIndex.from_frame(here[what]))]
+    if others.empty:
+        return rows
+    joined = pd.concat([others, rows])
+    return joined.iloc[np.argsort(pd.factorize(joined.environment)[0], kind="stable")]

@@ -350,21 +350,24 @@ EARLIER = {
 
 
 def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_path, small):
-    """Those of this one are of this one alone."""
+    """What this one's agents are shown is of this one alone."""
     options = {"seeds": 1, "episodes": 2, "workers": Workers(1), "information": ("state", "y")}
     kept = {
         "results.csv": ["Ball-v0,0.0,random,0,1.0,0.0", "Ball-v0,0.0,state,0,11.25,3.0", "Ball-v0,0.0,y,0,6.0,3.5"],
         "curves.csv": ["Ball-v0,0.0,state,10,1.5,2.0", "Ball-v0,0.0,y,10,1.5,0.125"],
     }
     for name, rows in kept.items():
-        lines = [",".join(COLUMNS[name]), *rows, rows[-1].replace("Ball-v0", "CartPole-v1")]
+        other = rows[-1].replace("Ball-v0", "CartPole-v1")
+        lines = [",".join(COLUMNS[name]), other, other.replace(",y,", ",z,"), *rows]
         (tmp_path / name).write_text("\n".join(lines) + "\n")
     Compare(("CartPole-v1",), **options, out=tmp_path / "out", beside=tmp_path).run(Console())
     for name, rows in kept.items():
-        assert (tmp_path / "out" / name).read_text().splitlines()[1 : len(rows) + 1] == rows
+        assert (tmp_path / "out" / name).read_text().splitlines()[-len(rows) :] == rows
     results = pd.read_csv(tmp_path / "out" / "results.csv")
-    assert list(results.environment) == ["Ball-v0"] * 3 + ["CartPole-v1"] * 3
-    assert "| Ball-v0 | 11.25 (1.00), 1 | 6 (0.49), 1 | 1 |" in (tmp_path / "out" / "table.md").read_text()
+    assert list(results.environment) == ["CartPole-v1"] * 4 + ["Ball-v0"] * 3
+    assert list(results.shown[:4]) == ["z", "random", "state", "y"]
+    assert results["return"][0] == 6.0 != results["return"][3]
+    assert "| Ball-v0 | 11.25 (1.00), 1 | – | 6 (0.49), 1 | 1 |" in (tmp_path / "out" / "table.md").read_text()
     for row, says in EARLIER.items():
         (tmp_path / "results.csv").write_text(
             "\n".join([",".join(COLUMNS["results.csv"]), kept["results.csv"][0], row])

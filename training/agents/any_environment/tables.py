@@ -1,5 +1,6 @@
 """The table and the figures of a comparison in any environments."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -193,20 +194,26 @@ def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
         What is missing, as a sentence.
     """
     tasks = tasks_in(found)
-    with drawing(path, 10.0, 2.7 * max(1, len(tasks)) + 0.8) as figure:
-        axes = figure.subplots(max(1, len(tasks)), 2, sharey="row", squeeze=False)
-        for row, (env_id, noise) in zip(axes, tasks):
+    rows = max(1, math.ceil(len(tasks) / 2))
+    with drawing(path, 12.0, 2.3 * rows + 0.8) as figure:
+        axes = figure.subplots(rows, 4, squeeze=False)
+        lines = dict[str, Any]()
+        for pair, (env_id, noise) in zip(axes.reshape(-1, 2), tasks):
             for i, kind in enumerate(SHOWN):
                 level = 0.0 if kind == "state" else noise
                 of = found[(found.environment == env_id) & (found.noise == level) & (found.shown == kind)]
-                for ax, over in zip(row, ("steps", "seconds")):
+                for ax, over in zip(pair, ("steps", "seconds")):
                     if len(of):
-                        ax.plot(of[over], of["return"], color=f"C{i}", label=LABELS[kind])
-            row[0].set(ylabel="return", title=_named((env_id, noise)), xlabel="steps of the environment")
-            row[1].set(xlabel="CPU seconds")
-            row[1].set_xscale("log")
-            row[1].legend()
+                        (lines[LABELS[kind]],) = ax.plot(of[over], of["return"], color=f"C{i}")
+            pair[0].set(ylabel="return", title=_named((env_id, noise)), xlabel="steps of the environment")
+            pair[0].xaxis.set_major_formatter(lambda steps, _: f"{steps / 1000:g}k")
+            pair[1].set(xlabel="CPU seconds", xscale="log")
+            pair[1].sharey(pair[0])
+            pair[1].tick_params(labelleft=False)
+        for ax in axes.reshape(-1)[2 * len(tasks) :]:
+            ax.set_axis_off()
         figure.suptitle(f"Learning curves.{partial}")
+        figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(SHOWN))
 
 
 __all__ = ["LABELS", "cell", "curves", "draw_curves", "draw_scores", "tasks_in", "write_table"]
