@@ -211,7 +211,7 @@ def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
             pair[1].sharey(pair[0])
             pair[1].tick_params(labelleft=False)
         for ax in axes.reshape(-1)[2 * len(tasks) :]:
-            ax.set_axis_off()
+            ax.set_visible(False)
         figure.suptitle(f"Learning curves.{partial}")
         figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(SHOWN))
 
