@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact, KKLObserver
@@ -85,6 +85,9 @@ class KKLTrainingCallback(BaseCallback):
         Steps before the first one; by default ``every``.
     keep : int, default 100_000
         Steps that are kept; older ones are forgotten.
+    rehearsal : int, default 0
+        Further steps at the end of each call of ``learn``, in which the agent acts without exploration, as it will when
+        it is used, and which end in a last refit. An agent that explores goes elsewhere.
     outputs : str, default "y"
         What of ``info`` is recorded as outputs: by default what the observer saw, with whatever noise there was. Where
         an environment tells them without noise, the key under which it does.
@@ -136,6 +139,7 @@ class KKLTrainingCallback(BaseCallback):
         *,
         first: int | None = None,
         keep: int = 100_000,
+        rehearsal: int = 0,
         outputs: str = "y",
         path: str | os.PathLike[str] | None = None,
         on_refit: Callable[[Refit], object] | None = None,
@@ -146,6 +150,7 @@ class KKLTrainingCallback(BaseCallback):
         self._every = integer("every", every, 1)
         self._next = self._every if first is None else integer("first", first, 1)
         self._keep, self._outputs = integer("keep", keep, 1), outputs
+        self._rehearsal = integer("rehearsal", rehearsal, 0)
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
             raise ValueError(f"path must end in .safetensors, got {shown(path)}")
         self._path = None if path is None else Path(path)
@@ -196,6 +201,34 @@ class KKLTrainingCallback(BaseCallback):
             memory = settling_time(self.artifact.filter)
             if any(record.duration >= memory for record in train):
                 self._refit(train, held_out)
+
+    def _on_training_end(self) -> None:
+        if self._rehearsal:
+            self._rehearse()
+            self._next = self._gathering.steps + self._every
+            self._refit(*self._gathering.records())
+
+    def _rehearse(self) -> None:
+        """Play the agent as it will act, without exploration, in the environments in which it has learned."""
+        env, until = self.training_env, self._gathering.steps + self._rehearsal
+        scaling = env if isinstance(env, VecNormalize) else None
+        if scaling is not None:
+            scaling.training = False
+        observations: Any = env.reset()
+        state: Any = None
+        starts = np.ones(env.num_envs, dtype=bool)
+        for row in range(env.num_envs):
+            self._begin(row)
+        while self._gathering.steps < until:
+            actions, state = self.model.predict(observations, state, starts, deterministic=True)
+            observations, _, starts, infos = env.step(actions)
+            for row, (info, done) in enumerate(zip(infos, starts, strict=True)):
+                self._gathering.add(row, info)
+                if done:
+                    self._begin(row)
+        if scaling is not None:
+            scaling.training = True
+        self.model.set_env(env)  # which makes a training that goes on reset it
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
         """Begin an episode with what its reset said, or with its first step where that is not known."""

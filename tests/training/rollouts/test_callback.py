@@ -221,6 +221,32 @@ def test_a_training_that_goes_on(spy, asked):
     assert len(asked.found) == 2
 
 
+def test_a_rehearsal_is_played_as_the_agent_will_act(spy, asked, monkeypatch):
+    env = VecNormalize(vector("Spy-v0", spy, n=2))
+    asked.artifact, told = in_use(env)[0], []
+    model = ppo(env, 50, log_std_init=1.5)
+    refits = KKLTrainingCallback(100, keep=30, rehearsal=30, on_refit=told.append)
+    predict, acted = model.predict, []
+
+    def noted(*given, **options):
+        actions, state = predict(*given, **options)
+        acted.extend(np.clip(actions, -1.0, 3.0))
+        return actions, state
+
+    monkeypatch.setattr(model, "predict", noted)
+    for _ in range(2):  # the second begins in new episodes
+        seen = env.obs_rms.count
+        model.learn(200, refits, reset_num_timesteps=False)
+        assert env.obs_rms.count == seen + 202  # with those of the reset, and none of the rehearsal
+        assert env.training
+        records = [record for record in asked.found[-1] if record.y[0, 0] >= 50]
+        check_spied(records)
+        played = [round(float(u), 5) for u in np.ravel(acted)]
+        assert {round(float(u), 5) for record in records for u in record.u[:-1, 0] * 2 + 1} <= {*played}
+    assert [refit.steps for refit in told] == [100, 230, 330, 460]
+    assert len(acted) == 60
+
+
 def test_the_agent_keeps_its_random_numbers(spy, asked):
     env = vector("Spy-v0", spy, n=1)
     asked.artifact = in_use(env)[0]

@@ -76,7 +76,12 @@ class Case:
         }
         if self.kind == RANDOM:
             return described
-        from training.agents.any_environment.learning import algorithm_for, hyperparameters
+        from training.agents.any_environment.learning import (
+            OBSERVER_STEPS,
+            REHEARSAL,
+            algorithm_for,
+            hyperparameters,
+        )
 
         with self.task.make() as env:
             algorithm = algorithm_for(env.action_space, self.task.env_id, self.kind)
@@ -85,7 +90,7 @@ class Case:
             "algorithm": algorithm,
             "hyperparameters": hyperparameters(algorithm, self.task.env_id),
             "aggregate": self.aggregate if self.kind == "x_hat" else 0,
-            **({"first_steps": "told the truth"} if self.kind == "x_hat" else {}),
+            **({"told": OBSERVER_STEPS, "rehearsal": REHEARSAL} if self.kind == "x_hat" else {}),
         }
 
     @property

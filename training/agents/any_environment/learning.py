@@ -44,6 +44,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 RECURRENT = "ppo_lstm"
 CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
 OBSERVER_STEPS = 0.1  # of the steps of a training, in which an agent on estimates is told the truth in their place
+REHEARSAL = 0.05  # of the steps, the last ones, in which it acts without exploration and learns no more
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
 
@@ -165,7 +166,8 @@ def learn_to_play(
         The agent's first steps, from which it is learned; by default a tenth of all. They end with what the algorithm
         collects at a time.
     aggregate : int
-        How many times it is fitted again while the agent learns, on the agent's own steps.
+        How many times it is fitted again while the agent learns, on the agent's own steps. A twentieth of all steps, the
+        last ones, is then without exploration, and followed by one more fit.
     progress : ProgressBars, optional
         Where bars are shown.
 
@@ -196,7 +198,8 @@ def learn_to_play(
         spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
         if not 0 < spent < steps:
             raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
-    newest = folder / OBSERVER
+    newest, rehearsal = folder / OBSERVER, round(REHEARSAL * steps) if aggregate else 0
+    steps -= rehearsal
     with progress_bars(progress) as bars:
         curve = Curve(folder / CURVE, began=began)
         description = f"{task.name} {information} {seed}"
@@ -210,7 +213,7 @@ def learn_to_play(
                 learner.move(partial(show, task, information, observer))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
-                callbacks.append(refitting(task, aggregate, steps - spent, newest))
+                callbacks.append(refitting(task, aggregate, steps - spent, rehearsal, newest))
             with bars.phase(description, steps) as report:
                 learner.learn(steps, [Bar(report), *callbacks])
     model = learner.model

@@ -102,7 +102,7 @@ def learn_observer(
     return path
 
 
-def refitting(task: HiddenTask, times: int, steps: int, path: Path) -> KKLTrainingCallback:
+def refitting(task: HiddenTask, times: int, steps: int, rehearsal: int, path: Path) -> KKLTrainingCallback:
     """Make what fits an observer again to an agent's own steps, at equal distances.
 
     Parameters
@@ -113,6 +113,8 @@ def refitting(task: HiddenTask, times: int, steps: int, path: Path) -> KKLTraini
         How often.
     steps : int
         Of the agent's training.
+    rehearsal : int
+        Steps after them in which the agent acts without exploration, for a last refit.
     path : Path
         Receives the observer in use at each time.
 
@@ -122,7 +124,9 @@ def refitting(task: HiddenTask, times: int, steps: int, path: Path) -> KKLTraini
         For the training.
     """
     outputs = CLEAN_Y if task.measurement_noise else "y"
-    return KKLTrainingCallback(max(1, steps // (times + 1)), outputs=outputs, path=path, **SETTINGS)
+    return KKLTrainingCallback(
+        max(1, steps // (times + 1)), rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
+    )
 
 
 __all__ = ["OBSERVER", "Told", "learn_observer", "refitting"]
