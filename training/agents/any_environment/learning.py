@@ -166,8 +166,8 @@ def learn_to_play(
         The agent's first steps, from which it is learned; by default a tenth of all. They end with what the algorithm
         collects at a time.
     aggregate : int
-        How many times it is fitted again while the agent learns, on the agent's own steps. A twentieth of all steps, the
-        last ones, is then without exploration, and followed by one more fit.
+        How many times it is fitted again while the agent learns, on the agent's own steps. A twentieth of all steps,
+        the last ones, is then without exploration, and followed by one more fit.
     progress : ProgressBars, optional
         Where bars are shown.
 
