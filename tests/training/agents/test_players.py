@@ -178,9 +178,10 @@ def test_an_agent_on_estimates_is_told_the_truth_until_there_are_some(tmp_path, 
         player.make(observer=str(tmp_path / "moved.safetensors"))
 
 
+@pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])
 @pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_what_is_told_stands_where_estimates_will(tmp_path, small, noise):
-    task = replace(CART, measurement_noise=noise)
+def test_what_is_told_stands_where_estimates_will(tmp_path, small, noise, task):
+    task = replace(task, measurement_noise=noise)
     told = Told(task)
     env = told.make()
     path = learn_observer(task, _played(told, env), tmp_path, seed=0, progress=ProgressBars(None))
@@ -195,11 +196,12 @@ def _played(told, env):
     """Records of some steps at random, of which the last episode is cut."""
     env.action_space.seed(0)
     env.reset(seed=0)
-    for _ in range(60):
-        if env.step(env.action_space.sample())[2]:
+    for _ in range(250):
+        _, _, terminated, truncated, _ = env.step(env.action_space.sample())
+        if terminated or truncated:
             env.reset()
     records = told.records()
-    assert sum(len(record.t) - 1 for record in records) == 60
+    assert sum(len(record.t) - 1 for record in records) == 250
     return records
 
 

@@ -1,7 +1,7 @@
 """What an agent is shown of an environment of which a part is hidden."""
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -65,9 +65,7 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
 
 
-def part_of(
-    env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: Collection[int] | None = None
-) -> gym.Env[np.ndarray, Any]:
+def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: bool = True) -> gym.Env[np.ndarray, Any]:
     """Show some entries of an observation alone.
 
     Parameters
@@ -76,8 +74,8 @@ def part_of(
         With a row of numbers as its observation.
     entries : sequence of int
         Those that are shown, in this order.
-    bounded : collection of int, optional
-        Those that keep their bounds; by default all.
+    bounded : bool
+        Whether they keep their bounds.
 
     Returns
     -------
@@ -86,10 +84,9 @@ def part_of(
     """
     space: Any = env.observation_space
     chosen = list(entries)
-    keeps = np.isin(chosen, chosen if bounded is None else list(bounded))
-    low, high = np.where(keeps, space.low[chosen], -np.inf), np.where(keeps, space.high[chosen], np.inf)
-    shown = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
-    return TransformObservation(env, partial(_taken, chosen), shown)
+    low, high = (space.low[chosen], space.high[chosen]) if bounded else (-np.inf, np.inf)
+    part = gym.spaces.Box(low, high, (len(chosen),), dtype=np.float32)
+    return TransformObservation(env, partial(_taken, chosen), part)
 
 
 def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:

@@ -51,7 +51,7 @@ class Told:
         size = space.shape[0]
         env = Recorder(env, measured=[str(i) for i in task.measured], hidden=task.estimated(size))
         self._recorders.append(env)
-        return part_of(env, task.told(size), bounded=() if task.measurement_noise else task.measured)
+        return part_of(env, task.told(size), bounded=not task.measurement_noise)
 
     def records(self) -> list[Record]:
         """Read what happened in all of them.
