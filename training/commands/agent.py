@@ -75,8 +75,8 @@ class Train:
     threads: int = 1
     """CPU threads of the networks."""
     observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
-    """First steps of an agent in an environment from which its observer is learned, where none is named. The agent
-    learns from them too: it is told the truth where estimates will be."""
+    """First steps of an agent in an environment from which its observer is learned, where none is named. Without noise
+    the agent learns from them too: it is told the truth where estimates will be. Under noise actions are random."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of an agent in an environment."""
 

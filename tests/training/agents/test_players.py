@@ -341,6 +341,17 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
         Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
 
 
+def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):
+    case = Case(CART, "x_hat", 0, 2, 400, 1, tmp_path / "job")
+    with monkeypatch.context() as patched:
+        patched.setattr(learning, "refitting", lambda *_: 1 / 0)  # once its observer is learned
+        with pytest.raises(ZeroDivisionError):
+            run_case(case)
+    assert not case.done
+    run_case(case)
+    assert case.done
+
+
 EARLIER = {
     "Ball-v0,0.0,state,0,much,3.0": "column return holds something that is no number",
     "Ball-v0,0.0,state,0,,3.0": "row 3 lacks a value",

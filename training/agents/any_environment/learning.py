@@ -43,7 +43,7 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 }
 RECURRENT = "ppo_lstm"
 CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
-OBSERVER_STEPS = 0.1  # of the steps of a training, in which an agent on estimates is told the truth in their place
+OBSERVER_STEPS = 0.1  # of the steps of a training, the first ones, in which there are no estimates yet
 REHEARSAL = 0.05  # of the steps, the last ones, in which it acts without exploration and learns no more
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
@@ -143,7 +143,8 @@ def learn_to_play(
     """Train one agent.
 
     Where an observer has to be learned, the agent's first steps are for both. As there are no estimates yet, the agent
-    is told the truth in their place, and the observer is learned from what happens.
+    is told the truth in their place, and the observer is learned from what happens. Under noise estimates are far from
+    the truth; these steps are then random actions, from which the observer alone is learned. They count too.
 
     Parameters
     ----------
@@ -200,22 +201,31 @@ def learn_to_play(
             raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
     newest, rehearsal = folder / OBSERVER, round(REHEARSAL * steps) if aggregate else 0
     steps -= rehearsal
+    # What is right with the truth is not with estimates that noise has spoilt.
+    tells, wanders = bool(spent and not task.measurement_noise), bool(spent and task.measurement_noise)
+
+    def shown() -> gym.Env[Any, Any]:
+        return show(task, information, observer)
+
     with progress_bars(progress) as bars:
-        curve = Curve(folder / CURVE, began=began)
-        description = f"{task.name} {information} {seed}"
-        told = Told(task)
-        first = told.make if spent else partial(show, task, information, observer)
-        with closing(_Learner(ALGORITHMS[name], settings, seed, first)) as learner:
-            if spent:
+        description, told = f"{task.name} {information} {seed}", Told(task)
+        learned = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
+        if wanders:
+            told.wander(spent, seed=seed, progress=bars)
+            observer = str(learned(told.records()))
+        curve = Curve(folder / CURVE, spent=spent if wanders else 0, began=began)
+        with closing(_Learner(ALGORITHMS[name], settings, seed, told.make if tells else shown)) as learner:
+            if tells:
                 with bars.phase(f"{description}, told the truth", spent) as report:
                     learner.learn(steps, [Bar(report), curve], until=spent)
-                observer = str(learn_observer(task, told.records(), folder, seed=seed, progress=bars))
-                learner.move(partial(show, task, information, observer))
+                observer = str(learned(told.records()))
+                learner.move(shown)
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
                 callbacks.append(refitting(task, aggregate, steps - spent, rehearsal, newest))
-            with bars.phase(description, steps) as report:
-                learner.learn(steps, [Bar(report), *callbacks])
+            left = steps - spent if wanders else steps
+            with bars.phase(description, left) as report:
+                learner.learn(left, [Bar(report), *callbacks])
     model = learner.model
     if name != RECURRENT:
         if newest.exists():  # which is what the agent has seen last
@@ -327,20 +337,22 @@ class Curve(BaseCallback):
     ----------
     path : Path
         The file.
+    spent : int
+        Steps that were spent before.
     began : float
         When the training began, as :func:`time.process_time` says it.
     """
 
-    def __init__(self, path: Path, *, began: float) -> None:
+    def __init__(self, path: Path, *, spent: int, began: float) -> None:
         super().__init__()
-        self._path, self._began = path, began
+        self._path, self._spent, self._began = path, spent, began
         self._rows = list[tuple[int, float, float]]()
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if "episode" in info:  # of the monitor that make_vec_env puts around
                 seconds = round(time.process_time() - self._began, 2)
-                self._rows.append((self.num_timesteps, seconds, round(float(info["episode"]["r"]), 4)))
+                self._rows.append((self.num_timesteps + self._spent, seconds, round(float(info["episode"]["r"]), 4)))
         return True
 
     def _on_training_end(self) -> None:

@@ -1,5 +1,6 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from training.recorded.fit import train_recorded
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
 from training.rollouts.playing import Recorder
+from training.rollouts.policies import WANDERING, policy_of
 from training.spectrum import evenly_spaced
 
 OBSERVER = "observer.safetensors"
@@ -52,6 +54,28 @@ class Told:
         env = Recorder(env, measured=[str(i) for i in task.measured], hidden=task.estimated(size))
         self._recorders.append(env)
         return part_of(env, task.told(size), bounded=not task.measurement_noise)
+
+    def wander(self, steps: int, *, seed: int, progress: ProgressBars) -> None:
+        """Act at random in one of them, each action held for a while.
+
+        Parameters
+        ----------
+        steps : int
+            Of the environment.
+        seed : int
+            Of the environment and the actions.
+        progress : ProgressBars
+            Where a bar is shown.
+        """
+        with self.make() as env, progress.phase(f"playing {self._task.env_id}", steps) as report:
+            env.action_space.seed(seed)
+            policy, over = policy_of(WANDERING, env), True
+            for step in range(steps):
+                if over:
+                    observation, _ = env.reset(seed=None if step else seed)
+                observation, _, terminated, truncated, _ = env.step(policy(observation))
+                over = terminated or truncated
+                report(step + 1)
 
     def records(self) -> list[Record]:
         """Read what happened in all of them.
@@ -96,7 +120,9 @@ def learn_observer(
         slowest = max(SLOWEST_UNDER_NOISE / dt, 1.001 * SETTLED / max(record.duration for record in records))
         changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -FASTEST_UNDER_NOISE / dt))
     config = recorded_config(list(records), changes)
-    artifact = train_recorded(list(records), config, folder / "observer", name=task.env_id, console=progress).artifact
+    with tempfile.TemporaryDirectory() as scratch:  # a training of agents begins anew, and so do its observers
+        run = Path(scratch) / "observer"
+        artifact = train_recorded(list(records), config, run, name=task.env_id, console=progress).artifact
     path = folder / OBSERVER
     artifact.save(path)
     return path
