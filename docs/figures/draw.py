@@ -256,7 +256,14 @@ def main(names: Sequence[str] = (), out: Path = DOCS) -> None:
         Which of ``FIGURES``; all if there are none.
     out : Path
         Where their names begin.
+
+    Raises
+    ------
+    SystemExit
+        If there is no such figure.
     """
+    if unknown := [name for name in names if name not in FIGURES]:
+        raise SystemExit(f"there is no figure {', '.join(unknown)}; there are {', '.join(FIGURES)}")
     for name in names or FIGURES:
         draw = FIGURES[name]()
         for theme in get_args(Theme):
