@@ -87,15 +87,12 @@ def compare_environments(
                 aggregate=aggregate,
             )
             there = [case for case in every if case.done]  # whichever run it is from
-            results = collect(there)
+            here = collect(there)
+            results = _joined(here, earlier["results.csv"], here) if len(here) else here
             if len(results) and set(results.shown) - {"state", RANDOM}:
                 missing = sum(not case.done for case in cases)
                 partial = f" Partial: {missing} of {len(cases)} agents are missing." if missing else ""
-                learned, here = curves(there), results
-                results, learned = (
-                    _joined(here, earlier["results.csv"], here),
-                    _joined(learned, earlier["curves.csv"], here),
-                )
+                learned = _joined(curves(there), earlier["curves.csv"], here)
                 if beside is not None:
                     progress.say(f"beside these {len(here)} agents, {len(results) - len(here)} from {beside}")
                 write(out / "results.csv", results.to_csv(index=False))

@@ -4,7 +4,8 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -71,8 +72,8 @@ class KKLTrainingCallback(BaseCallback):
 
     A refit fits T_inv anew to all episodes that are kept, but for a share that is held out for good. An observer that
     is worse on that share than the one in use is not taken. Refits take place where an algorithm begins to collect:
-    an on-policy one never learns from a batch of two observers, and there is none after the last batch. One is left out
-    while no episode is as long as the filter remembers.
+    an on-policy one never learns from a batch of two observers, and without ``rehearsal`` there is none after the last
+    batch. One is left out while no episode is as long as the filter remembers.
 
     Logged are ``kkl/error``, the error on held-out episodes of the observer in use (root mean square over standard
     deviation), ``kkl/error_before``, that of the one before, and ``kkl/refit_seconds``.
@@ -196,38 +197,36 @@ class KKLTrainingCallback(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if self._gathering.steps >= self._next:
-            self._next = self._gathering.steps + self._every
-            train, held_out = self._gathering.records()
-            memory = settling_time(self.artifact.filter)
-            if any(record.duration >= memory for record in train):
-                self._refit(train, held_out)
+            self._refit_where_possible()
 
     def _on_training_end(self) -> None:
         if self._rehearsal:
             self._rehearse()
-            self._next = self._gathering.steps + self._every
-            self._refit(*self._gathering.records())
+            self._refit_where_possible()
+
+    def _refit_where_possible(self) -> None:
+        self._next = self._gathering.steps + self._every
+        train, held_out = self._gathering.records()
+        memory = settling_time(self.artifact.filter)
+        if any(record.duration >= memory for record in train):
+            self._refit(train, held_out)
 
     def _rehearse(self) -> None:
         """Play the agent as it will act, without exploration, in the environments in which it has learned."""
         env, until = self.training_env, self._gathering.steps + self._rehearsal
-        scaling = env if isinstance(env, VecNormalize) else None
-        if scaling is not None:
-            scaling.training = False
-        observations: Any = env.reset()
-        state: Any = None
-        starts = np.ones(env.num_envs, dtype=bool)
-        for row in range(env.num_envs):
-            self._begin(row)
-        while self._gathering.steps < until:
-            actions, state = self.model.predict(observations, state, starts, deterministic=True)
-            observations, _, starts, infos = env.step(actions)
-            for row, (info, done) in enumerate(zip(infos, starts, strict=True)):
-                self._gathering.add(row, info)
-                if done:
-                    self._begin(row)
-        if scaling is not None:
-            scaling.training = True
+        with _as_it_is(self.model.get_vec_normalize_env()):
+            observations: Any = env.reset()
+            state: Any = None
+            starts = np.ones(env.num_envs, dtype=bool)
+            for row in range(env.num_envs):
+                self._begin(row)
+            while self._gathering.steps < until:
+                actions, state = self.model.predict(observations, state, starts, deterministic=True)
+                observations, _, starts, infos = env.step(actions)
+                for row, (info, done) in enumerate(zip(infos, starts, strict=True)):
+                    self._gathering.add(row, info)
+                    if done:
+                        self._begin(row)
         self.model.set_env(env)  # which makes a training that goes on reset it
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
@@ -274,6 +273,19 @@ class KKLTrainingCallback(BaseCallback):
 
 
 _SETTINGS = [field.name for field in fields(RecordedConfig) if field.name not in OF_THE_FILTER]
+
+
+@contextmanager
+def _as_it_is(scaling: VecNormalize | None) -> Iterator[None]:
+    """What scales observations learns nothing inside."""
+    if scaling is None:
+        yield
+        return
+    before, scaling.training = scaling.training, False
+    try:
+        yield
+    finally:
+        scaling.training = before
 
 
 def _config(artifact: Artifact, changes: Mapping[str, Any]) -> RecordedConfig:

@@ -152,7 +152,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Step the environment."""
+        """Step the environment; raises RuntimeError before a reset, or after :meth:`rollouts` without one."""
+        if not self._observations:
+            raise RuntimeError("reset the environment before its first step")
         self._actions.append(copy.deepcopy(action))
         observation, reward, self._terminated, truncated, info = self.env.step(action)
         self._keep(observation, info)
@@ -179,7 +181,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
             sampling_interval(self.env),
             self.env.observation_space,
             self.env.action_space,
-            self._played,
+            list(self._played),
             self._signals,
         )
 

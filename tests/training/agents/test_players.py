@@ -19,7 +19,7 @@ from training.agents.any_environment import learning
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
 from training.agents.any_environment.information import SHOWN, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
-from training.agents.any_environment.observing import Told, learn_observer
+from training.agents.any_environment.observing import Told, learn_observer, wander
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.tables import cell, curves, write_table
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
@@ -179,9 +179,7 @@ def test_an_agent_on_estimates_is_told_the_truth_until_there_are_some(tmp_path, 
 
 
 @pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])
-@pytest.mark.parametrize("noise", [0.0, 0.1])
-def test_what_is_told_stands_where_estimates_will(tmp_path, small, noise, task):
-    task = replace(task, measurement_noise=noise)
+def test_what_is_told_stands_where_estimates_will(tmp_path, small, task):
     told = Told(task)
     env = told.make()
     path = learn_observer(task, _played(told, env), tmp_path, seed=0, progress=ProgressBars(None))
@@ -189,7 +187,27 @@ def test_what_is_told_stands_where_estimates_will(tmp_path, small, noise, task):
     assert env.observation_space == later.observation_space
     truth, _ = env.reset(seed=3)
     _, info = later.reset(seed=3)
-    np.testing.assert_allclose(truth, np.concatenate([[] if noise else info["y"], info["x"]]), rtol=1e-6)
+    np.testing.assert_allclose(truth, np.concatenate([info["y"], info["x"]]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [5, 8, 10])
+def test_the_filter_settles_in_an_episode_that_is_trained_on(tmp_path, small, seed):
+    """Of these few random steps the longest episode is held out."""
+    task = replace(CART, measurement_noise=0.1)
+    records = wander(task, 600, seed=seed, progress=ProgressBars(None))
+    assert learn_observer(task, records, tmp_path, seed=seed, progress=ProgressBars(None)).exists()
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_short_episodes_at_the_end_leave_the_observer_as_it_is(tmp_path, small, noise):
+    task = replace(CART, measurement_noise=noise)
+    learn_to_play(task, "x_hat", tmp_path, algorithm="dqn", timesteps=1000, observer_steps=300, aggregate=1)
+    assert Player.read(tmp_path / "agent.safetensors").observer == str(tmp_path / "observer.safetensors")
+
+
+def test_an_agent_that_would_never_see_an_estimate_is_refused(tmp_path, small):
+    with pytest.raises(ValueError, match=r"ppo collects 34 steps before it goes on; give it more than 34 .--timesteps"):
+        learn_to_play(CART, "x_hat", tmp_path, timesteps=34, observer_steps=6)
 
 
 def _played(told, env):
@@ -297,6 +315,7 @@ def test_entries_and_environments_that_are_not_there_are_named():
         ({"information": "z", "algorithm": "ppo_lstm"}, "only that"),
         ({"information": "recurrent", "algorithm": "ppo"}, "only that"),
         ({"information": "x_hat", "observer_steps": 10**9}, "fewer than all"),
+        ({"information": "z", "observer_steps": 10}, "for agents on x_hat that are given no observer"),
         ({"information": "z", "timesteps": 0}, "must be positive"),
         ({"information": "z", "algorithm": "reinforce"}, "unknown algorithm"),
     ],
@@ -393,6 +412,12 @@ def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_pa
     with pytest.raises(OSError, match=r"results.csv"):
         Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path / "none").run(Console())
     assert not (tmp_path / "c").exists()
+    for name in kept:
+        (tmp_path / name).write_text(f"{','.join(COLUMNS[name])}\nCartPole-v1,0.0,z,10,1.5,0.125\n")
+    Compare(("CartPole-v1",), **{**options, "information": ("state",)}, out=tmp_path / "e", beside=tmp_path).run(
+        Console()
+    )
+    assert set(pd.read_csv(tmp_path / "e" / "results.csv").shown) == {"z", "random", "state"}
     with pytest.raises(ValueError, match="--beside is for environments"):
         Compare(out=tmp_path / "d", beside=tmp_path).run(Console())
 

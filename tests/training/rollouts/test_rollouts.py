@@ -11,6 +11,7 @@ from observers import Artifact
 from training.recorded.config import recorded_config
 from training.records import Signals, check_signals, resampled
 from training.rollouts import make, policy_of, roll_out
+from training.rollouts.playing import Recorder
 
 TINY = {"inverse_steps": 20, "members": 1, "width": 8, "samples": 5, "windows": 200, "batch": 64}
 
@@ -251,3 +252,18 @@ def test_learns_without_writing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     training.learn("Pendulum-v1", measured=[0, 1], hidden=[2], steps=400, **TINY)
     assert not list(tmp_path.iterdir())
+
+
+def test_rollouts_that_were_handed_out_stay_as_they_are():
+    env = gym.make("CartPole-v1")
+    recorder = Recorder(env, measured=["0"], hidden=["1"])
+    for _ in range(2):  # a reset alone is no episode
+        recorder.reset(seed=0)
+    recorder.step(0)
+    found = recorder.rollouts()
+    with pytest.raises(RuntimeError, match="reset the environment"):
+        recorder.step(0)
+    recorder.reset()
+    recorder.step(1)
+    assert [len(rollouts.episodes) for rollouts in (found, recorder.rollouts())] == [1, 2]
+    assert [len(record.t) for record in found.records()] == [2]

@@ -85,13 +85,16 @@ class Case:
 
         with self.task.make() as env:
             algorithm = algorithm_for(env.action_space, self.task.env_id, self.kind)
-        return described | {
+        described |= {
             "timesteps": self.timesteps,
             "algorithm": algorithm,
             "hyperparameters": hyperparameters(algorithm, self.task.env_id),
-            "aggregate": self.aggregate if self.kind == "x_hat" else 0,
-            **({"told": OBSERVER_STEPS, "rehearsal": REHEARSAL} if self.kind == "x_hat" else {}),
+            "aggregate": 0,
         }
+        if self.kind == "x_hat":
+            begins = "wanders" if self.task.measurement_noise else "told"
+            described |= {"aggregate": self.aggregate, begins: OBSERVER_STEPS, "rehearsal": REHEARSAL}
+        return described
 
     @property
     def done(self) -> bool:

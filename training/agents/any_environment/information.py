@@ -65,7 +65,7 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
 
 
-def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: bool = True) -> gym.Env[np.ndarray, Any]:
+def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
     """Show some entries of an observation alone.
 
     Parameters
@@ -74,8 +74,6 @@ def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: b
         With a row of numbers as its observation.
     entries : sequence of int
         Those that are shown, in this order.
-    bounded : bool
-        Whether they keep their bounds.
 
     Returns
     -------
@@ -84,8 +82,7 @@ def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int], *, bounded: b
     """
     space: Any = env.observation_space
     chosen = list(entries)
-    low, high = (space.low[chosen], space.high[chosen]) if bounded else (-np.inf, np.inf)
-    part = gym.spaces.Box(low, high, (len(chosen),), dtype=np.float32)
+    part = gym.spaces.Box(space.low[chosen], space.high[chosen], dtype=np.float32)
     return TransformObservation(env, partial(_taken, chosen), part)
 
 

@@ -25,7 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from observers.storage import replacing
 from training.agents.agent import fingerprint
 from training.agents.any_environment.information import Shown, show
-from training.agents.any_environment.observing import OBSERVER, Told, learn_observer, refitting
+from training.agents.any_environment.observing import OBSERVER, Told, learn_observer, refitting, wander
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
 from training.agents.policy import linear, perceptron
@@ -194,36 +194,41 @@ def learn_to_play(
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
     if aggregate and information != "x_hat":
         raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
-    spent = 0
-    if information == "x_hat" and observer is None:
+    rehearsal = round(REHEARSAL * steps) if aggregate else 0
+    learns_observer, spent = information == "x_hat" and observer is None, 0
+    if learns_observer:
         spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
-        if not 0 < spent < steps:
-            raise ValueError(f"observer_steps must be fewer than all {steps} steps, and some; got {spent}")
-    newest, rehearsal = folder / OBSERVER, round(REHEARSAL * steps) if aggregate else 0
-    steps -= rehearsal
-    # What is right with the truth is not with estimates that noise has spoilt.
-    tells, wanders = bool(spent and not task.measurement_noise), bool(spent and task.measurement_noise)
-
-    def shown() -> gym.Env[Any, Any]:
-        return show(task, information, observer)
-
+        if not 0 < spent < steps - rehearsal:
+            raise ValueError(
+                f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {spent}"
+            )
+    elif observer_steps is not None:
+        raise ValueError("observer_steps is for agents on x_hat that are given no observer")
+    newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
-        description, told = f"{task.name} {information} {seed}", Told(task)
         learned = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
-        if wanders:
-            told.wander(spent, seed=seed, progress=bars)
-            observer = str(learned(told.records()))
-        curve = Curve(folder / CURVE, spent=spent if wanders else 0, began=began)
-        with closing(_Learner(ALGORITHMS[name], settings, seed, told.make if tells else shown)) as learner:
-            if tells:
+        curve, told = Curve(folder / CURVE, began=began), None
+        if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
+            observer = str(learned(wander(task, spent, seed=seed, progress=bars)))
+            curve.spent = spent
+        elif learns_observer:
+            told = Told(task)
+        left = steps - rehearsal - curve.spent
+        make = partial(show, task, information, observer) if told is None else told.make
+        with closing(_Learner(ALGORITHMS[name], settings, seed, make)) as learner:
+            if told is not None:
                 with bars.phase(f"{description}, told the truth", spent) as report:
-                    learner.learn(steps, [Bar(report), curve], until=spent)
+                    learner.learn(left, [Bar(report), curve], until=spent)
+                if learner.steps >= left:
+                    raise ValueError(
+                        f"the agent would never see an estimate: {name} collects {learner.steps} steps before it goes "
+                        f"on; give it more than {steps} (--timesteps)"
+                    )
                 observer = str(learned(told.records()))
-                learner.move(shown)
+                learner.move(partial(show, task, information, observer))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
-                callbacks.append(refitting(task, aggregate, steps - spent, rehearsal, newest))
-            left = steps - spent if wanders else steps
+                callbacks.append(refitting(task, aggregate, left - learner.steps, rehearsal, newest))
             with bars.phase(description, left) as report:
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model
@@ -270,12 +275,21 @@ class _Learner:
             given["action_noise"] = NormalActionNoise(np.zeros_like(size), size)
         if settings.get("normalize"):
             vec_env = VecNormalize(vec_env, gamma=given.get("gamma", 0.99))
-        self.model = algorithm(env=vec_env, seed=seed, device="cpu", **given)
+        try:
+            self.model = algorithm(env=vec_env, seed=seed, device="cpu", **given)
+        except BaseException:
+            vec_env.close()
+            raise
         vec_env.seed(agent_training_seed(seed))  # the model has seeded it with its own
+
+    @property
+    def steps(self) -> int:
+        """How many steps it has learned from."""
+        return self.model.num_timesteps
 
     def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
         """Learn until there were so many steps; ``until`` stops before, at the end of what is collected at a time."""
-        done = self.model.num_timesteps
+        done = self.steps
         stop = [] if until is None else [_Until(until)]
         self.model.learn(steps - done, callback=[*callbacks, *stop], reset_num_timesteps=not done)
 
@@ -337,22 +351,25 @@ class Curve(BaseCallback):
     ----------
     path : Path
         The file.
-    spent : int
-        Steps that were spent before.
     began : float
         When the training began, as :func:`time.process_time` says it.
+
+    Attributes
+    ----------
+    spent : int
+        Steps that were spent before.
     """
 
-    def __init__(self, path: Path, *, spent: int, began: float) -> None:
+    def __init__(self, path: Path, *, began: float) -> None:
         super().__init__()
-        self._path, self._spent, self._began = path, spent, began
+        self._path, self._began, self.spent = path, began, 0
         self._rows = list[tuple[int, float, float]]()
 
     def _on_step(self) -> bool:
         for info in self.locals["infos"]:
             if "episode" in info:  # of the monitor that make_vec_env puts around
                 seconds = round(time.process_time() - self._began, 2)
-                self._rows.append((self.num_timesteps + self._spent, seconds, round(float(info["episode"]["r"]), 4)))
+                self._rows.append((self.num_timesteps + self.spent, seconds, round(float(info["episode"]["r"]), 4)))
         return True
 
     def _on_training_end(self) -> None:

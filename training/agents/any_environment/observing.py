@@ -14,9 +14,10 @@ from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
 from training.recorded.config import NOISE_SHARE, recorded_config
 from training.recorded.fit import train_recorded
+from training.recorded.preparing import split
 from training.records import Record
 from training.rollouts.callback import KKLTrainingCallback
-from training.rollouts.playing import Recorder
+from training.rollouts.playing import Recorder, roll_out
 from training.rollouts.policies import WANDERING, policy_of
 from training.spectrum import evenly_spaced
 
@@ -24,6 +25,7 @@ OBSERVER = "observer.safetensors"
 HEADROOM = 1.5  # of the noise that a map is trained for over the noise that there is
 # Per step, of filters under noise: more and slower modes, which average over more steps.
 MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
+HELD_OUT = 0.2  # of the episodes
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
@@ -33,7 +35,7 @@ class Told:
     Parameters
     ----------
     task : HiddenTask
-        Of which environment, and what is measured.
+        Of which environment, and what is measured, without noise.
     """
 
     def __init__(self, task: HiddenTask) -> None:
@@ -47,35 +49,10 @@ class Told:
         gymnasium.Env
             Its observations are those of an agent on estimates, had these no error.
         """
-        task = self._task
-        env = task.make(noisy=False)
-        space: Any = env.observation_space
-        size = space.shape[0]
-        env = Recorder(env, measured=[str(i) for i in task.measured], hidden=task.estimated(size))
-        self._recorders.append(env)
-        return part_of(env, task.told(size), bounded=not task.measurement_noise)
-
-    def wander(self, steps: int, *, seed: int, progress: ProgressBars) -> None:
-        """Act at random in one of them, each action held for a while.
-
-        Parameters
-        ----------
-        steps : int
-            Of the environment.
-        seed : int
-            Of the environment and the actions.
-        progress : ProgressBars
-            Where a bar is shown.
-        """
-        with self.make() as env, progress.phase(f"playing {self._task.env_id}", steps) as report:
-            env.action_space.seed(seed)
-            policy, over = policy_of(WANDERING, env), True
-            for step in range(steps):
-                if over:
-                    observation, _ = env.reset(seed=None if step else seed)
-                observation, _, terminated, truncated, _ = env.step(policy(observation))
-                over = terminated or truncated
-                report(step + 1)
+        env = self._task.make()
+        recorder = Recorder(env, **_signals(self._task, env))
+        self._recorders.append(recorder)
+        return part_of(recorder, self._task.told(_size(env)))
 
     def records(self) -> list[Record]:
         """Read what happened in all of them.
@@ -86,6 +63,40 @@ class Told:
             One of each episode.
         """
         return [record for recorder in self._recorders for record in recorder.rollouts().records()]
+
+
+def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
+    """Act at random, each action held for a while.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        In which environment, and what is measured.
+    steps : int
+        Of the environment.
+    seed : int
+        Of the environment and the actions.
+    progress : ProgressBars
+        Where a bar is shown.
+
+    Returns
+    -------
+    list of Record
+        One of each episode, without noise.
+    """
+    with task.make(noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
+        policy = policy_of(WANDERING, env)
+        rollouts = roll_out(env, policy, **_signals(task, env), steps=steps, seed=seed, report=report)
+    return rollouts.records()
+
+
+def _signals(task: HiddenTask, env: gym.Env[np.ndarray, Any]) -> dict[str, Any]:
+    return {"measured": [str(i) for i in task.measured], "hidden": task.estimated(_size(env))}
+
+
+def _size(env: gym.Env[np.ndarray, Any]) -> int:
+    space: Any = env.observation_space
+    return int(space.shape[0])
 
 
 def learn_observer(
@@ -111,14 +122,16 @@ def learn_observer(
     Path
         The observer's file.
     """
-    changes: dict[str, Any] = {"seed": seed, **SETTINGS}
+    changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
         changes["measurement_noise_max"] = tuple(np.maximum(NOISE_SHARE * spread, HEADROOM * task.measurement_noise))
         dt = float(np.diff(records[0].t[:2])[0])
-        # The filter has to settle in one episode at least; those of a beginner may be short.
-        slowest = max(SLOWEST_UNDER_NOISE / dt, 1.001 * SETTLED / max(record.duration for record in records))
-        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -FASTEST_UNDER_NOISE / dt))
+        # The filter has to settle in one episode at least of those that are trained on; a beginner's may be short.
+        longest = max(record.duration for record in split(records, HELD_OUT, seed)[0])
+        fastest = FASTEST_UNDER_NOISE / dt
+        slowest = min(max(SLOWEST_UNDER_NOISE / dt, 1.1 * SETTLED / longest), fastest / 2)
+        changes["eigenvalues"] = tuple(evenly_spaced(MODES_UNDER_NOISE, -slowest, -fastest))
     config = recorded_config(list(records), changes)
     with tempfile.TemporaryDirectory() as scratch:  # a training of agents begins anew, and so do its observers
         run = Path(scratch) / "observer"
@@ -155,4 +168,4 @@ def refitting(task: HiddenTask, times: int, steps: int, rehearsal: int, path: Pa
     )
 
 
-__all__ = ["OBSERVER", "Told", "learn_observer", "refitting"]
+__all__ = ["OBSERVER", "Told", "learn_observer", "refitting", "wander"]

@@ -213,7 +213,8 @@ def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
         for ax in axes.reshape(-1)[2 * len(tasks) :]:
             ax.set_visible(False)
         figure.suptitle(f"Learning curves.{partial}")
-        figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(SHOWN))
+        labels = [label for label in LABELS.values() if label in lines]
+        figure.legend([lines[label] for label in labels], labels, loc="outside lower center", ncols=len(SHOWN))
 
 
 __all__ = ["LABELS", "cell", "curves", "draw_curves", "draw_scores", "tasks_in", "write_table"]

@@ -119,7 +119,7 @@ class HiddenTask:
         return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*self._hidden(size), *self.measured}))
 
     def told(self, size: int) -> tuple[int, ...]:
-        """Which entries an agent on estimates would see if these were right.
+        """Which entries an agent on estimates would see if these were right and there were no noise.
 
         Parameters
         ----------
@@ -129,10 +129,8 @@ class HiddenTask:
         Returns
         -------
         tuple of int
-            What is measured, then what is estimated; under noise what is estimated alone.
+            What is measured, then what is estimated.
         """
-        if self.measurement_noise:
-            return tuple(sorted({*self._hidden(size), *self.measured}))
         return (*self.measured, *self._hidden(size))
 
     def _hidden(self, size: int) -> tuple[int, ...]:
