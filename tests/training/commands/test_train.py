@@ -23,7 +23,7 @@ def test_train_evaluate_and_report_from_the_command_line(tmp_path, capsys, monke
     wrote = re.fullmatch(r"wrote (\S+) \(0\.\d\d MB\), report\.png and log\.txt beside it, in (\S+) s", lines[-1])
     trained = Artifact.read(path).training["seconds"]  # without the imports and the report
     assert wrote.group(1) == str(path.relative_to(tmp_path))
-    assert float(wrote.group(2)) > trained
+    assert float(wrote.group(2)) > trained - 0.5  # which is in whole seconds
     logged = (path.parent / "log.txt").read_text().splitlines()
     assert [line.split(" ", 2)[2] for line in logged] == lines
     csv = tmp_path / "errors.csv"
