@@ -74,7 +74,8 @@ class Compare:
     ] = None
     """What agents know (docs/guides/agents.md). In environments: state, x_hat, z, stacked, recurrent, y."""
     seeds: int = 5
-    """Agents of each kind; at most 3 of the recurrent ones, which take longest, and 1 at the further noise levels."""
+    """Agents of each kind. Of our systems at most 3 of the recurrent ones, which take longest, and 1 at the further
+    noise levels."""
     episodes: int = 100
     """Number of episodes that each agent is played on."""
     timesteps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: the hyperparameters')")] = None

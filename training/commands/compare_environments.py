@@ -81,7 +81,6 @@ def compare_environments(
                 tasks,
                 out,
                 seeds=MANY,
-                recurrent_seeds=MANY,
                 episodes=episodes,
                 timesteps=timesteps,
                 aggregate=aggregate,

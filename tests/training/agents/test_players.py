@@ -430,10 +430,16 @@ def test_full_state_agents_are_shared_by_levels_of_noise(tmp_path):
     assert len(cases) == 7
 
 
-def test_recurrent_agents_are_fewer(tmp_path):
+def test_there_are_as_many_agents_of_each_kind(tmp_path):
     cases = planned([PENDULUM], tmp_path, kinds=("state", "recurrent"), seeds=4)
-    assert [case.seed for case in cases if case.kind == "recurrent"] == [0, 1, 2]
-    assert len([case for case in cases if case.kind == "state"]) == 4
+    for kind in ("state", "recurrent"):
+        assert [case.seed for case in cases if case.kind == kind] == [0, 1, 2, 3]
+
+
+def test_each_algorithm_learns_from_as_many_steps(tmp_path):
+    for env_id in ("CartPole-v1", "Pendulum-v1", "MountainCarContinuous-v0", "LunarLander-v3", "HalfCheetah-v5"):
+        algorithms = ("ppo_lstm", "sac" if env_id in settings_of("sac") else "ppo")
+        assert len({hyperparameters(name, env_id)["n_timesteps"] for name in algorithms}) == 1
 
 
 def test_a_table_of_known_results(tmp_path):

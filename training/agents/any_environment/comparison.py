@@ -13,7 +13,6 @@ import kkl_gym
 from observers.storage import explained, write
 from training.agents.any_environment.information import SHOWN, Shown, show
 from training.agents.any_environment.task import HiddenTask
-from training.agents.comparison import RECURRENT_SEEDS
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
 
@@ -192,7 +191,6 @@ def planned(
     *,
     kinds: Sequence[Shown] = SHOWN,
     seeds: int = 5,
-    recurrent_seeds: int = RECURRENT_SEEDS,
     episodes: int = 100,
     timesteps: int | None = None,
     aggregate: int = 0,
@@ -209,8 +207,6 @@ def planned(
         What agents are shown.
     seeds : int
         Agents of each kind.
-    recurrent_seeds : int
-        The most of those that are recurrent, which take several times as long.
     episodes : int
         Number of episodes that each is played on.
     timesteps : int, optional
@@ -227,8 +223,6 @@ def planned(
     for seed in range(seeds):
         for task in tasks:
             for kind in (*((RANDOM,) if seed == 0 else ()), *kinds):
-                if kind == "recurrent" and seed >= recurrent_seeds:
-                    continue
                 of = task.without_noise if kind in ("state", RANDOM) else task
                 folder = out / "jobs" / of.name / kind / str(seed)
                 found.setdefault(folder, Case(of, kind, seed, episodes, timesteps, aggregate, folder))
