@@ -116,7 +116,8 @@ def _earlier(folder: Path | None, name: str) -> "pd.DataFrame":
         if list(rows.columns) != columns:
             raise ValueError(f"its columns are {', '.join(rows.columns)}, not {', '.join(columns)}")
         for column in columns:
-            if column not in ("environment", "shown") and not pd.api.types.is_numeric_dtype(rows[column]):
+            number = rows.empty or pd.api.types.is_numeric_dtype(rows[column])
+            if column not in ("environment", "shown") and not number:
                 raise ValueError(f"column {column} holds something that is no number")
         if rows.isna().any(axis=None):
             raise ValueError(f"row {rows.index[rows.isna().any(axis=1)][0] + 2} lacks a value")

@@ -412,8 +412,8 @@ def test_environments_of_an_earlier_comparison_stand_beside_those_of_this(tmp_pa
     with pytest.raises(OSError, match=r"results.csv"):
         Compare(("CartPole-v1",), **options, out=tmp_path / "c", beside=tmp_path / "none").run(Console())
     assert not (tmp_path / "c").exists()
-    for name in kept:
-        (tmp_path / name).write_text(f"{','.join(COLUMNS[name])}\nCartPole-v1,0.0,z,10,1.5,0.125\n")
+    (tmp_path / "results.csv").write_text(f"{','.join(COLUMNS['results.csv'])}\nCartPole-v1,0.0,z,10,1.5,0.125\n")
+    (tmp_path / "curves.csv").write_text(f"{','.join(COLUMNS['curves.csv'])}\n")  # of agents without an episode
     Compare(("CartPole-v1",), **{**options, "information": ("state",)}, out=tmp_path / "e", beside=tmp_path).run(
         Console()
     )
