@@ -104,15 +104,15 @@ agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that s
 	cp runs/agents/comparison/jobs/van_der_pol-0.5/y/0/agent.safetensors training/agents/shipped/van_der_pol-y.safetensors
 	$(MAKE) figures
 
-HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 InvertedPendulum-v5 InvertedDoublePendulum-v5 Reacher-v5 \
-	Hopper-v5 HalfCheetah-v5
+HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 LunarLander-v3 InvertedPendulum-v5 \
+	InvertedDoublePendulum-v5 Reacher-v5 Hopper-v5 HalfCheetah-v5
 
 environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
-	$(BIN)/kkl-gym agent compare Pendulum-v1 --noise 0.3 0.1 --information state x_hat z stacked --aggregate 4 --seeds 5 \
-		--out runs/agents/noise
+	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 --information state x_hat z stacked recurrent \
+		--aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(MAKE) figures
 

@@ -125,4 +125,5 @@ def draw_panel(ax: "Axes", cells: Sequence[Cell | None], labels: Sequence[str], 
             ax.plot(found, place, "o", color=RIVAL, markersize=6)
     ax.axvline(1.0, color=MEASURED, lw=0.8)
     ax.set(title=title, xlabel="normalised score")
+    ax.locator_params(axis="x", nbins=4)
     ax.set_yticks(range(len(labels)), labels)
