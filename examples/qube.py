@@ -15,6 +15,9 @@ What is said of the device beforehand, beside the records: left and right are al
 own. Each run is therefore learned from twice, once mirrored, with the signs of both angles changed; and the map sees
 how the arm's angle changes, not where it is.
 
+Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the device's
+equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
+
 The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
 v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative behind a low-pass of 55.79 rad/s. Estimates of angles are taken
 through the same formula where they are compared with them.
@@ -32,6 +35,7 @@ from scipy.signal import savgol_filter
 
 import kkl_gym
 from kkl_gym.elementary import cos, sin, tanh
+from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.storage import write
 from training.figures import ALARM, ESTIMATE, RIVAL, TARGET, TRUTH, drawing
@@ -78,8 +82,13 @@ GUESSES = {
     "pendulum_damping": 1e-5,
     "pendulum_friction": 4e-5,
 }
-LOOKS = ("--", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)  # of estimators in the figure
+ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
+LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)  # of estimators in the figure
 WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
+# Of the equations' motions: how many, how long in s, and what they are released with at most in rad, beside any angle of
+# the pendulum, and in rad/s. The runs begin with the arm up to 0.85 rad from the middle, nearly at rest.
+MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
+ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
 
 
 @dataclass(frozen=True)
@@ -154,7 +163,7 @@ def main(
     path
         Folder with run01.csv to run12.csv.
     out
-        Folder of the run, which goes on from its checkpoints; receives qube.safetensors, table.md and estimates.png.
+        Folder of the runs, which go on from their checkpoints; receives qube.safetensors, table.md and estimates.png.
     cross_validate
         Judge the settings on the training runs instead: leave either half out once, and look at none of the others.
     inverse_steps
@@ -167,18 +176,18 @@ def main(
         deviations, all runs together, after the transient; NaN for what it does not estimate.
     """
     settings = {**SETTINGS, "dt": DT, "held_out": 0.0, "inverse_steps": inverse_steps}
+    training = read(path, TRAINING)
     if cross_validate:
-        runs, records = TRAINING, read(path, TRAINING)
-        estimators = {"KKL": left_out_in_turn(records, settings, out)}
+        runs, records, estimators = TRAINING, training, left_out_in_turn(training, settings, out)
     else:
         runs, records = HELD_OUT, read(path, HELD_OUT)
-        training = read(path, TRAINING)
         model = fitted(training)
         print("fitted:", ", ".join(f"{name} = {model.parameters[name]:.3g}" for name in GUESSES))
-        artifact = trained(training, settings, out)
-        artifact.save(out / "qube.safetensors")
+        alone, both = learned(training, model, settings, out)
+        both.save(out / "qube.safetensors")
         estimators = {
-            "KKL from recorded states": [estimates(artifact, record) for record in records],
+            ALONE: [estimates(alone, record) for record in records],
+            BOTH: [estimates(both, record) for record in records],
             "extended Kalman filter, published model": kalman(records, Qube()),
             "extended Kalman filter, fitted model": kalman(records, Qube(**model.parameters)),
             "finite differences": [differences(record) for record in records],
@@ -215,6 +224,26 @@ def fitted(records: Sequence[Record]) -> BothAngles:
     return replace(BothAngles(), **fit.parameters)
 
 
+def released(model: BothAngles) -> list[Record]:
+    """Motions of the equations, recorded as the device records its own."""
+    rng = np.random.default_rng(0)
+    theta, alpha = rng.uniform(-TURNED, TURNED, MOTIONS), rng.uniform(0, 2 * np.pi, MOTIONS)
+    x0 = np.stack([theta, alpha, *rng.uniform(-1, 1, (2, MOTIONS)) * np.array(MOVING)[:, None]], -1)
+    x = simulate(model, x0, round(LASTING / DT), DT)
+    t = DT * np.arange(len(x))
+    records = []
+    for i in range(MOTIONS):
+        theta, alpha = (ENCODER * np.round(x[:, i, column] / ENCODER) for column in (0, 1))
+        hidden = np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
+        records.append(Record(f"motion {i + 1}", t, theta[:, None], x=hidden, signals=SIGNALS))
+    return records
+
+
+def learned(records: Sequence[Record], model: BothAngles, settings: dict, out: Path) -> tuple[Artifact, Artifact]:
+    """Observers from records alone, and from records and motions of the equations."""
+    return trained(records, settings, out / "records"), trained([*records, *released(model)], settings, out / "both")
+
+
 def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
     """An observer from records and their mirror images."""
     mirrored = [replace(r, name=f"{r.name}, mirrored", y=-r.y, x=r.x * MIRRORED) for r in records]
@@ -223,14 +252,15 @@ def trained(records: Sequence[Record], settings: dict, out: Path) -> Artifact:
     return train_recorded(both, config, out, name="qube", resume=True, console=Console()).artifact
 
 
-def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> list[np.ndarray]:
-    """Estimates along each training run, by observers that were trained on the other half."""
+def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> dict[str, list[np.ndarray]]:
+    """Estimates along each training run, by observers and equations that were learned from the other half."""
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]
-        artifact = trained(kept, settings, out / f"without-{'-'.join(map(str, fold))}")
-        found |= {run: estimates(artifact, records[TRAINING.index(run)]) for run in fold}
-    return [found[run] for run in TRAINING]
+        observers = learned(kept, fitted(kept), settings, out / f"without-{'-'.join(map(str, fold))}")
+        for run in fold:
+            found[run] = [estimates(observer, records[TRAINING.index(run)]) for observer in observers]
+    return {name: [found[run][i] for run in TRAINING] for i, name in enumerate((ALONE, BOTH))}
 
 
 def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:

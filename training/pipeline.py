@@ -39,7 +39,7 @@ from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
 from training.trajectories.expression import output_expression
-from training.trajectories.parameters import blind, relative_ranges, with_parameters
+from training.trajectories.parameters import blind, relative_ranges, uncertain_plant
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -48,7 +48,6 @@ from training.trajectories.signals import DRIVEN, KINDS
 SPINN_SHARES = {"forward": 0.5, "inverse": 0.5}
 SOLVED_SHARES = {"inverse": 0.75}  # solving takes about the rest
 LEAD_IN_SHARE = 0.4  # of the free motions start beyond X, where inputs have led
-NOMINAL_SHARE = 0.5  # of the trajectories where parameters are uncertain have the system's own, which are the likeliest
 CLOSED_LOOP_SECONDS = 20.0  # of each trajectory, at the pace of the shipped systems
 
 
@@ -184,7 +183,7 @@ class _Run:
     def __post_init__(self) -> None:
         system, config = self.system, self.config
         noise_levels("measurement_noise_max", config.measurement_noise_max, system.ny)  # an error before any work
-        self.plant = with_parameters(system, self.ranges, NOMINAL_SHARE)
+        self.plant = uncertain_plant(system, self.ranges)
         self.estimated = tuple(self.ranges) if config.estimate_parameters else ()
         self.started = time.monotonic()
         self.fingerprint = hashlib.sha256(json.dumps(self.identity, sort_keys=True).encode()).hexdigest()[:16]
@@ -221,8 +220,12 @@ class _Run:
         return self.known(found)
 
     def known(self, trajectories: Recorded) -> Recorded:
-        """Trajectories without the parameters that are not to be estimated."""
-        return dataclasses.replace(trajectories, x=trajectories.x[..., : self.system.nx + len(self.estimated)])
+        """Trajectories without the parameters that are not to be estimated, and whether these are the system's own."""
+        x, nx, nominal = trajectories.x, self.system.nx, None
+        if self.ranges:
+            own = [self.system.parameters[name] for name in self.ranges]
+            nominal = np.isclose(x[0, :, nx:], own, rtol=1e-9).all(-1)
+        return dataclasses.replace(trajectories, x=x[..., : nx + len(self.estimated)], nominal=nominal)
 
     def along(
         self, trajectories: Trajectories, linear: LinearFilter, error: np.ndarray | None = None

@@ -19,11 +19,11 @@ from training.evaluation.metrics import chi_square, squared_distance
 from training.maps.optimise import Stage, optimise
 from training.maps.samplers import TrajectorySampler
 from training.maps.spread import SpreadProblem
-from training.pipeline import LEAD_IN_SHARE, NOMINAL_SHARE
+from training.pipeline import LEAD_IN_SHARE
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
-from training.trajectories.parameters import blind, with_parameters
+from training.trajectories.parameters import blind, uncertain_plant
 from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
 
@@ -98,7 +98,7 @@ def learn_error_bars(
                 f"{', '.join(inverse.features)}: train one with kkl-gym train"
             )
     config, policy = settings_of(artifact.training), policy and blind(policy, system.nx)
-    plant = with_parameters(system, artifact.parameter_ranges, NOMINAL_SHARE)
+    plant = uncertain_plant(system, artifact.parameter_ranges)
     with progress_bars(console) as progress:
         run = _Run(artifact, plant, config, steps, trajectories, seed, policy, device or torch.device("cpu"), progress)
         torch.manual_seed(seed)

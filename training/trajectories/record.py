@@ -41,12 +41,15 @@ class Trajectories:
         The filter's.
     process_noise : ndarray, shape (n,)
         Its level along each trajectory, in multiples of the system's scale per second.
+    nominal : ndarray of bool, shape (n,), optional
+        Where parameters differ from trajectory to trajectory, which of these have the system's own.
     """
 
     ages: np.ndarray
     x: np.ndarray
     z: np.ndarray
     process_noise: np.ndarray
+    nominal: np.ndarray | None = dataclasses.field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)

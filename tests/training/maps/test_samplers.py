@@ -1,5 +1,6 @@
 """Batches: what they hold, and that the observer shows its network the same."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -62,6 +63,23 @@ def test_how_often_batches_hold_each_noise_level(sampler, noise_free_share, high
     for below in (0.05, 0.2):  # of which a part of the two decades below 0.5 is left out
         expected = noise_free_share + (1 - noise_free_share) * (1 + np.log10(below / 0.5) / 2) ** high_noise_emphasis
         assert (level <= below).mean() == pytest.approx(expected, abs=0.01)
+
+
+def test_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
+    _, data, linear = sampler
+    nominal = np.arange(data.x.shape[1]) % 3 == 0
+    size = np.where(nominal, 0.0, 1e6)  # by which the states say whose they are
+    marked = dataclasses.replace(data, x=data.x * 0 + size[:, None] + 1, nominal=nominal)
+    alike, apart = (
+        TrajectorySampler(each, linear, measurement_noise_max=0.5, batch=1024, device=CPU)
+        for each in (dataclasses.replace(marked, nominal=None), marked)
+    )
+    assert apart.cells == 2 * alike.cells
+    together, found = (each(torch.Generator().manual_seed(0)) for each in (alike, apart))
+    torch.testing.assert_close(found.inputs, together.inputs)
+    own = (found.x[:, 0] < found.x[:, 0].mean()).long()
+    torch.testing.assert_close(found.cell, 2 * together.cell + own)
+    assert 0.25 < own.float().mean() < 0.42
 
 
 def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypatch):

@@ -11,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from kkl_gym.systems import Lorenz, VanDerPol
 from training.trajectories.derivatives import jacobian
-from training.trajectories.parameters import relative_ranges, with_parameters
+from training.trajectories.parameters import NOMINAL_SHARE, relative_ranges, uncertain_plant, with_parameters
 
 
 @dataclass(frozen=True)
@@ -124,3 +124,19 @@ def test_a_share_of_the_starts_has_the_nominal_parameters():
     assert nominal[0.0] == 0.0
     assert abs(nominal[0.5] - 0.5) < 0.04  # five standard errors
     assert nominal[1.0] == 1.0
+
+
+def test_trainings_have_the_nominal_parameters_or_some_towards_the_ends():
+    system = Lorenz()
+    ranges = relative_ranges(system, {"sigma": 0.1, "beta": 0.3})
+    drawn = uncertain_plant(system, ranges).draw_starts(np.random.default_rng(0), 20_000)[:, 3:]
+    own = [system.sigma, system.beta]
+    nominal = (drawn == own).all(-1)
+    assert nominal.mean() == pytest.approx(NOMINAL_SHARE**2, abs=0.02)
+    assert (nominal == (drawn == own).any(-1)).all()  # both or neither
+    share = (drawn[~nominal] / own - 1) / [0.1, 0.3]
+    assert np.abs(share).max() <= 1 + 1e-12
+    for part in (0.5, 0.9):  # of the half-width; the sine of an even angle stays below it so often
+        assert (np.abs(share) < part).mean(0) == pytest.approx(2 * np.arcsin(part) / np.pi, abs=0.02)
+    assert np.corrcoef(share.T)[0, 1] == pytest.approx(0, abs=0.03)
+    assert uncertain_plant(system, {}) is system

@@ -30,13 +30,15 @@ class ClosedLoopSampler:
         In which the network sees z.
     parameters : int
         How many of the last components of x are parameters.
+    plants : int
+        As there.
     cells : int
         Number of cells of like samples, those of the two halves apart.
     """
 
     def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
         self.open_loop, self.coordinates = open_loop, open_loop.coordinates
-        self.parameters = open_loop.parameters
+        self.parameters, self.plants = open_loop.parameters, open_loop.plants
         level, gain = data.measurement_noise, np.atleast_2d(open_loop.noise_gain)
         shrink = 1.0 + ((level[..., None] * gain) ** 2).sum(1)
         self._modes = tensor(open_loop.coordinates(data.z) / shrink, device)
@@ -52,6 +54,7 @@ class ClosedLoopSampler:
         self._process_cell = torch.zeros_like(self._level_cell)
         if open_loop.process_noise_max:
             self._process, self._process_cell = open_loop.process_conditions(data.process_noise, device)
+        self._nominal_cell = open_loop.nominal_cell(data, device)
         self.cells = 2 * open_loop.cells
 
     def __call__(self, generator: torch.Generator) -> Batch:
@@ -65,7 +68,9 @@ class ClosedLoopSampler:
         if self.open_loop.process_noise_max:
             conditions.insert(1, self._process[rows][:, None])
         closed = torch.cat([self._modes[ages, rows], *conditions], -1)
-        closed_cell = self.open_loop.cell(self._age_cell[ages], self._level_cell[rows], self._process_cell[rows])
+        closed_cell = self.open_loop.cell(
+            self._age_cell[ages], self._level_cell[rows], self._process_cell[rows], self._nominal_cell[rows]
+        )
         return Batch(
             torch.cat([inputs[:half], closed]),
             torch.cat([x[:half], self._x[ages, rows]]),

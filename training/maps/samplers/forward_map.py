@@ -40,11 +40,13 @@ class ForwardMapSampler:
         In which the network sees z.
     parameters : int
         0: none are estimated here.
+    plants : int
+        1: all motions have the same parameters.
     scale : StateScale
         Of the states.
     """
 
-    cells = 1
+    cells, plants = 1, 1
     parameters = 0
 
     def __init__(

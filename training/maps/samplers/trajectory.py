@@ -32,7 +32,8 @@ class TrajectorySampler:
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
     into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
-    improve in proportion.
+    improve in proportion. Where parameters differ, motions of the system's own are in cells apart: they can be
+    estimated best, and would count for little among the others.
 
     Parameters
     ----------
@@ -85,6 +86,8 @@ class TrajectorySampler:
         Seconds since reset beyond which the network is told no difference.
     cells : int
         Their number.
+    plants : int
+        1, or 2 where cells 2k and 2k + 1 differ in whose parameters motions have.
     """
 
     AGES_PER_BATCH = 32
@@ -153,7 +156,10 @@ class TrajectorySampler:
         self._process_cell = torch.zeros(n, dtype=torch.long, device=device)
         if process_noise_max:
             self._process, self._process_cell = self.process_conditions(data.process_noise, device)
-        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, self.PROCESS_CELLS - 1 if process_noise_max else 0) + 1
+        self.plants = 1 if data.nominal is None else 2
+        self._nominal_cell = self.nominal_cell(data, device)
+        processes = self.PROCESS_CELLS if process_noise_max else 1
+        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, processes - 1, self.plants - 1) + 1
 
     def _take(self, inverse: InverseMap, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and whiten."""
@@ -187,7 +193,7 @@ class TrajectorySampler:
         inputs = torch.cat([modes, *conditions], -1)
         level_cell = 1 + (position.mean(1) * self.LEVELS).long().clamp(0, self.LEVELS - 1)
         level_cell = torch.where((level > 0).any(1), level_cell, 0)
-        cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows])
+        cell = self.cell(self._age_cell[ages], level_cell, self._process_cell[rows], self._nominal_cell[rows])
         batch = self.AGES_PER_BATCH * self._per_age
         return Batch(
             inputs.reshape(batch, -1),
@@ -216,9 +222,15 @@ class TrajectorySampler:
         cell = (part > 0).astype(int) + (part > 0.5)
         return tensor(np.log1p(part / PROCESS_NOISE_UNIT), device), torch.as_tensor(cell, device=device)
 
-    def cell(self, age: Any, level: Any, process: Any) -> Any:
-        """Number of the cell where those of age, measurement noise and process noise meet."""
-        return (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
+    def cell(self, age: Any, level: Any, process: Any, nominal: Any) -> Any:
+        """Number of the cell where those of age, measurement noise, process noise and parameters meet."""
+        number = (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
+        return number * self.plants + nominal
+
+    def nominal_cell(self, data: Trajectories, device: torch.device) -> torch.Tensor:
+        """1 for trajectories of the system's own parameters where these differ, (n,); else 0."""
+        nominal = np.zeros(data.x.shape[1]) if data.nominal is None else data.nominal
+        return torch.as_tensor(nominal.astype(int), device=device)
 
     def age_cell(self, ages: np.ndarray, device: torch.device) -> torch.Tensor:
         """Cells of ages in samples."""
