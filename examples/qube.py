@@ -15,8 +15,8 @@ What is said of the device beforehand, beside the records: left and right are al
 own. Each run is therefore learned from twice, once mirrored, with the signs of both angles changed; and the map sees
 how the arm's angle changes, not where it is.
 
-Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the device's
-equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
+Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the
+device's equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
 
 The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
 v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative behind a low-pass of 55.79 rad/s. Estimates of angles are taken
@@ -85,8 +85,8 @@ GUESSES = {
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)  # of estimators in the figure
 WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
-# Of the equations' motions: how many, how long in s, and what they are released with at most in rad, beside any angle of
-# the pendulum, and in rad/s. The runs begin with the arm up to 0.85 rad from the middle, nearly at rest.
+# Of the equations' motions: how many, how long in s, and what they are released with at most: rad of the arm beside any
+# angle of the pendulum, and rad/s. The runs begin with the arm up to 0.85 rad from the middle, nearly at rest.
 MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
 ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
 
@@ -324,13 +324,12 @@ def draw(
                 ax = axes[i, column]
                 ax.plot(t, record.x[shown, i], color=TRUTH, lw=1.8, label="recorded")
                 for (label, x_hat), look in zip(estimators.items(), LOOKS, strict=False):
-                    if not np.isnan(x_hat[column][:, i]).any():
-                        ax.plot(t, x_hat[column][shown, i], ls=look[0], color=look[1], lw=1.0, label=label)
+                    ax.plot(t, x_hat[column][shown, i], ls=look[0], color=look[1], lw=1.0, label=label)
                 margin = 0.2 * np.ptp(record.x[:, i])
                 ax.set_ylim(record.x[:, i].min() - margin, record.x[:, i].max() + margin)
                 if column == 0:
                     ax.set_ylabel(name)
-        axes[-1, 0].legend(loc="upper right")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
 from training.trajectories.controllers import Controller
-from training.trajectories.parameters import relative_ranges
+from training.trajectories.parameters import nominal_share, relative_ranges
 
 if TYPE_CHECKING:
     import torch
@@ -64,8 +64,8 @@ class Train:
     """Fit the inverse a second time, also on 2,000 trajectories of a controller that acts on the estimate
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
     uncertain: HalfWidths = ()
-    """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all. Half
-    of the motions in training then have their own (input-aware), and the observer serves every such plant."""
+    """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all.
+    Motions in training then have parameters of their own (input-aware), and the observer serves every such plant."""
     no_inputs: tyro.conf.FlagCreatePairsOff[bool] = False
     """Let the filter take in no inputs; an input-aware map is then fitted to free motion only."""
     monitor: bool = True
@@ -257,7 +257,7 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
         f"pipeline {config.pipeline}, preset {name}{given}",
         f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
         f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-        *([f"half of the trajectories have parameters of their own: {uncertain}{estimated}"] if ranges else []),
+        *([f"{1 - nominal_share(ranges):.0%} of the trajectories have {uncertain}{estimated}"] if ranges else []),
     ]
 
 

@@ -99,7 +99,12 @@ def uncertain_plant(system: System, ranges: Mapping[str, tuple[float, float]]) -
     System
         As :func:`with_parameters` returns it; the same system if there are no ranges.
     """
-    return with_parameters(system, ranges, NOMINAL_SHARE ** len(ranges), at_ends=True)
+    return with_parameters(system, ranges, nominal_share(ranges), at_ends=True)
+
+
+def nominal_share(ranges: Mapping[str, tuple[float, float]]) -> float:
+    """Share of the motions of :func:`uncertain_plant` that have the system's own parameters."""
+    return NOMINAL_SHARE ** len(ranges)
 
 
 def with_parameters(
