@@ -144,8 +144,9 @@ class Config:
     map is fitted a second time beside the others; 0 for no second time."""
     uncertain: dict[str, Annotated[float, Field(ge=0, lt=1)]] = dataclasses.field(default_factory=dict)
     """Parameters of the system that differ from motion to motion (input-aware), by name: how far they may be from their
-    values, as a part of these. "all" stands for each that is not named. With one such parameter 0.6 of the motions keep
-    its value, with two 0.6^2 keep both. The map still gives the state alone, whichever plant it is."""
+    values, as a part of these. "all" stands for each that is not named. Some motions keep the values themselves
+    (:func:`training.trajectories.parameters.uncertain_plant`). The map still gives the state alone, whichever plant it
+    is."""
     estimate_parameters: bool = False
     """Whether the map gives the uncertain parameters too, so that the observer identifies the plant while it runs."""
     cpu_seconds: Positive | None = None

@@ -39,7 +39,7 @@ from training.trajectories.closed_loop import record_closed_loop
 from training.trajectories.controllers import Controller
 from training.trajectories.derivatives import output_matrix
 from training.trajectories.expression import output_expression
-from training.trajectories.parameters import blind, relative_ranges, uncertain_plant
+from training.trajectories.parameters import blind, nominal_share, relative_ranges, uncertain_plant
 from training.trajectories.policy import policy_fingerprint
 from training.trajectories.record import Motions, Trajectories, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
@@ -90,8 +90,8 @@ def train(
     2. Free inverse (input-aware maps of a system with inputs, unless turned off or under a policy): trajectories
        without input are simulated with a filter of y beside them, and an inverse of z_y alone is fitted.
     3. The training trajectories are simulated with the filter beside them; those of input-aware maps have process noise
-       and inputs, random ones or a policy's. In all stages half of the trajectories have values of their own of
-       uncertain parameters.
+       and inputs, random ones or a policy's. In all stages uncertain parameters differ between trajectories, see
+       :func:`training.trajectories.parameters.uncertain_plant`.
     4. Forward map (spinn): T is trained on them and on its equation, or solved for, and z' = T(x') takes the place of
        the simulated z. An input-aware map has no T. Batches are drawn along the trajectories, with measurement noise
        added to z.
@@ -137,6 +137,8 @@ def train(
     if config.pipeline == "spinn":
         check_continuous(system)
     ranges = relative_ranges(system, config.uncertain)
+    if ranges:
+        identity["nominal_share"] = nominal_share(ranges)
     policy = None if config.policy is None else named_policy(system, config.policy)
     feedback = (policy or named_policy(system, "controller")) if config.closed_loop_trajectories else None
     if policy:
@@ -224,7 +226,7 @@ class _Run:
         x, nx, nominal = trajectories.x, self.system.nx, None
         if self.ranges:
             own = [self.system.parameters[name] for name in self.ranges]
-            nominal = np.isclose(x[0, :, nx:], own, rtol=1e-9).all(-1)
+            nominal = (x[0, :, nx:] == own).all(-1)  # at age 0 they are as they were drawn
         return dataclasses.replace(trajectories, x=x[..., : nx + len(self.estimated)], nominal=nominal)
 
     def along(

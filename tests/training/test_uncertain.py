@@ -47,6 +47,10 @@ class Spring(System):
         return (x[0],)
 
 
+class ReachedError(Exception):
+    """Raised where a test has seen enough of a training."""
+
+
 @cache
 def trained(**uncertain):
     """An observer of free motion, for one plant or many."""
@@ -67,7 +71,7 @@ def test_an_observer_for_uncertain_plants_holds_on_another():
         for what, moving in {"model": system, "plant": plant}.items():
             runs = unseen_trajectories(moving, 0.05, n=20, duration=15.0, seed=3)
             late[name, what] = np.median(errors(artifact, moving, runs, measurement_noise=0.02, seed=3).late)
-    assert late["many", "plant"] < 0.5 * late["one", "plant"]
+    assert late["many", "plant"] < 0.6 * late["one", "plant"]
     assert late["many", "model"] < 2.5 * late["one", "model"]  # at this toy size
 
 
@@ -82,9 +86,6 @@ def test_it_identifies_the_plant_while_it_runs():
 
 
 def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate(monkeypatch, tmp_path):
-    class ReachedError(Exception):
-        pass
-
     seen = {}
 
     def spy_record(plant, *arguments, **named):
@@ -92,12 +93,12 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate(monkeypatch, tm
         return record(plant, *arguments, **named)
 
     def spy_sampler(data, *arguments, **named):
-        seen["x"], seen["parameters"] = data.x, named["parameters"]
+        seen["x"], seen["parameters"], seen["nominal"] = data.x, named["parameters"], data.nominal
         raise ReachedError
 
     monkeypatch.setattr(training.pipeline, "record", spy_record)
     monkeypatch.setattr(training.pipeline, "TrajectorySampler", spy_sampler)
-    config = toy(VanDerPol(), uncertain={"mu": 0.1})
+    config = toy(VanDerPol(), uncertain={"mu": 0.1}, trajectories=200)
     for estimated in (False, True):
         with pytest.raises(ReachedError):
             train(VanDerPol(), replace(config, estimate_parameters=estimated), tmp_path / str(estimated), device=CPU)
@@ -105,8 +106,29 @@ def test_what_the_map_is_shown_holds_only_what_it_is_to_estimate(monkeypatch, tm
         assert seen["x"].shape[-1] == 2 + estimated
         assert seen["parameters"] == estimated
     mu = seen["x"][..., 2]
+    np.testing.assert_array_equal(seen["nominal"], mu[0] == 3)
+    assert 0.4 < seen["nominal"].mean() < 0.9
     np.testing.assert_allclose(mu, np.broadcast_to(mu[0], mu.shape), rtol=1e-9)
     assert 2.7 <= mu.min() < 2.8 < 3.2 < mu.max() <= 3.3
+
+
+@pytest.mark.parametrize("capacitance", [1.0, 4.7e-9])
+def test_parameters_of_any_size_are_told_from_the_systems_own(monkeypatch, tmp_path, capacitance):
+    @dataclass(frozen=True)
+    class Circuit(Spring):
+        name: ClassVar[str] = "circuit"
+        stiffness: float = capacitance
+
+        def f(self, x):
+            return x[1], -4.0 * self.stiffness / capacitance * x[0]
+
+    def spy(data, *arguments, **named):
+        raise ReachedError(data.nominal.mean())
+
+    monkeypatch.setattr(training.pipeline, "TrajectorySampler", spy)
+    with pytest.raises(ReachedError) as reached:
+        train(Circuit(), toy(Circuit(), uncertain={"stiffness": 0.1}, trajectories=300), tmp_path, device=CPU)
+    assert reached.value.args[0] == pytest.approx(2 / 3, abs=0.15)
 
 
 def test_in_closed_loop_the_plant_is_uncertain_and_the_controller_nominal(monkeypatch, tmp_path):
@@ -165,6 +187,23 @@ def test_parameters_leave_states_as_they_are():
     cells = states.sampler.cells
     torch.testing.assert_close(states.error, both.error[:cells])
     assert (both.error[cells:][both.visited[cells:]] > 2 * states.error[:cells].max()).all()
+
+
+def test_errors_of_parameters_are_not_apart_for_the_systems_own():
+    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
+    plant, ages = with_parameters(VanDerPol(), {"mu": (2.7, 3.3)}, 0.5), recording_ages(100, 20)
+    data = record(plant, linear, n=40, steps=100, ages=ages, rng=np.random.default_rng(0))
+    for nominal in (None, data.x[0, :, 2] == 3):
+        how = {"measurement_noise_max": 1.0, "batch": 256, "device": CPU, "parameters": 1}
+        sampler = TrajectorySampler(replace(data, nominal=nominal), linear, **how)
+        network = Network(len(sampler.coordinates.noise_gain) + 2, 3, width=8, depth=1, activation="tanh")
+        problem = InverseProblem(network, sampler, CPU)
+        problem.loss(torch.Generator().manual_seed(0))
+        visited = problem.visited[sampler.cells :].sum()
+        if nominal is None:
+            expected = visited
+    assert visited == expected
+    assert problem.visited[: sampler.cells].sum() > expected
 
 
 def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():

@@ -65,7 +65,7 @@ class Train:
     (input-aware); takes half as long again. Writes NAME-closed-loop."""
     uncertain: HalfWidths = ()
     """How far a parameter may be from its value, as a part of that: mu=0.1, once for each, or 0.1 for all.
-    Motions in training then have parameters of their own (input-aware), and the observer serves every such plant."""
+    Some motions in training then have their own (input-aware), and the observer serves every such plant."""
     no_inputs: tyro.conf.FlagCreatePairsOff[bool] = False
     """Let the filter take in no inputs; an input-aware map is then fitted to free motion only."""
     monitor: bool = True
@@ -252,12 +252,17 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
     ranges = relative_ranges(system, config.uncertain)
     uncertain = ", ".join(f"{parameter} from {low:g} to {high:g}" for parameter, (low, high) in ranges.items())
     estimated = ", which the map estimates" if config.estimate_parameters else ""
+    others = 100 * (1 - nominal_share(ranges))
     return [
         f"training an observer for {system.name}{own}: {', '.join(sizes)}",
         f"pipeline {config.pipeline}, preset {name}{given}",
         f"{config.trajectories:,} trajectories of {config.duration:g} s at dt = {config.dt:g} s; "
         f"{spectrum.modes} modes of A for each output, from {rates.max():.3g} to {rates.min():.3g} 1/s",
-        *([f"{1 - nominal_share(ranges):.0%} of the trajectories have {uncertain}{estimated}"] if ranges else []),
+        *(
+            [f"{others:.0f} % of the trajectories have parameters of their own: {uncertain}{estimated}"]
+            if ranges
+            else []
+        ),
     ]
 
 

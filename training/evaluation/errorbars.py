@@ -52,7 +52,9 @@ def learn_error_bars(
 
     Motions are simulated as in its training, but others. A small network is fitted to what T_inv is off by on them, at
     every age and level of noise, by Gaussian likelihood. Then factors are found on further motions, so that regions of
-    90 % hold 90 % of the errors at each age and level of noise, on free and on driven motions.
+    90 % hold 90 % of the errors at each age and level of noise, on free and on driven motions. Where parameters are
+    uncertain that is so over plants as :func:`training.trajectories.parameters.uncertain_plant` draws them, and less at
+    the ends of the ranges.
 
     Parameters
     ----------

@@ -65,8 +65,8 @@ class InverseProblem(nn.Module):
         square = weight * apart[:, :nx].mean(-1)
         if self.sampler.parameters:  # cells of their own, for they are as hard where states are easy
             square = torch.cat([square, apart[:, nx:].mean(-1)])
-            # Motions of the system's own parameters are in no cells apart: maps would say these of all that are near.
-            cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.plants])
+            # Not apart for the system's own: a map would give these for every plant that is near.
+            cell = torch.cat([cell, self.sampler.cells + cell // self.sampler.kinds_of_plant])
         detached = square.detach()
         count = torch.zeros_like(self.error).index_add_(0, cell, torch.ones_like(detached))
         mean = torch.zeros_like(self.error).index_add_(0, cell, detached) / count.clamp(min=1.0)

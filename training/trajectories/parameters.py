@@ -12,7 +12,7 @@ from training.trajectories.controllers import Controller
 
 # Of motions in training with one uncertain parameter, the share that has its own value; with more, the power of their
 # number, for it is the less likely that all are as said. Chosen on the four systems that ship, on validation runs.
-NOMINAL_SHARE = 0.6
+NOMINAL_SHARE = 2 / 3
 STILL = 1e-12  # scale of a parameter's process noise, of which there is to be none
 EVERY = "all"  # in the place of a parameter's name
 ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
@@ -84,8 +84,8 @@ def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[st
 def uncertain_plant(system: System, ranges: Mapping[str, tuple[float, float]]) -> System:
     """A system whose parameters differ from motion to motion, as a training for all of them wants it.
 
-    Some motions have the system's own parameters, which are the likeliest. In the others parameters gather at the ends
-    of their ranges, where plants are hardest to serve: as the sine of an angle that is drawn evenly.
+    Some motions have the system's own parameters, which are the likeliest: two in three where one parameter is
+    uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to serve.
 
     Parameters
     ----------
@@ -120,11 +120,12 @@ def with_parameters(
     system : System
         Any system.
     ranges : mapping of str to (float, float)
-        Low and high end of each parameter that becomes a state, in this order. Starts are uniform in them.
+        Low and high end of each parameter that becomes a state, in this order.
     nominal_share : float, default 0
-        Share of the starts that have the system's own parameters instead.
+        Share of the starts that have the system's own parameters; the others draw theirs from the ranges.
     at_ends : bool, default False
-        Whether starts gather at the ends of the ranges instead.
+        Whether these lie more often near the ends of their ranges, as the sine of an angle that is drawn evenly, or
+        anywhere alike.
 
     Returns
     -------

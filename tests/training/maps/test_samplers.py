@@ -247,6 +247,21 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(process_noi
         assert (at_run_time % 7 == 0) == (data.measurement_noise[trajectory] == 0)
 
 
+def test_closed_loop_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
+    _, open_data, linear = sampler
+    _, data, _, _ = closed_loop()
+    nominal = np.arange(data.x.shape[1]) % 2 == 0
+    data = dataclasses.replace(data, x=data.x * 0 + np.where(nominal, 1.0, 1e6)[:, None], nominal=nominal)
+    apart = dataclasses.replace(open_data, nominal=np.arange(open_data.x.shape[1]) % 2 == 0)
+    beside = TrajectorySampler(apart, linear, measurement_noise_max=0.5, batch=4096, device=CPU)
+    both = ClosedLoopSampler(beside, data, dt=linear.dt, device=CPU)
+    _, x, _, cell = both(torch.Generator().manual_seed(0))
+    x, cell = x[2048:, 0], cell[2048:]
+    assert (both.kinds_of_plant, both.cells) == (2, 2 * beside.cells)
+    assert ((cell >= beside.cells) & (cell < both.cells)).all()
+    torch.testing.assert_close(cell % 2, (x < x.mean()).long())
+
+
 def test_closed_loop_batches_of_two_outputs():
     sampler, _, linear = of_two_outputs()
     network = untrained_network(sampler)

@@ -30,15 +30,15 @@ class ClosedLoopSampler:
         In which the network sees z.
     parameters : int
         How many of the last components of x are parameters.
-    plants : int
-        As there.
+    kinds_of_plant : int
+        As of :class:`training.maps.samplers.TrajectorySampler`.
     cells : int
         Number of cells of like samples, those of the two halves apart.
     """
 
     def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
         self.open_loop, self.coordinates = open_loop, open_loop.coordinates
-        self.parameters, self.plants = open_loop.parameters, open_loop.plants
+        self.parameters, self.kinds_of_plant = open_loop.parameters, open_loop.kinds_of_plant
         level, gain = data.measurement_noise, np.atleast_2d(open_loop.noise_gain)
         shrink = 1.0 + ((level[..., None] * gain) ** 2).sum(1)
         self._modes = tensor(open_loop.coordinates(data.z) / shrink, device)

@@ -40,13 +40,13 @@ class ForwardMapSampler:
         In which the network sees z.
     parameters : int
         0: none are estimated here.
-    plants : int
+    kinds_of_plant : int
         1: all motions have the same parameters.
     scale : StateScale
         Of the states.
     """
 
-    cells, plants = 1, 1
+    cells, kinds_of_plant = 1, 1
     parameters = 0
 
     def __init__(

@@ -32,8 +32,8 @@ class TrajectorySampler:
 
     The errors that can be reached differ by orders of magnitude between ages and noise levels. Samples fall
     into ``cells`` of like age and levels, and the loss divides each by its cell's own recent error, so that all
-    improve in proportion. Where parameters differ, motions of the system's own are in cells apart: they can be
-    estimated best, and would count for little among the others.
+    improve in proportion. Where parameters differ, motions of the system's own are in cells apart: their errors can be
+    smaller, and in cells with the others they would count for little.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class TrajectorySampler:
         Seconds since reset beyond which the network is told no difference.
     cells : int
         Their number.
-    plants : int
+    kinds_of_plant : int
         1, or 2 where cells 2k and 2k + 1 differ in whose parameters motions have.
     """
 
@@ -156,10 +156,10 @@ class TrajectorySampler:
         self._process_cell = torch.zeros(n, dtype=torch.long, device=device)
         if process_noise_max:
             self._process, self._process_cell = self.process_conditions(data.process_noise, device)
-        self.plants = 1 if data.nominal is None else 2
+        self.kinds_of_plant = 1 if data.nominal is None else 2
         self._nominal_cell = self.nominal_cell(data, device)
         processes = self.PROCESS_CELLS if process_noise_max else 1
-        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, processes - 1, self.plants - 1) + 1
+        self.cells = self.cell(self.AGE_CELLS - 1, self.LEVELS, processes - 1, self.kinds_of_plant - 1) + 1
 
     def _take(self, inverse: InverseMap, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Take coordinates, scales, units and ends from a map; returns the noise's size in them, and whiten."""
@@ -225,7 +225,7 @@ class TrajectorySampler:
     def cell(self, age: Any, level: Any, process: Any, nominal: Any) -> Any:
         """Number of the cell where those of age, measurement noise, process noise and parameters meet."""
         number = (age * (1 + self.LEVELS) + level) * (self.PROCESS_CELLS if self.process_noise_max else 1) + process
-        return number * self.plants + nominal
+        return number * self.kinds_of_plant + nominal
 
     def nominal_cell(self, data: Trajectories, device: torch.device) -> torch.Tensor:
         """1 for trajectories of the system's own parameters where these differ, (n,); else 0."""
