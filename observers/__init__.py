@@ -3,7 +3,9 @@
 from observers.artifact import Artifact
 from observers.errors import ArtifactError
 from observers.expression import Expression
+from observers.factors import Factors
 from observers.filter import LinearFilter
+from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.monitor import Limits, Monitor
@@ -17,6 +19,8 @@ __all__ = [
     "Artifact",
     "ArtifactError",
     "Expression",
+    "Factors",
+    "Flow",
     "ForwardMap",
     "InverseMap",
     "KKLObserver",

@@ -16,16 +16,18 @@ from observers import storage
 from observers.checks import is_finite, noise_levels, shown
 from observers.errors import ArtifactError
 from observers.expression import Expression
+from observers.factors import Factors
 from observers.filter import LinearFilter
+from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
 from observers.monitor import Limits
 from observers.spread import Spread
 
 # The second has maps that are told the process noise, the third maps that are told levels of measurement noise, one for
-# each of several outputs, the fourth maps that estimate parameters too, the fifth maps with error bars; the others are
-# still written as the first.
-FORMATS = (1, 2, 3, 4, 5)
+# each of several outputs, the fourth maps that estimate parameters too, the fifth maps with error bars, the sixth maps
+# with a flow; the others are still written as the first.
+FORMATS = (1, 2, 3, 4, 5, 6)
 USUAL_NOISE = 0.5  # standard deviation of the measurement noise where a file does not say what is usual
 # Parameters that a system has been given since files for it were written that say none, and what they were then.
 _PARAMETERS_SINCE = {"reverse_duffing": {"a": 1.0, "b": 1.0}}
@@ -36,6 +38,20 @@ _LIMIT_SCALARS = ("window", "warm_up", "false_alarms", "duration")
 _FORWARD_ARRAYS = ("x_offset", "x_scale", "z_offset", "z_scale")
 _INVERSE_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _SPREAD_ARRAYS = ("levels", "ages", "factors")
+_FLOW_ARRAYS = (
+    "x_offset",
+    "x_scale",
+    "u_scale",
+    "bias",
+    "gain",
+    "linear",
+    "low",
+    "high",
+    "error",
+    "process_noise",
+    "least_measurement_noise",
+)
+_FLOW_SCALARS = ("least_process_noise", "window")
 # Scalars of an inverse map, and what the files call them.
 _SCALARS = {
     "measurement_noise_unit": "noise_unit",
@@ -72,6 +88,9 @@ class Artifact:
     free_inverse : InverseMap, optional
         T_inv of z_y alone, in use as long as no input has acted since reset. Motions without input keep to far fewer
         states than driven ones, which a map that knows of no input can rely on.
+    flow : Flow, optional
+        The system's motion over a sample. An observer that has it tracks: T_inv says where its estimate begins, and
+        from there the flow moves it and each sample corrects it.
     measurement_noise : float or tuple of float, length ny, default 0.5
         Standard deviation of the noise that is usual on each sample, of all outputs or each. Observers assume it where
         they are told nothing else. It is cut at the largest that the maps are told.
@@ -109,6 +128,7 @@ class Artifact:
     h: Expression | None = None
     limits: Limits | None = None
     free_inverse: InverseMap | None = None
+    flow: Flow | None = None
     measurement_noise: float | tuple[float, ...] = USUAL_NOISE
     parameter_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     estimated_parameters: tuple[str, ...] = ()
@@ -164,6 +184,8 @@ class Artifact:
                 f"an output h of {len(self.h.components)} components and {self.h.states} states does not fit {self.ny} "
                 f"outputs and {self.nx} states, or there is a C beside it"
             )
+        if self.flow is not None:
+            self._check_flow(self.flow)
         if self.signals is not None:
             self._check_signals(self.signals)
         if self.environment is not None:
@@ -187,6 +209,17 @@ class Artifact:
                 f"the observer {self.system!r} was learned from recorded states: {names['hidden']} from {given}, every "
                 f"{self.filter.dt:g} s. It has no equations, and {fits}; observers.load(path) runs it on samples"
             )
+
+    def _check_flow(self, flow: Flow) -> None:
+        sizes, expected = (flow.nx, flow.nu, len(flow.least_measurement_noise)), (self.nx, self.nu, self.ny)
+        if sizes != expected:
+            raise ArtifactError(f"a flow of {sizes} states, inputs and outputs does not fit an observer of {expected}")
+        if self.inverse.spread is None or not self.knows_output:
+            raise ArtifactError("a flow needs error bars and the output h(x) beside it")
+        if self.parameter_ranges:
+            raise ArtifactError(f"a flow is of one plant, not of a range of {', '.join(self.parameter_ranges)}")
+        if (flow.factors.factors.ndim == 3) != (self.process_noise_max is not None):
+            raise ArtifactError("factors of a flow must be by process noise if the map is told that, and only then")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
         counts = {"measured": self.ny, "inputs": self.nu, "hidden": self.nx}
@@ -335,6 +368,26 @@ class Artifact:
             )
         return self.inverse.spread
 
+    def require_flow(self) -> Flow:
+        """Return the flow by which the observer tracks.
+
+        Returns
+        -------
+        Flow
+            What :attr:`flow` holds.
+
+        Raises
+        ------
+        ArtifactError
+            If none was learned; the message says how to.
+        """
+        if self.flow is None:
+            raise ArtifactError(
+                f"this map for {self.system!r} holds no flow; kkl-gym tracking NAME_OR_FILE learns one, and writes a "
+                "map that has it"
+            )
+        return self.flow
+
     @property
     def process_noise_max(self) -> float | None:
         """The highest level of process noise that the map was trained for; None if it is not told the level."""
@@ -408,6 +461,7 @@ class Artifact:
             inverse.noise_gain.ndim == 2,
             bool(self.estimated_parameters),
             inverse.spread is not None,
+            self.flow is not None,
         )
         level = max(number * there for number, there in enumerate(told, 1))
         described: dict[str, Any] = {
@@ -440,6 +494,8 @@ class Artifact:
             storage.put_mlp(tensors, "forward.", self.forward.mlp)
             tensors |= {f"forward.{n}": np.asarray(getattr(self.forward, n), dtype=float) for n in _FORWARD_ARRAYS}
             described["forward"] = {"activation": self.forward.mlp.activation}
+        if self.flow is not None:
+            described["flow"] = _put_flow(tensors, self.flow)
         if self.limits is not None:
             tensors |= {f"limits.{name}": np.asarray(getattr(self.limits, name), dtype=float) for name in _LIMITS}
             described["limits"] = {name: getattr(self.limits, name) for name in _LIMIT_SCALARS}
@@ -502,6 +558,7 @@ class Artifact:
             h=Expression(described["h"]) if "h" in described else None,
             limits=limits,
             free_inverse=free_inverse,
+            flow=_get_flow(tensors, described["flow"]) if "flow" in described else None,
             measurement_noise=described.get("measurement_noise", USUAL_NOISE),
             parameter_ranges={name: tuple(ends) for name, ends in described["system"].get("ranges", {}).items()},
             estimated_parameters=tuple(described.get("estimated_parameters", ())),
@@ -539,6 +596,21 @@ def _put_spread(tensors: dict[str, np.ndarray], prefix: str, spread: Spread | No
     storage.put_mlp(tensors, prefix, spread.mlp)
     tensors |= {f"{prefix}{name}": np.asarray(getattr(spread, name), dtype=float) for name in _SPREAD_ARRAYS}
     return {"spread": {"activation": spread.mlp.activation}}
+
+
+def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
+    """Add a flow's arrays; returns what describes it."""
+    storage.put_mlp(tensors, "flow.", flow.mlp)
+    tensors |= {f"flow.{name}": np.asarray(getattr(flow, name), dtype=float) for name in _FLOW_ARRAYS}
+    tensors |= {f"flow.factors.{name}": np.asarray(getattr(flow.factors, name), dtype=float) for name in _SPREAD_ARRAYS}
+    return {"activation": flow.mlp.activation, **{name: getattr(flow, name) for name in _FLOW_SCALARS}}
+
+
+def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> Flow:
+    arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
+    factors = Factors(*(tensors[f"flow.factors.{name}"] for name in _SPREAD_ARRAYS))
+    scalars = {name: described[name] for name in _FLOW_SCALARS}
+    return Flow(storage.get_mlp(tensors, "flow.", described["activation"]), **arrays, **scalars, factors=factors)
 
 
 def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:

@@ -16,6 +16,7 @@ from observers.monitor import Monitor
 from observers.names import resolve
 from observers.replacement import check_replacement
 from observers.spread import deviations
+from observers.tracker import Tracker
 
 SOON = 1000  # single samples after which a simulation will go on for long enough to wait a second for the compiler
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
@@ -31,6 +32,10 @@ class KKLObserver:
     A filter that is switched on knows nothing of what came before, and its estimates need some time. Where the state
     x_0 is known and the artifact holds the forward map T, ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead, where a
     filter would be that has run for ever. T also gives :attr:`mismatch`, which says how far z is from T(x_hat).
+
+    Where the artifact holds a flow, the observer tracks: T_inv says where the estimate begins, the learned motion
+    carries it on, and each sample corrects it (:class:`observers.tracker.Tracker`). What T_inv says takes its place
+    where that is surer, or where the samples show that it is lost.
 
     Parameters
     ----------
@@ -87,6 +92,7 @@ class KKLObserver:
         self._compile, self._compiled = compiled, bool(compiled)
         self._samples = 0  # single ones
         self._z: np.ndarray | None = None
+        self._tracker: Tracker | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._parts: Parts | None  # which networks made the last estimate, and from what
         self._process_noise = self._level(process_noise)
@@ -137,6 +143,16 @@ class KKLObserver:
         nx = self.artifact.nx
         self._states = self._decoders(slice(nx))
         self._parameters = self._decoders(slice(nx, None)) if self.artifact.estimated_parameters else None
+        before, self._tracker = self._tracker, self._new_tracker()
+        if before is not None and self._tracker is not None and self._z is not None:
+            self._tracker.go_on(before)
+
+    def _new_tracker(self) -> Tracker | None:
+        """One that has not begun, where the artifact holds a flow."""
+        if self.artifact.flow is None:
+            return None
+        level, process_noise = self._measurement_noise, self._process_noise
+        return Tracker(self.artifact, measurement_noise=level, process_noise=process_noise)
 
     def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
@@ -184,6 +200,10 @@ class KKLObserver:
         other._compile, other._samples = self._compile, self._samples
         if self._z is not None:
             other._z, other._y, other._age = self._z, self._y, self._age
+            if other._tracker is not None and self._tracker is not None:
+                other._tracker.go_on(self._tracker)
+            elif other._tracker is not None:
+                other._begin(None)
             if other._monitor is not None:
                 other._monitor.reset(self._z.shape[:-1])
         vars(self).update(vars(other))
@@ -226,6 +246,7 @@ class KKLObserver:
             self._tell()
             self._warm_up()
         self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
+        self._begin(x0)
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -298,6 +319,10 @@ class KKLObserver:
         y0 = real_array("y", y0)
         self._check_output(y0, (int(rows.sum()),), first=True)
         z[rows], age = self._start(y0, x0)
+        if self._tracker is not None and rows.any():
+            begun = self._twin()
+            begun.reset(y0, x0)
+            self._tracker.take(rows.ravel(), begun._tracker)
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, age, self._age)
@@ -365,7 +390,14 @@ class KKLObserver:
         else:
             y = real_array("y", y).copy()  # as in reset
             gaps = self._check_output(y, batch)
-        if gaps is not None:
+        tracker = self._tracker
+        if tracker is not None:
+            ahead = tracker.ahead(u.reshape(-1, self.artifact.nu))
+            samples = y if gaps is None else np.where(gaps, np.nan, y)
+        if gaps is not None and tracker is not None:
+            h = tracker.expected(ahead).reshape(y.shape)
+            y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
+        elif gaps is not None:
             y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
         linear = self.artifact.filter
         if y.ndim == 1:
@@ -382,6 +414,10 @@ class KKLObserver:
             self._z, self._y = kept, np.where(rows[..., None], y, self._y)
             self._age = self._age + rows
         self._x_hat, self._parts = None, None
+        if tracker is not None:
+            moved = None if rows is None else rows.ravel()
+            tracker.correct(ahead, samples.reshape(-1, self.artifact.ny), moved)
+            self._supervise(moved)
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]
@@ -410,6 +446,9 @@ class KKLObserver:
             If ``rows`` does not fit the batch.
         """
         z, age = self._moment(rows)
+        if self._tracker is not None:
+            x_hat = self._tracker.estimate.reshape(*self._z.shape[:-1], -1)
+            return x_hat if rows is None else x_hat[rows]
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
         parts, x_hat = self._states.estimate(z, age)
@@ -478,9 +517,61 @@ class KKLObserver:
             If ``rows`` does not fit the batch, or the artifact holds no error bars.
         """
         self.artifact.require_spread()
+        if self._tracker is not None:
+            z, _ = self._moment(None)
+            age = np.broadcast_to(self._age, z.shape[:-1]).ravel()
+            covariance = self._tracker.covariance(age).reshape(*z.shape[:-1], self.artifact.nx, self.artifact.nx)
+            return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
         if rows is None and self._parts is not None:
             return self._states.covariance(self._parts)
         return self._states.covariances(*self._moment(rows))
+
+    def _begin(self, x0: np.ndarray | None) -> None:
+        """Begin tracking, where the observer does, from what is known or T_inv says."""
+        if self._tracker is None:
+            return
+        if x0 is not None:
+            self._tracker.know(np.reshape(np.asarray(x0, dtype=float), (-1, self.artifact.nx)))
+            return
+        self._tracker.begin(*self._said(np.ones(math.prod(self._z.shape[:-1]), dtype=bool)))
+
+    def _said(self, rows: np.ndarray, oldest: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
+        """What T_inv says in some rows of the flattened batch: estimates, and covariances as if at most so old."""
+        assert self._z is not None
+        dt, batch = self.artifact.filter.dt, self._z.shape[:-1]
+        z, age = self._z.reshape(-1, self._z.shape[-1])[rows], np.broadcast_to(self._age, batch).ravel()[rows]
+        parts, x_hat = self._states.estimate(z, age * dt)
+        if (age > oldest).any():
+            return x_hat, self._states.covariances(z, np.minimum(age, oldest) * dt)
+        return x_hat, self._states.covariance(parts)
+
+    def _supervise(self, moved: np.ndarray | None) -> None:
+        """Let T_inv say where the tracked estimate is lost, and where it may be surer: as long as the filter settles.
+
+        Where the estimate is lost, what came before may have misled the filter too. What T_inv says is therefore taken
+        for no surer than so soon after a reset as the tracker's window is long.
+        """
+        tracker = self._tracker
+        assert tracker is not None and self._z is not None
+        lost = tracker.lost
+        young = np.broadcast_to(self._age, self._z.shape[:-1]).ravel() * self.artifact.filter.dt < (
+            self.artifact.inverse.age_max
+        )
+        if moved is not None:
+            lost, young = lost & moved, young & moved
+        if lost.any():
+            tracker.replace(lost, *self._said(lost, oldest=tracker.window))
+        if (young & ~lost).any():
+            tracker.replace(young & ~lost, *self._said(young & ~lost))
+
+    def _twin(self) -> "KKLObserver":
+        """Another of the same artifact, levels of noise and compilation, without a monitor."""
+        return KKLObserver(
+            self.artifact,
+            self._measurement_noise,
+            process_noise=self._process_noise,
+            compiled=self._compiled or self._compile,
+        )
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""
@@ -542,6 +633,8 @@ class KKLObserver:
         ValueError
             As :meth:`reset` and :meth:`step`.
         """
+        if self._tracker is not None:
+            return self._replayed(y, u, x0, of=KKLObserver.decode)
         return self._along(y, u, of=self._states, x0=x0)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
@@ -591,6 +684,8 @@ class KKLObserver:
             As :meth:`estimate`, and if the artifact holds no error bars.
         """
         self.artifact.require_spread()
+        if self._tracker is not None:
+            return self._replayed(y, u, x0, of=KKLObserver.decode_covariance)
         return self._along(y, u, of=self._states.covariances, x0=x0)
 
     def _along(
@@ -602,18 +697,9 @@ class KKLObserver:
         x0: np.ndarray | None = None,
     ) -> np.ndarray:
         """What a function of the filter's states and their ages gives along a record."""
-        y = real_array("y", y)
-        if y.ndim < 2 or not len(y):
-            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
-        gaps = self._check_output(y, y.shape[:-1])
-        if gaps is not None:
-            self._check_output(y[0], y.shape[1:-1], first=True)
-            y = y.copy()  # in which they are filled
+        y, gaps = self._record(y, u)
+        u = None if u is None else real_array("u", u)
         steps, batch = len(y), y.shape[1:-1]
-        if u is not None:
-            u = real_array("u", u)
-            if u.ndim < 1 or len(u) not in (steps - 1, steps):
-                raise ValueError(f"u must have {steps - 1} or {steps} rows for {steps} rows of y, got shape {u.shape}")
         linear = self.artifact.filter
         out: np.ndarray | None = None
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
@@ -634,6 +720,43 @@ class KKLObserver:
             out[first : first + count] = found
         assert out is not None  # there is one sample at least
         return out
+
+    def _record(self, y: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """A record's outputs, and where entries are missing, None if none are; an error if it is none."""
+        y = real_array("y", y)
+        if y.ndim < 2 or not len(y):
+            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
+        gaps = self._check_output(y, y.shape[:-1])
+        if gaps is not None:
+            self._check_output(y[0], y.shape[1:-1], first=True)
+            y = y.copy()  # in which they are filled
+        if u is not None:
+            u = real_array("u", u)
+            if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
+                raise ValueError(
+                    f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}"
+                )
+        return y, gaps
+
+    def _replayed(
+        self,
+        y: np.ndarray,
+        u: np.ndarray | None,
+        x0: np.ndarray | None,
+        *,
+        of: Callable[["KKLObserver"], np.ndarray],
+    ) -> np.ndarray:
+        """What is asked of another observer like this one at each sample of a record."""
+        y, _ = self._record(y, u)
+        other = self._twin()
+        other.reset(y[0], x0)
+        first = of(other)
+        found = np.empty((len(y), *first.shape))
+        found[0] = first
+        for k in range(1, len(y)):
+            other.advance(y[k], None if u is None else u[k - 1])
+            found[k] = of(other)
+        return found
 
     def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
         """The filter's first state, (..., size), and how many samples old it is."""

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from observers.checks import shown
 from observers.compiled_covariance import CompiledCovariance
+from observers.factors import Factors
 from observers.network import MLP
 
-COVERAGE = 0.9  # of the regions that the factors make true
 _LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
-_LARGEST_FACTOR = 1e12
 
 
 @dataclass(frozen=True)
@@ -22,26 +20,21 @@ class Spread:
 
     It is factor * D L L^T D. The network has the inputs of T_inv's own. Its first nx outputs are the logarithms of D,
     which is diagonal, the others the entries of L below its diagonal of ones, row by row. All are in scaled units,
-    those of :attr:`observers.InverseMap.x_scale`. The factors come from runs that the network was not fitted to: with
-    them, nine errors in ten lie where (x - x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square
-    distribution with nx degrees of freedom.
+    those of :attr:`observers.InverseMap.x_scale`. The factors are those of :class:`observers.factors.Factors`.
 
     Parameters
     ----------
     mlp : MLP
         The network, of nx (nx + 1) / 2 outputs.
     levels : ndarray, shape (k,)
-        Levels of measurement noise, rising from 0, in multiples of the largest that the map is told.
     ages : ndarray, shape (m,)
-        Seconds since reset, rising from 0.
     factors : ndarray, shape (k, m) or (2, k, m)
-        At each of them; two tables are without process noise and with the highest level that the map is told.
-        Between them their logarithms are interpolated, and beyond the last ones they stay.
+        As there.
 
     Raises
     ------
     ValueError
-        If shapes do not go together, levels or ages do not rise from 0, or a factor is not positive.
+        If the network makes no covariance, or as there.
     """
 
     mlp: MLP
@@ -50,18 +43,7 @@ class Spread:
     factors: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("levels", "ages"):
-            values = getattr(self, name)
-            rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
-            if not rising or not np.isfinite(values).all():
-                raise ValueError(f"the {name} of error bars must rise from 0, got {shown(values)}")
-        tables = (len(self.levels), len(self.ages))
-        if self.factors.shape not in (tables, (2, *tables)):
-            raise ValueError(
-                f"factors of shape {self.factors.shape} do not fit {tables[0]} levels and {tables[1]} ages"
-            )
-        if not ((self.factors > 0) & (self.factors <= _LARGEST_FACTOR)).all():
-            raise ValueError(f"factors must be positive and at most {_LARGEST_FACTOR:g}, got {shown(self.factors)}")
+        Factors(self.levels, self.ages, self.factors)  # or what is wrong with them
         if not self.nx or self.nx * (self.nx + 1) // 2 != self.mlp.outputs:
             raise ValueError(f"a network of {self.mlp.outputs} outputs makes no covariance: it takes 1, 3, 6, 10, …")
 
@@ -90,12 +72,8 @@ class Covariance:
         *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
         bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
         self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
-        tables, (measurement, process) = np.log(spread.factors) / 2, levels
-        if tables.ndim == 3:
-            share = min(process, 1.0)
-            tables = (1.0 - share) * tables[0] + share * tables[1]
         self._ages = spread.ages.tolist()
-        self._log_factors = [float(np.interp(measurement, spread.levels, column)) for column in tables.T]
+        self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 
     def __call__(self, inputs: np.ndarray, age: Any) -> np.ndarray:
         """Evaluate.
@@ -184,4 +162,4 @@ def deviations(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))
 
 
-__all__ = ["COVERAGE", "Covariance", "Spread", "deviations"]
+__all__ = ["Covariance", "Spread", "deviations"]

@@ -12,10 +12,10 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact, InverseMap, Spread
 from observers.decoder import Decoders
-from observers.spread import COVERAGE
 from training.config import Config, settings_of
 from training.evaluation.calibration import sound_trajectories
-from training.evaluation.metrics import chi_square, squared_distance
+from training.evaluation.metrics import squared_distance
+from training.evaluation.regions import LEVELS, Regions, level_of
 from training.maps.optimise import Stage, optimise
 from training.maps.samplers import TrajectorySampler
 from training.maps.spread import SpreadProblem
@@ -27,12 +27,6 @@ from training.trajectories.parameters import blind, uncertain_plant
 from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
 
-# Of measurement noise, in multiples of the largest that the map is told; dense near 0, where errors of the map end.
-LEVELS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
-AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
-FEWEST = 50  # errors from which a quantile is taken
-PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
 WIDTH, DEPTH = 32, 1
 LEARNING_RATE = 3e-3
 
@@ -129,10 +123,7 @@ class _Run:
         largest = self.artifact.process_noise_max
         self.tables = (0.0,) if largest is None else (0.0, largest)  # levels of process noise
         self.duration = self.config.duration
-        dt, settled = self.artifact.filter.dt, min(self.artifact.inverse.age_max, self.duration / 2)
-        later = [round(age * self.plant.pace / dt) for age in AGES]
-        last = max(1, round(settled / dt))
-        self.knots = np.array(sorted({*(k for k in (*FIRST, *later) if k < last), last}))  # ages in samples
+        self.regions = Regions.of(self.artifact, self.plant, self.duration)
 
     def learned(self, name: str, inverse: InverseMap) -> InverseMap:
         """The map with a network of its errors, fitted on motions as in its training."""
@@ -186,8 +177,8 @@ class _Run:
                 optimiser="soap",
             )
             optimise(stage, problem.network, problem.loss, self.progress, resume=False)
-        ones = np.ones((*(() if len(self.tables) == 1 else (2,)), len(LEVELS), len(self.knots)))
-        spread = Spread(problem.network.export(), np.array(LEVELS), self.knots * linear.dt, ones)
+        ones = np.ones((*(() if len(self.tables) == 1 else (2,)), *self.regions.tables))
+        spread = Spread(problem.network.export(), np.array(LEVELS), self.regions.knots * linear.dt, ones)
         return dataclasses.replace(inverse, spread=spread)
 
     def calibrated(self, artifact: Artifact, report: Callable[[float], object]) -> Artifact:
@@ -195,17 +186,17 @@ class _Run:
         inverse, free = artifact.inverse, artifact.free_inverse
         driven_factors, free_factors = [], []
         for table, process_noise in enumerate(self.tables):
-            x, z, noise, ages = self._runs(artifact, process_noise, generator(Stream.CALIBRATION, self.seed, 3 + table))
+            x, z, noise = self._runs(artifact, process_noise, generator(Stream.CALIBRATION, self.seed, 3 + table))
             report(2 * table + 1)
             moved = np.asarray(z[..., len(artifact.filter.A) :].any(-1))
             groups = (moved, ~moved) if free is not None else (np.ones_like(moved), None)
             distances = [
-                self._distances(artifact, x, z + level * noise, ages, level=level, process_noise=process_noise)
+                self._distances(artifact, x, z + level * noise, level=level, process_noise=process_noise)
                 for level in LEVELS
             ]
-            driven_factors.append(self._factors(distances, ages, groups[0]))
+            driven_factors.append(self.regions.factors(distances, groups[0]))
             if groups[1] is not None:
-                free_factors.append(self._factors(distances, ages, groups[1]))
+                free_factors.append(self.regions.factors(distances, groups[1]))
             report(2 * table + 2)
 
         def with_factors(inverse: InverseMap, factors: list[np.ndarray]) -> InverseMap:
@@ -221,8 +212,8 @@ class _Run:
 
     def _runs(
         self, artifact: Artifact, process_noise: float, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """States, filter states without noise, what the largest noise adds to these, and ages in samples."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """States, filter states without noise, and what the largest noise adds to these, at the regions' ages."""
         linear, system = artifact.filter, self.plant
         x, u = sound_trajectories(
             artifact,
@@ -234,58 +225,21 @@ class _Run:
             process_noise=process_noise,
             kinds=DRIVEN,
         )
-        ages = np.unique(np.concatenate(self._windows(len(u))))
-        u = u[..., : linear.nu]
+        ages, u = self.regions.ages, u[..., : linear.nu]
         z = linear.run(system.output(x), u, ages)
         largest = np.broadcast_to(artifact.inverse.measurement_noise_max, (system.ny,))
         noise = linear.run(largest * rng.standard_normal((*x.shape[:2], system.ny)), np.zeros_like(u), ages)
-        return x[ages][..., : artifact.nx], z, noise, ages
-
-    def _windows(self, steps: int) -> list[np.ndarray]:
-        """Ages in samples that stand for each of the knots: those about it, and all behind the last."""
-        between = np.sqrt(self.knots[1:] * np.maximum(self.knots[:-1], 0.5))
-        edges = [0.0, *between.tolist(), float(steps)]
-        counts = [PER_AGE] * len(between) + [4 * PER_AGE]
-        spans = (np.linspace(low, high, count) for low, high, count in zip(edges, edges[1:], counts, strict=False))
-        return [np.unique(span.round()).astype(int) for span in spans]
+        return x[ages][..., : artifact.nx], z, noise
 
     def _distances(
-        self,
-        artifact: Artifact,
-        x: np.ndarray,
-        z: np.ndarray,
-        ages: np.ndarray,
-        *,
-        level: float,
-        process_noise: float,
+        self, artifact: Artifact, x: np.ndarray, z: np.ndarray, *, level: float, process_noise: float
     ) -> np.ndarray:
         """Squared distances of the errors in units of the covariance, (ages, n)."""
-        largest = np.asarray(artifact.inverse.measurement_noise_max)
         decoders = Decoders.of(
             artifact,
             slice(artifact.nx),
-            measurement_noise=_plain(level * largest),
+            measurement_noise=level_of(artifact, level),
             process_noise=process_noise,
         )
-        parts, x_hat = decoders.estimate(z, (ages * artifact.filter.dt)[:, None])
+        parts, x_hat = decoders.estimate(z, (self.regions.ages * artifact.filter.dt)[:, None])
         return squared_distance(x - x_hat, decoders.covariance(parts))
-
-    def _factors(self, distances: list[np.ndarray], ages: np.ndarray, group: np.ndarray) -> np.ndarray:
-        """Factors (levels, knots) from the errors of a group, (ages, n)."""
-        rows = [np.isin(ages, window) for window in self._windows(int(ages[-1]))]
-        inside = chi_square(COVERAGE, self.artifact.nx)
-        factors = np.empty((len(LEVELS), len(rows)))
-        for i, distance in enumerate(distances):
-            for j, row in enumerate(rows):
-                found = distance[row][group[row]]
-                # Where hardly any motion is of the group, as driven ones at the first sample: those of the next age.
-                factors[i, j] = np.nan if len(found) < FEWEST else np.quantile(found, COVERAGE, method="weibull")
-            known = np.isfinite(factors[i])
-            if not known.any():
-                raise ValueError("hardly any motion is of the kind that error bars are for; simulate more trajectories")
-            factors[i] = np.interp(np.arange(len(rows)), np.flatnonzero(known), factors[i, known])
-        return np.clip(factors / inside, 1e-6, 1e6)
-
-
-def _plain(level: np.ndarray) -> float | tuple[float, ...]:
-    return tuple(level.tolist()) if level.ndim else float(level)

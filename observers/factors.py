@@ -1,0 +1,74 @@
+"""What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from observers.checks import shown
+
+COVERAGE = 0.9  # of the regions that the factors make true
+_LARGEST = 1e12
+
+
+@dataclass(frozen=True)
+class Factors:
+    """Factors by level of measurement noise, age, and process noise, found on runs that nothing else was fitted to.
+
+    With them, nine errors in ten lie where (x - x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square
+    distribution with nx degrees of freedom. Between levels and ages their logarithms are interpolated, and beyond the
+    last ones they stay.
+
+    Parameters
+    ----------
+    levels : ndarray, shape (k,)
+        Levels of measurement noise, rising from 0, in multiples of the largest that the map is told.
+    ages : ndarray, shape (m,)
+        Seconds since reset, rising from 0.
+    factors : ndarray, shape (k, m) or (2, k, m)
+        At each of them; two tables are without process noise and with the highest level that the map is told.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not go together, levels or ages do not rise from 0, or a factor is not positive.
+    """
+
+    levels: np.ndarray
+    ages: np.ndarray
+    factors: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("levels", "ages"):
+            values = getattr(self, name)
+            rising = values.ndim == 1 and len(values) and values[0] == 0 and (np.diff(values) > 0).all()
+            if not rising or not np.isfinite(values).all():
+                raise ValueError(f"the {name} of error bars must rise from 0, got {shown(values)}")
+        tables = (len(self.levels), len(self.ages))
+        if self.factors.shape not in (tables, (2, *tables)):
+            raise ValueError(
+                f"factors of shape {self.factors.shape} do not fit {tables[0]} levels and {tables[1]} ages"
+            )
+        if not ((self.factors > 0) & (self.factors <= _LARGEST)).all():
+            raise ValueError(f"factors must be positive and at most {_LARGEST:g}, got {shown(self.factors)}")
+
+    def log_roots(self, measurement_noise: float, process_noise: float) -> np.ndarray:
+        """Logarithms of the factors' square roots at each age.
+
+        Parameters
+        ----------
+        measurement_noise, process_noise : float
+            Levels in multiples of the highest that the map is told.
+
+        Returns
+        -------
+        ndarray, shape (m,)
+            What logarithms of standard deviations rise by.
+        """
+        tables = np.log(self.factors) / 2
+        if tables.ndim == 3:
+            share = min(process_noise, 1.0)
+            tables = (1.0 - share) * tables[0] + share * tables[1]
+        return np.array([np.interp(measurement_noise, self.levels, column) for column in tables.T])
+
+
+__all__ = ["COVERAGE", "Factors"]

@@ -1,0 +1,156 @@
+"""Where a state is a sample later, as it was learned, and how sure of that an observer may be."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from observers.checks import is_finite
+from observers.errors import ArtifactError, check_shapes
+from observers.network import MLP
+from observers.spread import Factors
+
+
+@dataclass(frozen=True)
+class Flow:
+    """The system's motion over one sample, for observers that track (:class:`observers.tracker.Tracker`).
+
+    Scaled states are s = (x - x_offset) / x_scale, and scaled inputs v = u / u_scale. A sample later
+
+        s_next = s + bias + linear @ [s, v] + gain * mlp([s, v]).
+
+    All variances below are of scaled states, or of outputs in their own units.
+
+    Parameters
+    ----------
+    mlp : MLP
+        The network, of nx + nu inputs and nx outputs.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Scaling of the states.
+    u_scale : ndarray, shape (nu,)
+        Scaling of the inputs.
+    bias, gain : ndarray, shape (nx,)
+        As above.
+    linear : ndarray, shape (nx, nx + nu)
+        As above.
+    low, high : ndarray, shape (nx,)
+        Bounds of the motion, in units of the states: an estimate beyond them is lost.
+    error : ndarray, shape (nx,)
+        Standard deviation of what the flow itself is off by, at each sample.
+    process_noise : ndarray, shape (nx,)
+        Standard deviation of what process noise of level 1 adds at each sample.
+    least_process_noise : float
+        Level of process noise that is assumed at least: a tracker that trusts its model wholly stops to listen.
+    least_measurement_noise : ndarray, shape (ny,)
+        Standard deviations of measurement noise that are assumed at least.
+    window : float
+        Seconds over which innovations are averaged.
+    factors : Factors
+        What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors.
+
+    Raises
+    ------
+    ArtifactError
+        If a shape does not fit the network, a scale is not positive, or a bound or variance makes no sense.
+    """
+
+    mlp: MLP
+    x_offset: np.ndarray
+    x_scale: np.ndarray
+    u_scale: np.ndarray
+    bias: np.ndarray
+    gain: np.ndarray
+    linear: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    error: np.ndarray
+    process_noise: np.ndarray
+    least_process_noise: float
+    least_measurement_noise: np.ndarray
+    window: float
+    factors: Factors
+
+    def __post_init__(self) -> None:
+        nx, nu = self.nx, self.nu
+        if self.u_scale.ndim != 1 or nx + nu != self.mlp.inputs:
+            raise ArtifactError(f"a flow of {nx} states and {nu} inputs needs as many of its network's inputs")
+        of_states = ("x_offset", "x_scale", "bias", "gain", "low", "high", "error", "process_noise")
+        check_shapes(self, {**dict.fromkeys(of_states, (nx,)), "linear": (nx, nx + nu)})
+        if self.least_measurement_noise.ndim != 1:
+            raise ArtifactError("least_measurement_noise must have shape (ny,)")
+        for name in ("x_scale", "u_scale", "least_measurement_noise"):
+            if not (getattr(self, name) > 0).all():
+                raise ArtifactError(f"{name} of a flow must be positive, got {getattr(self, name)}")
+        for name in ("error", "process_noise"):
+            if not (getattr(self, name) >= 0).all():
+                raise ArtifactError(f"{name} of a flow must not be negative, got {getattr(self, name)}")
+        if not (self.low < self.high).all():
+            raise ArtifactError(f"bounds of a flow must go from low to high, got {self.low} and {self.high}")
+        for name in ("least_process_noise", "window"):
+            value = getattr(self, name)
+            if not is_finite(value) or not value > 0:
+                raise ArtifactError(f"{name} of a flow must be a positive, finite number, got {value!r}")
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return self.mlp.outputs
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return len(self.u_scale)
+
+    def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Evaluate.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., nx)
+            States.
+        u : ndarray, shape (..., nu)
+            Inputs that are held over the sample.
+
+        Returns
+        -------
+        ndarray, shape (..., nx)
+            States a sample later.
+        """
+        return self.x_offset + self.x_scale * self.scaled((x - self.x_offset) / self.x_scale, u / self.u_scale)
+
+    def scaled(self, s: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """The same of scaled states (..., nx) and scaled inputs (..., nu)."""
+        inputs = np.concatenate([s, v], axis=-1)
+        return np.asarray(s + self.bias + inputs @ self.linear.T + self.gain * self.mlp(inputs))
+
+    def variances(
+        self, measurement_noise: float | tuple[float, ...], process_noise: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Variances that are assumed at levels of noise.
+
+        Parameters
+        ----------
+        measurement_noise : float or tuple of float, length ny
+            Standard deviations, of all outputs or each.
+        process_noise : float
+            Level in multiples of the system's scale per second.
+
+        Returns
+        -------
+        Q : ndarray, shape (nx,)
+            Of what is added to scaled states at each sample.
+        R : ndarray, shape (ny,)
+            Of the noise on each output.
+        """
+        level = max(process_noise, self.least_process_noise)
+        return (
+            (level * self.process_noise) ** 2 + self.error**2,
+            np.maximum(measurement_noise, self.least_measurement_noise) ** 2,
+        )
+
+    def samples(self, dt: float) -> int:
+        """The window in samples."""
+        return max(1, math.ceil(self.window / dt - 1e-9))
+
+
+__all__ = ["Flow"]

@@ -1,0 +1,222 @@
+"""Teaching an observer that is there already to track: a learned flow, and covariances that are calibrated."""
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.console import Console
+
+from kkl_gym.system import System
+from observers import Artifact, Factors, Flow, KKLObserver
+from training.config import settings_of
+from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
+from training.evaluation.metrics import squared_distance
+from training.evaluation.regions import LEVELS, Regions, level_of
+from training.maps.flow import FlowProblem, draw_increments
+from training.maps.optimise import Stage, optimise
+from training.progress import ProgressBars, progress_bars
+from training.seeds import Stream, generator
+from training.trajectories.controllers import Controller
+from training.trajectories.expression import output_expression
+from training.trajectories.signals import DRIVEN
+
+WIDTH, DEPTH, BATCH = 48, 2, 1024
+LEARNING_RATE = 3e-3
+LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
+LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
+JUDGED = 20_000  # increments of which the flow's error is taken
+OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
+
+
+def learn_tracking(
+    artifact: Artifact,
+    system: System,
+    *,
+    steps: int = 40_000,
+    trajectories: int = 500,
+    seed: int = 0,
+    policy: Controller | None = None,
+    device: torch.device | None = None,
+    console: Console | ProgressBars | None = None,
+) -> Artifact:
+    """Teach an observer to track: to carry its estimate on by the system's motion, which is learned here.
+
+    T_inv and its error bars stay as they are. A small network learns how states change over a sample, on simulated
+    ones about the system's motions. An unscented Kalman filter on that flow is what :class:`observers.KKLObserver`
+    then runs beside z. Its covariances are calibrated on further motions, so that regions of 90 % hold 90 % of the
+    errors, and so are the limits of the monitor, if there are any.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, with error bars. A flow that it has is replaced.
+    system : System
+        What it was made for.
+    steps : int
+        Batches for the network.
+    trajectories : int
+        Number of motions to calibrate on.
+    seed : int
+        Of everything random; no seed gives the motions of a training, or of an evaluation.
+    policy : callable, optional
+        Acts on the system, for maps that were trained under one.
+    device : torch.device, optional
+        Where the network is trained; by default on the CPU.
+    console : Console or ProgressBars, optional
+        Where progress is shown; by default nowhere.
+
+    Returns
+    -------
+    Artifact
+        The same with a flow.
+
+    Raises
+    ------
+    ValueError
+        If a number makes no sense, the observer has no error bars or serves a range of plants, its output cannot be
+        written down, or most motions leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if it
+        was made for another system.
+    """
+    artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
+    artifact.require_spread()
+    if artifact.parameter_ranges:
+        raise ValueError(
+            f"an observer for a range of {', '.join(artifact.parameter_ranges)} cannot track: a flow is of one plant"
+        )
+    if steps < 1 or trajectories < 50 or seed < 0:
+        raise ValueError(
+            f"need a step at least, 50 trajectories and a seed that is not negative, got {steps}, {trajectories}, "
+            f"{seed}"
+        )
+    artifact = dataclasses.replace(artifact, flow=None)
+    if not artifact.knows_output:
+        artifact = dataclasses.replace(artifact, h=output_expression(system))
+    duration, largest = settings_of(artifact.training).duration, artifact.process_noise_max
+    regions = Regions.of(artifact, system, duration)
+    levels = (0.0,) if largest is None else (0.0, largest)
+    torch.manual_seed(seed)
+    with progress_bars(console) as progress:
+        flow = _learned(
+            artifact, system, duration=duration, steps=steps, seed=seed, policy=policy, progress=progress, device=device
+        )
+        ones = np.ones((*(() if len(levels) == 1 else (2,)), *regions.tables))
+        flow = dataclasses.replace(
+            flow, factors=Factors(np.array(LEVELS), regions.knots * artifact.filter.dt, ones)
+        )
+        tracking = dataclasses.replace(artifact, flow=flow)
+        tables = []
+        with progress.phase("calibrating the error bars", len(levels) * (1 + len(LEVELS))) as report:
+            for table, level in enumerate(levels):
+                runs = sound_trajectories(
+                    artifact,
+                    system,
+                    n=trajectories,
+                    duration=duration,
+                    rng=generator(Stream.CALIBRATION, seed, 6 + table),
+                    policy=policy,
+                    process_noise=level,
+                    kinds=DRIVEN,
+                )
+                begun = table * (1 + len(LEVELS)) + 1
+                report(begun)
+                rng = generator(Stream.CALIBRATION, seed, 8 + table)
+                told = partial(_tell, report, begun)
+                tables.append(_factors(tracking, system, runs, level, regions=regions, rng=rng, report=told))
+        factors = dataclasses.replace(flow.factors, factors=np.array(tables) if len(tables) > 1 else tables[0])
+        tracking = dataclasses.replace(tracking, flow=dataclasses.replace(flow, factors=factors))
+        if tracking.limits is not None:
+            with progress.phase("finding the monitor's limits", PARTS) as report:
+                tracking = calibrate(tracking, system, policy=policy, report=report)
+    return tracking
+
+
+def _tell(report: Callable[[float], object], begun: int, done: int) -> None:
+    """Tell how much of the work is done: some, and what has been since."""
+    report(begun + done)
+
+
+def _learned(
+    artifact: Artifact,
+    system: System,
+    *,
+    duration: float,
+    steps: int,
+    seed: int,
+    policy: Controller | None,
+    progress: ProgressBars,
+    device: torch.device | None,
+) -> Flow:
+    """The flow, with factors that are none yet."""
+    dt, nu, device = artifact.filter.dt, artifact.nu, device or torch.device("cpu")
+
+    rng = generator(Stream.CALIBRATION, seed, 5)
+    with progress.phase("simulating motions"):
+        drawn = draw_increments(system, dt, duration=duration, nu=nu, rng=rng, policy=policy)
+    judged, increments = drawn.part(slice(JUDGED)), drawn.part(slice(JUDGED, None))
+    u_scale = np.array(system.u_max[:nu], dtype=float)
+    problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Stage(
+            name="flow",
+            steps=steps,
+            learning_rate=LEARNING_RATE,
+            folder=Path(folder),
+            fingerprint="",
+            seed=seed,
+            optimiser="soap",
+        )
+        optimise(stage, problem.network, problem.loss, progress, resume=False)
+    low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
+    usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
+    flow = Flow(
+        problem.network.export(),
+        x_offset=increments.x_offset,
+        x_scale=increments.x_scale,
+        u_scale=u_scale,
+        bias=problem.bias,
+        gain=problem.gain,
+        linear=problem.linear,
+        low=low,
+        high=high,
+        error=np.zeros(system.nx),
+        process_noise=np.array(system.scale) / increments.x_scale * dt / np.sqrt(3),
+        least_process_noise=LEAST_PROCESS_NOISE / system.pace,
+        least_measurement_noise=np.maximum(LEAST_MEASUREMENT_NOISE * usual, 1e-9),
+        window=WINDOW * system.pace,
+        factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
+    )
+    apart = (flow(judged.x, judged.u) - judged.x - judged.change) / flow.x_scale
+    return dataclasses.replace(flow, error=OF_MEDIAN * np.median(np.abs(apart), axis=0))  # not of the farthest states
+
+
+def _factors(
+    artifact: Artifact,
+    system: System,
+    runs: tuple[np.ndarray, np.ndarray],
+    process_noise: float,
+    *,
+    regions: Regions,
+    rng: np.random.Generator,
+    report: Callable[[int], object],
+) -> np.ndarray:
+    """Factors (levels, knots) from the errors of an observer that tracks, along runs of a level of process noise."""
+    x, u = runs
+    clean, distances = system.output(x), list[np.ndarray]()
+    for done, share in enumerate(LEVELS, 1):
+        level = level_of(artifact, share)
+        y = clean + np.asarray(level) * rng.standard_normal(clean.shape)
+        observer = KKLObserver(artifact, level, process_noise=process_noise)
+        observer.reset(y[0])
+        found = []
+        for k in range(regions.ages[-1] + 1):
+            if k:
+                observer.advance(y[k], u[k - 1] if artifact.nu else None)
+            if k in regions.ages:
+                found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
+        distances.append(np.array(found))
+        report(done)
+    return regions.factors(distances, np.ones(distances[0].shape, dtype=bool))

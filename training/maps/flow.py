@@ -1,0 +1,176 @@
+"""The system's motion over one sample as a network: its data, and what its training minimises."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import nn
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.maps.networks import Network, tensor
+from training.trajectories.controllers import Controller
+from training.trajectories.record import Motions, trajectories
+from training.trajectories.signals import DRIVEN
+
+REACH = 1.5  # of X, from which motions start
+RUNS = 300  # of motions without input, and as many under inputs
+STATES = 200_000  # along them, at most
+PAIRS = 400_000
+# States are moved off the motions, as estimates are off: by this many standard deviations of the states, log-uniform,
+# most of them near and some far. That a tracker does not leave the motions it is the near ones that decide.
+NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
+STILL = 0.5  # share of the pairs without input, where there are inputs
+LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
+
+
+@dataclass(frozen=True)
+class Increments:
+    """States, inputs, and how states change over a sample.
+
+    Parameters
+    ----------
+    x, u, change : ndarray, shapes (n, nx), (n, nu) and (n, nx)
+        In their own units.
+    x_offset, x_scale : ndarray, shape (nx,)
+        Mean and standard deviation of the states along the motions that these lie about.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    change: np.ndarray
+    x_offset: np.ndarray
+    x_scale: np.ndarray
+
+    def part(self, rows: slice) -> "Increments":
+        """Some of them."""
+        return replace(self, x=self.x[rows], u=self.u[rows], change=self.change[rows])
+
+
+def draw_increments(
+    system: System,
+    dt: float,
+    *,
+    duration: float,
+    nu: int,
+    rng: np.random.Generator,
+    runs: int = RUNS,
+    policy: Controller | None = None,
+) -> Increments:
+    """Simulate motions, and from states about them one sample further.
+
+    Parameters
+    ----------
+    system : System
+        What moves.
+    dt : float
+        Sampling interval in seconds.
+    duration : float
+        Length of the motions in seconds.
+    nu : int
+        Number of inputs that the observer knows of: the system's, or 0, which then do not act.
+    rng : numpy.random.Generator
+        Of everything random.
+    runs : int
+        Number of motions without input, and as many under inputs.
+    policy : callable, optional
+        Acts on the motions in place of random inputs.
+
+    Returns
+    -------
+    Increments
+        Up to ``PAIRS`` of them; those that leave the system's bounds are left out.
+    """
+    steps = round(duration / dt)
+    kinds: list[Motions] = [] if policy else [Motions(box_factor=REACH)]
+    if nu:
+        kinds.append(Motions(kinds=DRIVEN, box_factor=REACH, policy=policy))
+    every = max(1, steps * runs * len(kinds) // STATES)
+    along = np.concatenate(
+        [
+            x[::every].reshape(-1, system.nx)
+            for motions in kinds
+            for x, _, _ in trajectories(system, n=runs, steps=steps, dt=dt, rng=rng, motions=motions)
+        ]
+    )
+    offset, scale = along.mean(0), along.std(0)
+    scale = np.where(scale > 0, scale, 1.0)
+    low, high = (np.array(bound) for bound in zip(*system.bounds, strict=True))
+    far = rng.random((PAIRS, 1)) < FAR_SHARE
+    size = np.where(far, _log_uniform(rng, FAR), _log_uniform(rng, NEAR))
+    x = along[rng.integers(len(along), size=PAIRS)] + size * scale * rng.standard_normal((PAIRS, system.nx))
+    x = np.clip(x, low, high)
+    u = np.zeros((PAIRS, system.nu))
+    if nu:
+        u = np.where(rng.random((PAIRS, 1)) < STILL, 0.0, rng.uniform(-1, 1, (PAIRS, nu)) * system.u_max)
+    later = simulate(system, x, 1, dt, u=u[None] if nu else None)[-1]
+    inside = np.isfinite(later).all(-1)
+    return Increments(x[inside], u[inside, :nu], (later - x)[inside], offset, scale)
+
+
+def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndarray:
+    return np.asarray(np.exp(rng.uniform(*np.log(ends), (PAIRS, 1))))
+
+
+class FlowProblem(nn.Module):
+    """The network of :class:`observers.Flow`, on what a linear fit leaves of the increments.
+
+    Parameters
+    ----------
+    increments : Increments
+        What it is fitted to.
+    u_scale : ndarray, shape (nu,)
+        Of the inputs.
+    width, depth : int
+        Neurons in each hidden layer, and number of these.
+    batch : int
+        Samples in a batch.
+    device : torch.device
+        Where the network is trained.
+
+    Attributes
+    ----------
+    bias, linear : ndarray, shapes (nx,) and (nx, nx + nu)
+        The linear fit, of scaled increments.
+    gain : ndarray, shape (nx,)
+        Scale of what it leaves.
+    """
+
+    def __init__(
+        self, increments: Increments, u_scale: np.ndarray, *, width: int, depth: int, batch: int, device: torch.device
+    ) -> None:
+        super().__init__()
+        inputs = scaled_inputs(increments, u_scale)
+        change = increments.change / increments.x_scale
+        found = np.linalg.lstsq(np.column_stack([inputs, np.ones(len(inputs))]), change, rcond=None)[0]
+        self.linear, self.bias = found[:-1].T, found[-1]
+        left = change - inputs @ self.linear.T - self.bias
+        self.gain = left.std(0)
+        left = left / np.where(self.gain > 0, self.gain, 1.0)
+        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=depth, activation="tanh").to(device)
+        self._batch, self._inputs, self._left = batch, tensor(inputs, device), tensor(left, device)
+        self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
+
+    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        """Mean square error of a batch, relative to what the linear fit leaves of each sample.
+
+        Parameters
+        ----------
+        generator : torch.Generator
+            Of the batch.
+
+        Returns
+        -------
+        dict of str to Tensor
+            "loss", and "error", its root.
+        """
+        rows = torch.randint(len(self._inputs), (self._batch,), generator=generator, device=self._inputs.device)
+        square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
+        loss = (self._weight[rows] * square).mean()
+        return {"loss": loss, "error": loss.detach().sqrt()}
+
+
+def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
+    """What a flow's network is given, (n, nx + nu)."""
+    s = (increments.x - increments.x_offset) / increments.x_scale
+    return np.column_stack([s, increments.u / u_scale])
