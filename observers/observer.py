@@ -89,6 +89,7 @@ class KKLObserver:
         self._z: np.ndarray | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._parts: Parts | None  # which networks made the last estimate, and from what
+        self._asked = False  # for the last estimate's covariance: then the next one's is made with the estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -412,9 +413,10 @@ class KKLObserver:
         z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        parts, x_hat = self._states.estimate(z, age)
-        if rows is None:
-            self._parts = parts
+        if rows is not None:
+            return self._states(z, age)
+        self._parts, x_hat = self._states.estimate(z, age, self._asked)
+        self._asked = False
         return x_hat
 
     @property
@@ -455,7 +457,7 @@ class KKLObserver:
     @property
     def std(self) -> np.ndarray:
         """Standard deviation of each state's error, shape (..., nx): the roots of :attr:`covariance`'s diagonal."""
-        return deviations(self.covariance)
+        return deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance of what :meth:`decode` returns; it is quicker right after that, of all rows.
@@ -478,6 +480,7 @@ class KKLObserver:
             If ``rows`` does not fit the batch, or the artifact holds no error bars.
         """
         self.artifact.require_spread()
+        self._asked = True
         if rows is None and self._parts is not None:
             return self._states.covariance(self._parts)
         return self._states.covariances(*self._moment(rows))
