@@ -235,7 +235,7 @@ class CompiledDecoder:
             The estimates.
         """
         network, n, width = self._network, len(z), len(self._sums)
-        enter, finish = _batches(network.activation)
+        enter, finish = batch_kernels(network.activation)
         ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
         x_hat = np.empty((n, network.outputs))
         pieces = network.pieces(n)
@@ -359,7 +359,7 @@ def _decode(activation: str) -> Callable[..., None]:
 
 
 @functools.cache
-def _batches(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
+def batch_kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
     """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
     import numba
 

@@ -1,4 +1,4 @@
-"""Error bars of single samples as machine code, where Numba is installed: the network, the factor and the product."""
+"""Error bars as machine code, where Numba is installed: all of it for a single sample, the first layer for a batch."""
 
 import functools
 import math
@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from observers.compiled import FAST, Layers, active_kernel, entering_kernel, first_layer
+from observers.compiled import FAST, Layers, active_kernel, batch_kernels, entering_kernel, first_layer
 
 
 class CompiledCovariance:
-    """From the filter's state to the covariance of the estimate's error, by one call.
+    """From the filter's state to the covariance of the estimate's error, by one call for a single sample.
 
     Parameters
     ----------
@@ -54,8 +54,9 @@ class CompiledCovariance:
         second = np.ascontiguousarray(np.vstack(layers[1]).T, dtype=float)  # a row for each output, the bias last
         table = np.array([ages, log_factors], dtype=float)
         self._shape = (nx, nx)
-        unit, end = age or (1.0, 0.0)
-        self._one = functools.partial(_covary(activation), first, second, table, float(unit), float(end), largest_log)
+        self._first, self._activation, self._age = first, activation, age or (1.0, 0.0)
+        unit, end = (float(each) for each in self._age)
+        self._one = functools.partial(_covary(activation), first, second, table, unit, end, largest_log)
 
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
         """Evaluate for one sample.
@@ -75,6 +76,26 @@ class CompiledCovariance:
         covariance = np.empty(self._shape)
         self._one(z, age, covariance)
         return covariance
+
+    def hidden(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
+        """Evaluate the first layer for many samples.
+
+        Parameters
+        ----------
+        z : ndarray, shape (n, size)
+            The filter's states.
+        age : float or ndarray, shape (n,)
+            Seconds since reset.
+
+        Returns
+        -------
+        ndarray of float32, shape (n, width)
+            What the second layer is given.
+        """
+        sums, (unit, end) = z @ self._first[2:], self._age
+        h = np.empty(sums.shape, np.float32)
+        batch_kernels(self._activation)[0](sums, self._first, np.full(len(z), np.log1p(np.minimum(age, end) / unit)), h)
+        return h
 
 
 @functools.cache

@@ -1,6 +1,5 @@
 """Where a state is a sample later, as it was learned, and how sure of that an observer may be."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
 from observers.network import MLP
-from observers.spread import Factors
+from observers.factors import Factors
 
 
 @dataclass(frozen=True)
@@ -147,10 +146,6 @@ class Flow:
             (level * self.process_noise) ** 2 + self.error**2,
             np.maximum(measurement_noise, self.least_measurement_noise) ** 2,
         )
-
-    def samples(self, dt: float) -> int:
-        """The window in samples."""
-        return max(1, math.ceil(self.window / dt - 1e-9))
 
 
 __all__ = ["Flow"]

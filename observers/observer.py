@@ -95,6 +95,7 @@ class KKLObserver:
         self._tracker: Tracker | None = None
         self._x_hat: np.ndarray | None  # where the monitor has already made the network say it
         self._parts: Parts | None  # which networks made the last estimate, and from what
+        self._asked = False  # for the last estimate's covariance: then the next one's is made with the estimate
         self._process_noise = self._level(process_noise)
         self.measurement_noise = artifact.measurement_noise if measurement_noise is None else measurement_noise
         self._age: Any = 0  # samples since the filter was switched on, an array where rows have restarted
@@ -152,7 +153,7 @@ class KKLObserver:
         if self.artifact.flow is None:
             return None
         level, process_noise = self._measurement_noise, self._process_noise
-        return Tracker(self.artifact, measurement_noise=level, process_noise=process_noise)
+        return Tracker(self.artifact, self._states, measurement_noise=level, process_noise=process_noise)
 
     def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
@@ -203,7 +204,7 @@ class KKLObserver:
             if other._tracker is not None and self._tracker is not None:
                 other._tracker.go_on(self._tracker)
             elif other._tracker is not None:
-                other._begin(None)
+                other._tracker.reset(self._z, self._age)
             if other._monitor is not None:
                 other._monitor.reset(self._z.shape[:-1])
         vars(self).update(vars(other))
@@ -246,7 +247,8 @@ class KKLObserver:
             self._tell()
             self._warm_up()
         self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
-        self._begin(x0)
+        if self._tracker is not None:
+            self._tracker.reset(z0, age, x0)
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -319,10 +321,8 @@ class KKLObserver:
         y0 = real_array("y", y0)
         self._check_output(y0, (int(rows.sum()),), first=True)
         z[rows], age = self._start(y0, x0)
-        if self._tracker is not None and rows.any():
-            begun = self._twin()
-            begun.reset(y0, x0)
-            self._tracker.take(rows.ravel(), begun._tracker)
+        if self._tracker is not None:
+            self._tracker.restart(rows, z[rows], age, x0)
         self._z, self._y = z, self._y.copy()
         self._y[rows] = y0
         self._age = np.where(rows, age, self._age)
@@ -392,10 +392,10 @@ class KKLObserver:
             gaps = self._check_output(y, batch)
         tracker = self._tracker
         if tracker is not None:
-            ahead = tracker.ahead(u.reshape(-1, self.artifact.nu))
+            ahead = tracker.ahead(u)
             samples = y if gaps is None else np.where(gaps, np.nan, y)
         if gaps is not None and tracker is not None:
-            h = tracker.expected(ahead).reshape(y.shape)
+            h = tracker.expected(ahead)
             y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
         elif gaps is not None:
             y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
@@ -415,9 +415,8 @@ class KKLObserver:
             self._age = self._age + rows
         self._x_hat, self._parts = None, None
         if tracker is not None:
-            moved = None if rows is None else rows.ravel()
-            tracker.correct(ahead, samples.reshape(-1, self.artifact.ny), moved)
-            self._supervise(moved)
+            tracker.correct(ahead, samples, rows)
+            tracker.supervise(self._z, self._age, rows)
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]
@@ -447,13 +446,14 @@ class KKLObserver:
         """
         z, age = self._moment(rows)
         if self._tracker is not None:
-            x_hat = self._tracker.estimate.reshape(*self._z.shape[:-1], -1)
-            return x_hat if rows is None else x_hat[rows]
+            x_hat = self._tracker.estimate
+            return x_hat if rows is None else x_hat[np.asarray(rows)]
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
-        parts, x_hat = self._states.estimate(z, age)
-        if rows is None:
-            self._parts = parts
+        if rows is not None:
+            return self._states(z, age)
+        self._parts, x_hat = self._states.estimate(z, age, self._asked)
+        self._asked = False
         return x_hat
 
     @property
@@ -494,7 +494,7 @@ class KKLObserver:
     @property
     def std(self) -> np.ndarray:
         """Standard deviation of each state's error, shape (..., nx): the roots of :attr:`covariance`'s diagonal."""
-        return deviations(self.covariance)
+        return deviations(self.decode_covariance())
 
     def decode_covariance(self, rows: np.ndarray | None = None) -> np.ndarray:
         """Return the covariance of what :meth:`decode` returns; it is quicker right after that, of all rows.
@@ -518,51 +518,13 @@ class KKLObserver:
         """
         self.artifact.require_spread()
         if self._tracker is not None:
-            z, _ = self._moment(None)
-            age = np.broadcast_to(self._age, z.shape[:-1]).ravel()
-            covariance = self._tracker.covariance(age).reshape(*z.shape[:-1], self.artifact.nx, self.artifact.nx)
-            return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
+            self._moment(rows)  # or what is wrong
+            covariance = self._tracker.covariance(self._age)
+            return covariance if rows is None else covariance[np.asarray(rows)]
+        self._asked = True
         if rows is None and self._parts is not None:
             return self._states.covariance(self._parts)
         return self._states.covariances(*self._moment(rows))
-
-    def _begin(self, x0: np.ndarray | None) -> None:
-        """Begin tracking, where the observer does, from what is known or T_inv says."""
-        if self._tracker is None:
-            return
-        if x0 is not None:
-            self._tracker.know(np.reshape(np.asarray(x0, dtype=float), (-1, self.artifact.nx)))
-            return
-        self._tracker.begin(*self._said(np.ones(math.prod(self._z.shape[:-1]), dtype=bool)))
-
-    def _said(self, rows: np.ndarray, oldest: float = math.inf) -> tuple[np.ndarray, np.ndarray]:
-        """What T_inv says in some rows of the flattened batch: estimates, and covariances as if at most so old."""
-        assert self._z is not None
-        dt, batch = self.artifact.filter.dt, self._z.shape[:-1]
-        z, age = self._z.reshape(-1, self._z.shape[-1])[rows], np.broadcast_to(self._age, batch).ravel()[rows]
-        parts, x_hat = self._states.estimate(z, age * dt)
-        if (age > oldest).any():
-            return x_hat, self._states.covariances(z, np.minimum(age, oldest) * dt)
-        return x_hat, self._states.covariance(parts)
-
-    def _supervise(self, moved: np.ndarray | None) -> None:
-        """Let T_inv say where the tracked estimate is lost, and where it may be surer: as long as the filter settles.
-
-        Where the estimate is lost, what came before may have misled the filter too. What T_inv says is therefore taken
-        for no surer than so soon after a reset as the tracker's window is long.
-        """
-        tracker = self._tracker
-        assert tracker is not None and self._z is not None
-        lost = tracker.lost
-        young = np.broadcast_to(self._age, self._z.shape[:-1]).ravel() * self.artifact.filter.dt < (
-            self.artifact.inverse.age_max
-        )
-        if moved is not None:
-            lost, young = lost & moved, young & moved
-        if lost.any():
-            tracker.replace(lost, *self._said(lost, oldest=tracker.window))
-        if (young & ~lost).any():
-            tracker.replace(young & ~lost, *self._said(young & ~lost))
 
     def _twin(self) -> "KKLObserver":
         """Another of the same artifact, levels of noise and compilation, without a monitor."""

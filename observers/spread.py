@@ -1,5 +1,6 @@
 """How far an estimate may be off: the covariance of its error, as it was learned."""
 
+import copy
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
@@ -91,11 +92,8 @@ class Covariance:
             In units of the states.
         """
         nx, out = self._nx, self._mlp(inputs)
-        if out.ndim == 1:  # a single sample: every call of numpy would be felt
-            values, factor = out.tolist(), self._log_factor(float(age))
-            scales = [math.exp(min(value, _LARGEST_LOG) + factor) for value in values[:nx]]
-            entries = _product(scales, values[nx:])
-            return np.array(entries).reshape(nx, nx)
+        if out.ndim == 1:  # a single sample: every call would be felt
+            return np.array(_entries(out.tolist(), nx, self._log_factor(float(age)))).reshape(nx, nx)
         values = np.moveaxis(out, -1, 0).astype(float, order="C")
         np.minimum(values[:nx], _LARGEST_LOG, out=values[:nx])
         values[:nx] += np.interp(age, self._ages, self._log_factors)
@@ -127,6 +125,12 @@ class Covariance:
         except ImportError:
             return None
 
+    def behind(self) -> "Covariance":
+        """The same from what comes out of the first layer."""
+        other = copy.copy(self)
+        other._mlp = self._mlp.behind()
+        return other
+
     def _log_factor(self, age: float) -> float:
         """As np.interp, without its overhead."""
         ages, values = self._ages, self._log_factors
@@ -135,6 +139,25 @@ class Covariance:
             return values[-1]
         share = (age - ages[i - 1]) / (ages[i] - ages[i - 1])
         return values[i - 1] + share * (values[i] - values[i - 1])
+
+
+def _entries(values: list[float], nx: int, factor: float) -> list[float]:
+    """The covariance of one sample, row by row; written out for two or three states: loops take thrice as long."""
+    exp, end = math.exp, _LARGEST_LOG
+    if nx == 2:
+        a, b, d = values
+        a, b = exp((end if a > end else a) + factor), exp((end if b > end else b) + factor)
+        d = b * d
+        side = a * d
+        return [a * a, side, side, d * d + b * b]
+    if nx == 3:
+        a, b, c, d, e, f = values
+        a, b = exp((end if a > end else a) + factor), exp((end if b > end else b) + factor)
+        c = exp((end if c > end else c) + factor)
+        d, e, f = b * d, c * e, c * f
+        side, corner, last = a * d, a * e, d * e + b * f
+        return [a * a, side, corner, side, d * d + b * b, last, corner, last, e * e + f * f + c * c]
+    return _product([exp(min(value, end) + factor) for value in values[:nx]], values[nx:])
 
 
 def _product(scales: Any, lower: Any) -> list[Any]:
@@ -159,7 +182,7 @@ def _product(scales: Any, lower: Any) -> list[Any]:
 
 def deviations(covariance: np.ndarray) -> np.ndarray:
     """Standard deviations (..., nx) of what has covariances (..., nx, nx)."""
-    return np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))
+    return np.sqrt(covariance.diagonal(0, -2, -1))
 
 
 __all__ = ["Covariance", "Spread", "deviations"]

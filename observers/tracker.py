@@ -1,10 +1,12 @@
 """An estimate that goes on with the learned motion of the system, and is corrected by each sample."""
 
+import copy
 import math
 
 import numpy as np
 
 from observers.artifact import Artifact
+from observers.decoder import Decoders
 from observers.unscented import Gaussian, corrected, factor, predicted
 
 # A filter is lost where innovations are as large as that by chance once in 1e9: the normal distribution's quantile.
@@ -15,14 +17,18 @@ KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scale
 class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
-    It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for, which says where
-    to begin, and again where the filter is lost. It is lost where the mean square of its innovations, over the flow's
-    window, is beyond chance for the levels of noise told, or its covariance is none any more.
+    It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
+    to begin. It says it again where it is surer, by the determinants of both covariances, for as long as the filter
+    z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's window,
+    is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then have
+    misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
 
     Parameters
     ----------
     artifact : Artifact
-        With a flow and the output h(x).
+        With a flow, error bars and the output h(x).
+    decoders : Decoders
+        T_inv at the levels of noise.
     measurement_noise : float or tuple of float, length ny
         Standard deviations of the noise on the samples, of all outputs or each.
     process_noise : float
@@ -30,106 +36,131 @@ class Tracker:
     """
 
     def __init__(
-        self, artifact: Artifact, *, measurement_noise: float | tuple[float, ...], process_noise: float
+        self,
+        artifact: Artifact,
+        decoders: Decoders,
+        *,
+        measurement_noise: float | tuple[float, ...],
+        process_noise: float,
     ) -> None:
-        flow, dt = artifact.require_flow(), artifact.filter.dt
-        self._flow, self._artifact = flow, artifact
+        flow, self._dt = artifact.require_flow(), artifact.filter.dt
+        self._flow, self._artifact, self._decoders = flow, artifact, decoders
         q, r = flow.variances(measurement_noise, process_noise)
         self._Q, self._R = np.diag(q), np.diag(r)
         self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
         self._units = flow.x_scale[:, None] * flow.x_scale
-        self.window = flow.samples(dt)
-        self._share = -math.expm1(-1 / self.window)
+        self._settled = artifact.inverse.age_max / self._dt
+        self._window = max(1, round(flow.window / self._dt))
+        self._share = -math.expm1(-1 / self._window)
         self._limit = _largest_mean_square(len(r) * (2 - self._share) / self._share)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
-        self._ages, self._log_roots = flow.factors.ages / dt, flow.factors.log_roots(*shares)
-        self._x = np.zeros((0, flow.nx))  # scaled states
-        self._P = np.zeros((0, flow.nx, flow.nx))
-        self._mean_square = np.zeros(0)
+        self._ages, self._log_roots = flow.factors.ages / self._dt, flow.factors.log_roots(*shares)
+        self._batch: tuple[int, ...]
+        self._x: np.ndarray  # scaled states (n, nx) of the flattened batch
+        self._P: np.ndarray
+        self._mean_square: np.ndarray
 
     @property
     def estimate(self) -> np.ndarray:
-        """The estimates, (n, nx)."""
-        return self._flow.x_offset + self._flow.x_scale * self._x
+        """The estimates, (..., nx)."""
+        x = self._flow.x_offset + self._flow.x_scale * self._x
+        return x.reshape(*self._batch, self._flow.nx)
 
     def covariance(self, age: np.ndarray | float) -> np.ndarray:
-        """Covariances of the estimates' errors, (n, nx, nx), at ages in samples."""
+        """Covariances of the estimates' errors, (..., nx, nx), at ages in samples."""
         factors = np.exp(2 * np.interp(age, self._ages, self._log_roots))
-        return self._P * self._units * np.reshape(factors, (-1, 1, 1))
+        P = self._P * self._units
+        return P.reshape(*self._batch, *P.shape[1:]) * np.asarray(factors)[..., None, None]
 
-    @property
-    def lost(self) -> np.ndarray:
-        """Which rows T_inv is to say, (n,)."""
-        return ~(self._mean_square <= self._limit)  # true of NaN too
+    def reset(self, z: np.ndarray, age: np.ndarray | float, x0: np.ndarray | None = None) -> None:
+        """Begin with what T_inv says of z, (..., size), at ages in samples, or with states that are known."""
+        self._batch = z.shape[:-1]
+        z = z.reshape(-1, z.shape[-1])
+        if x0 is None:
+            self._begin(*self._said(z, np.broadcast_to(age, self._batch).ravel()))
+        else:
+            x = np.reshape(x0, (-1, self._flow.nx)).astype(float)
+            self._begin(x, np.broadcast_to(np.diag((KNOWN * self._flow.x_scale) ** 2), (*x.shape, x.shape[-1])))
 
-    def begin(self, x: np.ndarray, P: np.ndarray) -> None:
-        """Forget all rows, and begin with estimates (n, nx) of covariances (n, nx, nx)."""
-        self._x, self._P = self._scaled(x, P)
-        self._mean_square = np.ones(len(x))
-
-    def know(self, x: np.ndarray) -> None:
-        """Begin with states (n, nx) that are known."""
-        self.begin(x, np.broadcast_to(np.diag((KNOWN * self._flow.x_scale) ** 2), (*x.shape, x.shape[-1])))
-
-    def take(self, rows: np.ndarray, other: "Tracker") -> None:
-        """Take the rows (n,) of another tracker, which holds no others."""
+    def restart(self, rows: np.ndarray, z: np.ndarray, age: float, x0: np.ndarray | None = None) -> None:
+        """Begin anew in some rows (...,), with what T_inv says of their z, (k, size), or with their known states."""
+        if not rows.any():
+            return
+        begun, where = copy.copy(self), rows.ravel()
+        begun.reset(z, age, x0)
         self._own()
-        self._x[rows], self._P[rows], self._mean_square[rows] = other._x, other._P, other._mean_square
+        self._x[where], self._P[where], self._mean_square[where] = begun._x, begun._P, begun._mean_square
 
     def go_on(self, other: "Tracker") -> None:
         """Go on where another stands, which may be told other levels of noise or have another flow."""
-        self.begin(other.estimate, other._P * other._units)
+        self._batch = other._batch
+        self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units)
         self._mean_square = other._mean_square.copy()
 
-    def replace(self, rows: np.ndarray, x: np.ndarray, P: np.ndarray) -> None:
-        """Take estimates (k, nx) of covariances (k, nx, nx) in some rows (n,), where they are surer or the row is lost.
-
-        What is surer has the smaller determinant.
-        """
-        x, P = self._scaled(x, P)
-        lost, mine = self.lost[rows], self._P[rows]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            taken = lost | (_log_volume(P) < _log_volume(mine))
-        if not taken.any():
-            return
-        where = np.flatnonzero(rows)[taken]
-        self._own()
-        self._x[where], self._P[where] = x[taken], P[taken]
-        self._mean_square[np.flatnonzero(rows)[lost]] = 1.0
-
     def ahead(self, u: np.ndarray) -> Gaussian:
-        """Scaled estimates and covariances a sample later, under inputs (n, nu), before that sample is known."""
+        """Scaled estimates and covariances a sample later, under inputs (..., nu), before that sample is known."""
         flow = self._flow
-        v = np.broadcast_to(u / flow.u_scale, (2 * flow.nx + 1, len(u), flow.nu)) if flow.nu else None
+        points = 2 * flow.nx + 1
+        v = np.tile(u.reshape(len(self._x), flow.nu) / flow.u_scale, (points, 1))
 
-        def move(points: np.ndarray) -> np.ndarray:
-            inside = np.clip(points, self._low, self._high)
-            rows = inside.reshape(-1, flow.nx)
-            held = np.zeros((len(rows), 0)) if v is None else v.reshape(-1, flow.nu)
-            return flow.scaled(rows, held).reshape(points.shape)
+        def move(s: np.ndarray) -> np.ndarray:
+            return flow.scaled(np.clip(s, self._low, self._high).reshape(-1, flow.nx), v).reshape(s.shape)
 
         with np.errstate(over="ignore", invalid="ignore"):
             return predicted(self._x, self._P, move=move, Q=self._Q)
 
     def expected(self, ahead: Gaussian) -> np.ndarray:
-        """The outputs (n, ny) that belong to it."""
-        return self._output(ahead[0])
+        """The outputs (..., ny) that belong to it."""
+        return self._output(ahead[0]).reshape(*self._batch, -1)
 
     def correct(self, ahead: Gaussian, y: np.ndarray, rows: np.ndarray | None = None) -> None:
-        """Take in samples (n, ny), NaN where they are missing, in all rows or some (n,)."""
+        """Take in samples (..., ny), NaN where they are missing, in all rows or some (...,)."""
+        y = y.reshape(len(self._x), -1)
         with np.errstate(over="ignore", invalid="ignore"):
             x, P, nis = corrected(*ahead, y, output=self._output, R=self._R)
-        seen = ~np.isnan(y).all(-1)
-        mean_square = np.where(seen, self._mean_square + self._share * (nis - self._mean_square), self._mean_square)
+        mean_square = self._mean_square + self._share * ~np.isnan(y).all(-1) * (nis - self._mean_square)
         broken = ~(np.isfinite(P).all((1, 2)) & np.isfinite(x).all(-1))
         if broken.any():
             mean_square[broken] = np.inf
             x[broken], P[broken] = self._x[broken], self._P[broken]
         x = np.clip(x, self._low, self._high)
         if rows is not None:
+            rows = rows.ravel()
             x, P = np.where(rows[:, None], x, self._x), np.where(rows[:, None, None], P, self._P)
             mean_square = np.where(rows, mean_square, self._mean_square)
         self._x, self._P, self._mean_square = x, P, mean_square
+
+    def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
+        """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
+        age = np.broadcast_to(age, self._batch).ravel()
+        lost, asked = ~(self._mean_square <= self._limit), age < self._settled  # lost where it is NaN too
+        if rows is not None:
+            lost, asked = lost & rows.ravel(), asked & rows.ravel()
+        where = np.flatnonzero(lost | asked)
+        if not len(where):
+            return
+        lost = lost[where]
+        x, P = self._scaled(*self._said(z.reshape(-1, z.shape[-1])[where], age[where], lost))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            taken = lost | (_log_volume(P) < _log_volume(self._P[where]))
+        if taken.any():
+            self._own()
+            self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
+            self._mean_square[where[lost]] = 1.0
+
+    def _said(self, z: np.ndarray, age: np.ndarray, lost: np.ndarray | None = None) -> Gaussian:
+        """What T_inv says of z, (k, size), at ages in samples: estimates, and covariances, in units of the states."""
+        parts, x = self._decoders.estimate(z, age * self._dt)
+        P = self._decoders.covariance(parts)
+        if lost is not None and lost.any():
+            soon = np.minimum(age[lost], self._window) * self._dt
+            P[lost] = self._decoders.covariances(z[lost], soon)
+        return x, P
+
+    def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
+        """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
+        self._x, self._P = self._scaled(x, P)
+        self._mean_square = np.ones(len(x))
 
     def _output(self, s: np.ndarray) -> np.ndarray:
         return self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)

@@ -25,6 +25,7 @@ COMMANDS = {
     "identify": ("identify", "Identify"),
     "adapt": ("identify", "Adapt"),
     "errorbars": ("errorbars", "ErrorBars"),
+    "tracking": ("tracking", "Tracking"),
     "evaluate": ("evaluate", "Evaluate"),
     "benchmark": ("benchmark", "Benchmark"),
     "agent": ("agent", "AgentCommand"),

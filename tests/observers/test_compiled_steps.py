@@ -33,7 +33,9 @@ REFERENCE = {
 
 def forget():
     """Forgets what has been compiled."""
-    for cache in (machine._kernels, machine._decode, machine._batches, machine.active_kernel, machine.entering_kernel):
+    for cache in (machine._kernels, machine._decode, machine.batch_kernels):
+        cache.cache_clear()
+    for cache in (machine.active_kernel, machine.entering_kernel):
         cache.cache_clear()
     for cache in (observers.sparse._kernel, observers.sparse._single, compiled_covariance._covary):
         cache.cache_clear()
@@ -90,6 +92,53 @@ def test_compiled_error_bars_of_single_samples_are_numpys(name):
                 size = np.sqrt(expected.diagonal())
                 assert 0 < np.abs((found - expected) / np.outer(size, size)).max() < 1e-4  # not the same arithmetic
                 np.testing.assert_array_equal(found, found.T)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+def test_estimates_whose_error_bars_are_asked_for_at_each_sample(name):
+    """NumPy makes both in one go from the second on. Levels of noise change meanwhile, and inputs begin."""
+    one, other = (observers.load(name, compiled=choice) for choice in (True, False))
+    y, u = signals(one.artifact, 60)
+    plain = along(observers.load(name, compiled=False), y[:40], u)
+    for k in range(60):
+        found = []
+        for observer in (one, other):
+            if k == 40:
+                observer.measurement_noise, observer.process_noise = 0.2, 0.3
+            if k == 50:
+                observer.replace(observer.artifact)
+            x_hat = observer.step(y[k], u[k]) if k else observer.reset(y[k])
+            found.append((x_hat, observer.covariance, observer.std))
+        (x_hat, covariance, std), expected = found
+        assert apart(x_hat, expected[0], one.artifact) < ACCURATE
+        assert np.abs((covariance - expected[1]) / np.outer(std, std)).max() < 1e-4
+        np.testing.assert_allclose(std, np.sqrt(covariance.diagonal()), rtol=1e-12)
+        if k < 40:
+            assert apart(expected[0], plain[k], one.artifact) < ACCURATE
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+def test_error_bars_of_batches_are_those_of_single_samples(name):
+    """Free motion, both, and driven motion alone; at ages that differ and in some rows."""
+    artifact = Artifact.read(resolve(name))
+    y, u = signals(artifact, 6, (2 * MANY_ROWS + 3,))
+    u[1:3, ::2] = 0.0
+    rows = np.arange(y.shape[1]) < MANY_ROWS
+    observer = observers.KKLObserver(artifact, 0.3)
+    single = observers.KKLObserver(artifact, 0.3, compiled=False)._states
+    observer.reset(y[0])
+    for k in range(1, 6):
+        observer.step(y[k], u[k])
+        if k == 4:
+            observer.restart(y[4][::5], np.arange(y.shape[1]) % 5 == 0)
+        found, part = observer.covariance, observer.decode_covariance(rows)
+        z, ages = observer._moment(np.ones(y.shape[1], dtype=bool))
+        for row in range(0, y.shape[1], 23):
+            expected = single.covariances(z[row], float(ages[row]))
+            size = np.sqrt(expected.diagonal())
+            assert np.abs((found[row] - expected) / np.outer(size, size)).max() < 1e-4
+            if rows[row]:
+                assert np.abs((part[row] - expected) / np.outer(size, size)).max() < 1e-4
 
 
 def test_error_bars_are_compiled_with_the_observer_and_stay_when_it_travels():
@@ -333,7 +382,7 @@ def test_inputs_that_are_read_only_or_have_strides():
 def test_a_batch_compiles_nothing_more_where_rows_restart():
     observer = observers.load("van_der_pol")
     y = np.linspace(-1, 1, MANY_ROWS)[:, None]
-    enter = machine._batches(observer.artifact.inverse.mlp.activation)[0]
+    enter = machine.batch_kernels(observer.artifact.inverse.mlp.activation)[0]
     observer.reset(y)
     observer.step(y, y)
     made = len(enter.signatures)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from error_bars import AGES, LEVELS, with_error_bars
 from safetensors import safe_open
 
 from observers import MLP, Artifact, ArtifactError, KKLObserver, Spread
+from observers.decoder import Both
 from observers.spread import Covariance
 
 CLOSE = {"rtol": 1e-4, "atol": 1e-6}  # the networks work in float32
@@ -62,22 +64,27 @@ def test_single_and_batch_are_the_closed_form(make_artifact, system, options):
     np.testing.assert_allclose(along[-1], batch.covariance, **CLOSE)
 
 
-@pytest.mark.parametrize("nx", [1, 4, 6])
+@pytest.mark.parametrize("nx", [1, 2, 3, 4, 6])
 def test_any_number_of_states(nx):
     rng, count = np.random.default_rng(nx), nx * (nx + 1) // 2
     mlp = MLP([rng.normal(size=(count, 5))], [rng.normal(size=count)], "tanh")
     spread, scale = Spread(mlp, LEVELS, AGES, np.ones((3, 3))), np.geomspace(1e-3, 1e3, nx)
     covariance, inputs = Covariance(spread, (0.5, 0.0), scale), rng.normal(size=(7, 5)).astype(np.float32)
     found = covariance(inputs, 0.05)
-    np.testing.assert_allclose([covariance(row, 0.05) for row in inputs], found, rtol=1e-4)
+    singles = np.array([covariance(row, 0.05) for row in inputs])
+    np.testing.assert_allclose(singles, found, rtol=1e-4)
+    np.testing.assert_array_equal(singles, singles.mT)
     assert (np.linalg.eigvalsh(found / np.outer(scale, scale)) > 0).all()
 
 
-def test_far_from_training_it_stays_finite():
-    mlp = MLP([np.full((3, 1), 1e4)], [np.zeros(3)], "tanh")
-    covariance = Covariance(Spread(mlp, LEVELS, AGES, np.ones((3, 3))), (9.0, 9.0), np.ones(2))
+@pytest.mark.parametrize("nx", [1, 2, 3, 4])
+def test_far_from_training_it_stays_finite(nx):
+    count = nx * (nx + 1) // 2
+    mlp = MLP([np.full((count, 1), 1e4)], [np.zeros(count)], "tanh")
+    covariance = Covariance(Spread(mlp, LEVELS, AGES, np.ones((3, 3))), (9.0, 9.0), np.ones(nx))
     for inputs in (np.ones(1, np.float32), np.ones((2, 1), np.float32)):
         assert np.isfinite(covariance(inputs, np.inf)).all()
+        assert np.isnan(covariance(np.nan * inputs, np.inf)).all()  # what is lost does not look sure
 
 
 def test_files_keep_it(make_artifact, tmp_path):
@@ -175,3 +182,100 @@ def test_beside_estimated_parameters(make_artifact):
     observer.reset([0.2])
     assert observer.covariance.shape == (2, 2)
     assert observer.parameters_hat.shape == (1,)
+
+
+@pytest.fixture
+def together(monkeypatch):
+    """One entry for each estimate that was made with its covariance."""
+    made, call = [], Both.__call__
+    monkeypatch.setattr(Both, "__call__", lambda self, *a: made.append(1) or call(self, *a))
+    return made
+
+
+def test_estimate_and_covariance_in_one_go_are_what_they_are_one_after_the_other(make_artifact, together):
+    plain, rng = make_artifact("van_der_pol", forward=True, **OPTIONS), np.random.default_rng(3)
+    artifact = with_error_bars(plain, activation="silu")  # as its maps have it
+    one, other = (KKLObserver(artifact, 0.1, compiled=False) for _ in range(2))
+    y, u = rng.normal(size=(2, 11, 1))
+    for change in (
+        lambda observer: observer.reset(y[:1, 0]),
+        lambda observer: observer.step(y[1]),  # free motion
+        lambda observer: observer.step(y[2], u[2]),
+        lambda observer: observer.step(None, u[3]),
+        lambda observer: observer.advance(y[4], u[4], np.array(True)),
+        lambda observer: observer.restart(y[5:6], np.array(True)),
+        lambda observer: observer.step(y[6], u[6]),
+        lambda observer: setattr(observer, "measurement_noise", 0.7),
+        lambda observer: setattr(observer, "process_noise", 0.01),
+        lambda observer: observer.step(y[7], u[7]),
+        lambda observer: observer.replace(with_error_bars(plain, seed=5, activation="silu")),
+        lambda observer: observer.step(y[8], u[8]),
+        lambda observer: observer.reset(y[9], np.array([0.3, 0.2])),
+        lambda observer: vars(observer).update(vars(pickle.loads(pickle.dumps(observer)))),
+        lambda observer: observer.step(y[10], u[10]),
+    ):
+        change(one)
+        before = len(together)
+        change(other)
+        fresh = other._states.covariances(*other._moment(None))
+        np.testing.assert_allclose(one.covariance, fresh, rtol=1e-5)
+        np.testing.assert_allclose(other.decode(), x_hat := one.decode(), rtol=1e-5)
+        np.testing.assert_allclose(one.covariance, fresh, rtol=1e-5)
+        assert len(together) == before + 1
+        np.testing.assert_allclose(one.step(y[0], u[0]), other.step(y[0], u[0]), rtol=1e-5)
+        assert len(together) == before + 2
+        assert not np.array_equal(one.decode(), x_hat)
+
+
+def test_one_covariance_is_made_in_vain_where_nobody_asks_any_more(make_artifact, together):
+    observer = KKLObserver(with_error_bars(make_artifact("lorenz"), activation="silu"), compiled=False)
+    observer.reset([0.1])
+    _ = observer.covariance
+    for _ in range(3):
+        observer.step([0.2])
+    assert len(together) == 1
+
+
+def test_what_is_handed_out_belongs_to_the_caller(make_artifact, together):
+    observer = KKLObserver(with_error_bars(make_artifact("lorenz"), activation="silu"), compiled=False)
+    observer.reset([0.1])
+    for _ in range(3):
+        given = observer.covariance
+        expected = given.copy()
+        given[:] = np.nan
+        np.testing.assert_array_equal(observer.covariance, expected)
+        observer.step([0.2])
+    assert together
+
+
+def test_it_is_made_again_where_the_observer_goes(make_artifact, together):
+    observer = KKLObserver(with_error_bars(make_artifact("van_der_pol", **OPTIONS), activation="silu"), compiled=False)
+    observer.reset([0.1])
+    _ = observer.covariance
+    observer.step([0.2])
+    travelled = pickle.loads(pickle.dumps(observer))
+    np.testing.assert_array_equal(travelled.covariance, observer.covariance)
+    np.testing.assert_array_equal(travelled.step([0.3]), observer.step([0.3]))
+    np.testing.assert_array_equal(travelled.covariance, observer.covariance)
+    assert len(together) == 3
+    assert b"Both" not in pickle.dumps(observer)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_networks_that_share_nothing(make_artifact, layers, together):
+    """Of one layer, and of another activation."""
+    artifact = with_error_bars(make_artifact("lorenz"), activation="tanh" if layers == 2 else "silu")
+    spread = artifact.inverse.spread
+    if layers == 1:
+        rng = np.random.default_rng(0)
+        mlp = MLP([rng.normal(size=(6, spread.mlp.inputs))], [rng.normal(size=6)], "silu")
+        inverse = dataclasses.replace(artifact.inverse, spread=dataclasses.replace(spread, mlp=mlp))
+        artifact = dataclasses.replace(artifact, inverse=inverse)
+    observer = KKLObserver(artifact, compiled=False)
+    observer.reset([0.1])
+    for _ in range(3):
+        z, age = observer._moment(None)
+        expected = by_hand(artifact.inverse, z, age, observer.measurement_noise, 0.0)
+        np.testing.assert_allclose(observer.covariance, expected, **CLOSE)
+        observer.step([0.2])
+    assert not together

@@ -104,9 +104,7 @@ def learn_tracking(
             artifact, system, duration=duration, steps=steps, seed=seed, policy=policy, progress=progress, device=device
         )
         ones = np.ones((*(() if len(levels) == 1 else (2,)), *regions.tables))
-        flow = dataclasses.replace(
-            flow, factors=Factors(np.array(LEVELS), regions.knots * artifact.filter.dt, ones)
-        )
+        flow = dataclasses.replace(flow, factors=Factors(np.array(LEVELS), regions.knots * artifact.filter.dt, ones))
         tracking = dataclasses.replace(artifact, flow=flow)
         tables = []
         with progress.phase("calibrating the error bars", len(levels) * (1 + len(LEVELS))) as report:

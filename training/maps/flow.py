@@ -109,7 +109,7 @@ def draw_increments(
 
 
 def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndarray:
-    return np.asarray(np.exp(rng.uniform(*np.log(ends), (PAIRS, 1))))
+    return np.exp(rng.uniform(np.log(ends[0]), np.log(ends[1]), (PAIRS, 1)))
 
 
 class FlowProblem(nn.Module):
