@@ -6,8 +6,8 @@ import numpy as np
 
 from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
-from observers.network import MLP
 from observers.factors import Factors
+from observers.network import MLP
 
 
 @dataclass(frozen=True)
