@@ -7,7 +7,7 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.decoder import Decoders
-from observers.unscented import Gaussian, corrected, factor, predicted
+from observers.unscented import Gaussian, corrected, predicted
 
 # A filter is lost where innovations are as large as that by chance once in 1e9: the normal distribution's quantile.
 _BEYOND_CHANCE = 5.998
@@ -18,8 +18,8 @@ class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
     It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
-    to begin. It says it again where it is surer, by the determinants of both covariances, for as long as the filter
-    z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's window,
+    to begin. It says it again where it is surer, by the traces of both covariances of scaled states, for as long as the
+    filter z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's window,
     is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then have
     misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
 
@@ -141,8 +141,7 @@ class Tracker:
             return
         lost = lost[where]
         x, P = self._scaled(*self._said(z.reshape(-1, z.shape[-1])[where], age[where], lost))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            taken = lost | (_log_volume(P) < _log_volume(self._P[where]))
+        taken = lost | (_mean_square(P) < _mean_square(self._P[where]))
         if taken.any():
             self._own()
             self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
@@ -174,9 +173,12 @@ class Tracker:
         self._x, self._P, self._mean_square = self._x.copy(), self._P.copy(), self._mean_square.copy()
 
 
-def _log_volume(P: np.ndarray) -> np.ndarray:
-    """Logarithm of the determinant of covariances, halved; NaN of what is none."""
-    return np.log(np.diagonal(factor(P), axis1=-2, axis2=-1)).sum(-1)
+def _mean_square(P: np.ndarray) -> np.ndarray:
+    """Of errors with covariances (n, nx, nx), summed over the states: (n,).
+
+    Not the determinant: soon after a wrong start the tracker is far too sure along what is measured.
+    """
+    return np.asarray(np.trace(P, axis1=-2, axis2=-1))
 
 
 def _largest_mean_square(freedom: float) -> float:
