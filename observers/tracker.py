@@ -19,9 +19,9 @@ class Tracker:
 
     It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
     to begin. It says it again where it is surer, by the traces of both covariances of scaled states, for as long as the
-    filter z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's window,
-    is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then have
-    misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
+    filter z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's
+    window, is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then
+    have misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
 
     Parameters
     ----------
