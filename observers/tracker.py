@@ -18,10 +18,11 @@ class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
     It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
-    to begin. It says it again where it is surer, by the traces of both covariances of scaled states, for as long as the
-    filter z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's
-    window, is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then
-    have misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
+    to begin. Within the flow's window from there it says it again where it is surer, by the traces of both covariances of
+    scaled states. (Asked for longer, it is surer by chance now and then, and errors rise.) It also says it again where the
+    tracker is lost: where the mean square of its innovations, over the window, is beyond chance for the levels of noise
+    told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
+    surer than so soon after a reset as the window is long.
 
     Parameters
     ----------
@@ -49,7 +50,6 @@ class Tracker:
         self._Q, self._R = np.diag(q), np.diag(r)
         self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
         self._units = flow.x_scale[:, None] * flow.x_scale
-        self._settled = artifact.inverse.age_max / self._dt
         self._window = max(1, round(flow.window / self._dt))
         self._share = -math.expm1(-1 / self._window)
         self._limit = _largest_mean_square(len(r) * (2 - self._share) / self._share)
@@ -133,7 +133,7 @@ class Tracker:
     def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         age = np.broadcast_to(age, self._batch).ravel()
-        lost, asked = ~(self._mean_square <= self._limit), age < self._settled  # lost where it is NaN too
+        lost, asked = ~(self._mean_square <= self._limit), age < self._window  # lost where it is NaN too
         if rows is not None:
             lost, asked = lost & rows.ravel(), asked & rows.ravel()
         where = np.flatnonzero(lost | asked)
