@@ -18,8 +18,8 @@ class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
     It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
-    to begin. Within the flow's window from there it says it again where it is surer, by the traces of both covariances of
-    scaled states. (Asked for longer, it is surer by chance now and then, and errors rise.) It also says it again where the
+    to begin. Within the flow's window from there it says so again where it is surer, by the traces of both covariances
+    of scaled states. (Asked for longer, it is surer by chance now and then, and errors rise.) It also says so where the
     tracker is lost: where the mean square of its innovations, over the window, is beyond chance for the levels of noise
     told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
     surer than so soon after a reset as the window is long.

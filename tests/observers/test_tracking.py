@@ -77,7 +77,7 @@ def test_t_inv_takes_over_where_it_is_surer():
     plain = KKLObserver(plain_observer(), LEVEL)
     observer.reset(y[0])
     plain.reset(y[0])
-    old = round(sure.inverse.age_max / DT)
+    old = round(sure.flow.window / DT)
     for k in range(1, old + 10):
         same = np.allclose(observer.step(y[k]), plain.step(y[k]))
         assert same == (k < old), k
