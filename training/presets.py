@@ -78,6 +78,8 @@ def preset(system: System, pipeline: Pipeline, name: Preset, *, changes: Mapping
     if pipeline == "input-aware":
         spectrum = given.get("eigenvalues") or eigenvalues(system, given.get("dt", system.dt))
         config = override(Config(pipeline, eigenvalues=spectrum, **sizes), profile(system).settings)
+        if any(override(config, changes).uncertain.values()):
+            config = override(config, profile(system).uncertain_settings)
         larger = {**LARGE, "inverse_steps": 244_140}
         return override(override(config, larger if name == "paper" else {}), changes)
     if name == "paper":

@@ -1,11 +1,14 @@
 """The configurations behind --preset."""
 
+from dataclasses import replace
+
 import pytest
 from linear_system import Oscillator, TwoOutputs, TwoUnits
 
-from kkl_gym import Lorenz, VanDerPol
+from kkl_gym import Lorenz, Rossler, VanDerPol
 from training import preset, presets
 from training.config import Config
+from training.systems import PROFILES
 
 
 def test_paper_preset_has_the_papers_table():
@@ -55,3 +58,25 @@ def test_maps_are_trained_for_twice_what_is_usual_on_each_output():
 def test_what_is_wrong_with_a_setting_is_told_by_its_name(pipeline):
     with pytest.raises(ValueError, match=r"eigenvalues\.1"):
         preset(Oscillator(), pipeline, "fast", changes={"eigenvalues": (-1.0, 2.0)})
+    with pytest.raises(ValueError, match="uncertain"):
+        preset(Oscillator(), pipeline, "fast", changes={"eigenvalues": (-1.0, -2.0), "uncertain": 0.1})
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_uncertain_parameters_add_what_the_systems_profile_says(name):
+    def of(**changes):
+        return preset(Rossler(), "input-aware", name, changes=changes)
+
+    plain = of()
+    assert plain.pairs == ()
+    assert of(uncertain={"all": 0.0}) == replace(plain, uncertain={"all": 0.0})
+    uncertain = {"c": 0.1}
+    found = of(uncertain=uncertain)
+    assert found.eigenvalues == plain.eigenvalues
+    assert found.pairs == PROFILES["rossler"].uncertain_settings["pairs"]
+    assert found.width == (512 if name == "paper" else 192)
+    given = {"pairs": ((-0.5, 2.0),), "width": 40}
+    assert of(uncertain=uncertain, **given) == replace(found, **given)
+    assert preset(VanDerPol(), "input-aware", name, changes={"uncertain": {"mu": 0.1}}) == replace(
+        preset(VanDerPol(), "input-aware", name), uncertain={"mu": 0.1}
+    )

@@ -22,8 +22,10 @@ class Profile:
         :func:`training.presets.eigenvalues`.
     settings : mapping of str to object
         Settings of :class:`training.config.Config`, where an input-aware map's differ from the preset's.
+    uncertain_settings : mapping of str to object
+        The same where parameters are uncertain, beside those of ``settings`` and before them.
     spinn_settings : mapping of str to object
-        The same for a map of the paper's pipeline, its eigenvalues among them. These must be fast enough for T to be
+        Those of a map of the paper's pipeline, its eigenvalues among them. These must be fast enough for T to be
         smooth; by default :func:`training.smoothness.smooth_spectrum` finds them.
     controller : callable
         Makes of the system the feedback that drives closed-loop data and that agents are measured against.
@@ -44,6 +46,7 @@ class Profile:
 
     eigenvalues: tuple[float, ...] | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    uncertain_settings: Mapping[str, Any] = field(default_factory=dict)
     spinn_settings: Mapping[str, Any] = field(default_factory=dict)
     controller: Callable[[System], Controller] = linear_quadratic
     fault_deadline: float | None = None
