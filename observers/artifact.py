@@ -347,6 +347,17 @@ class Artifact:
             )
         return self.forward
 
+    def require_known_start(self) -> None:
+        """See that an observer can begin at a state that is known: by T, or by tracking from there.
+
+        Raises
+        ------
+        ArtifactError
+            If there is neither; the message says which maps have T.
+        """
+        if self.flow is None:
+            self.require_forward()
+
     def require_spread(self) -> Spread:
         """Return the error bars of T_inv.
 

@@ -226,18 +226,20 @@ class KKLObserver:
         x0 : array_like, shape (..., nx), optional
             The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
             beside a motion without input: there is no transient, and a map that is told the age is told that it is
-            past it. Where it is known in some rows only, :meth:`restart` those.
+            past it. An observer that tracks begins at x0 itself, with T or without. Where it is known in some rows
+            only, :meth:`restart` those.
 
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate, T_inv(z_0). With x0 that is T_inv(T(x0)), as close to x0 as the maps are good.
+            The first estimate, T_inv(z_0). With x0 that is T_inv(T(x0)), as close to x0 as the maps are good, and x0
+            of an observer that tracks.
 
         Raises
         ------
         ValueError
-            If a shape is wrong, there is anything but finite real numbers, or x0 is given and the artifact holds no T;
-            the observer is then as it was.
+            If a shape is wrong, there is anything but finite real numbers, or x0 is given and the artifact holds
+            neither T nor a flow; the observer is then as it was.
         """
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         self._check_output(y0, y0.shape[:-1], first=True)
@@ -722,15 +724,19 @@ class KKLObserver:
 
     def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
         """The filter's first state, (..., size), and how many samples old it is."""
+        artifact = self.artifact
         if x0 is None:
-            return self.artifact.filter.start(y0), 0
-        T, x0, shape = self.artifact.require_forward(), real_array("x0", x0), (*y0.shape[:-1], self.artifact.nx)
+            return artifact.filter.start(y0), 0
+        artifact.require_known_start()
+        x0, shape = real_array("x0", x0), (*y0.shape[:-1], artifact.nx)
         if x0.shape != shape:
             raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
         if not all_finite(x0):
             raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
-        z0 = np.zeros((*shape[:-1], self.artifact.filter.size))
-        z0[..., : T.mlp.outputs] = T(x0)
+        if artifact.forward is None:  # where the tracker begins
+            return artifact.filter.start(y0), 0
+        z0 = np.zeros((*shape[:-1], artifact.filter.size))
+        z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)
         return z0, math.inf  # which every map takes for its age_max
 
     def _check_output(self, y: np.ndarray, batch: tuple[int, ...], first: bool = False) -> np.ndarray | None:

@@ -136,7 +136,7 @@ class KKLEstimator:
         map's range, or ``uncertainty`` is asked for beside z.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map and ``known_start`` is asked for, or no error bars and ``uncertainty``.
+        forward map or flow and ``known_start`` is asked for, or no error bars and ``uncertainty``.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class KKLEstimator:
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
         if known_start:
-            artifact.require_forward()  # an error now, not at the first reset
+            artifact.require_known_start()  # an error now, not at the first reset
         self._require_error_bars(artifact, estimate)
         noise = plant.measurement_noise if measurement_noise is None else measurement_noise
         self.observer = KKLObserver(artifact, noise, process_noise=plant.process_noise, monitor=monitor)
@@ -198,7 +198,7 @@ class KKLEstimator:
         """
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
-            artifact.require_forward()
+            artifact.require_known_start()
         self._require_error_bars(artifact, self.estimate)
         self.observer.replace(artifact)
 

@@ -72,7 +72,7 @@ class NamedEstimator(KKLEstimator):
         check_identity(artifact, env)
         self._require_error_bars(artifact, estimate)
         if known_start:
-            artifact.require_forward()
+            artifact.require_known_start()
         self.observer = KKLObserver(artifact, measurement_noise, monitor=monitor)
         self.estimate = estimate
         try:

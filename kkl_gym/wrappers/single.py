@@ -82,7 +82,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Whether to keep the score, see :attr:`observers.KKLObserver.score`.
     known_start : bool
         Whether the observer is told the true state ``info["x"]`` at reset, and only there. It then has no transient.
-        Only maps with a forward map T can use it: ``observer="SYSTEM-spinn"``.
+        Maps with a forward map T can use it, ``observer="SYSTEM-spinn"``, and those that track, ``"SYSTEM-tracking"``.
     uncertainty : bool
         Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
         ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with error bars, which
@@ -104,7 +104,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         observer.
     observers.ArtifactError
         If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map and ``known_start`` is asked for, or no error bars and ``uncertainty``. It is a ValueError.
+        forward map or flow and ``known_start`` is asked for, or no error bars and ``uncertainty``. It is a ValueError.
 
     Examples
     --------

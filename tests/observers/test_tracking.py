@@ -162,13 +162,19 @@ def test_some_rows_move_and_some_begin_anew():
     observer.restart(np.zeros((0, 1)), [False] * 3)
 
 
-def test_a_known_start_is_begun_with():
-    observer, (x, y) = KKLObserver(tracking_observer(), LEVEL), runs()
+@pytest.mark.parametrize("t_is_there", [True, False])
+def test_a_known_start_is_begun_with(t_is_there):
+    artifact = tracking_observer() if t_is_there else dataclasses.replace(tracking_observer(), forward=None)
+    observer, (x, y) = KKLObserver(artifact, LEVEL), runs()
     np.testing.assert_allclose(observer.reset(y[0], x[0]), x[0])
     assert (observer.std < 0.01).all()
     known = np.array([[0.4, 0.6]])
     observer.restart(y[1][:1], [True, False, False], known)
     np.testing.assert_allclose(observer.decode()[0], known[0])
+    np.testing.assert_allclose(observer.estimate(y, x0=x[0])[0], x[0])
+    for sample in y[1:5]:
+        observer.step(sample)
+    assert (observer.std[1:] < 0.1).all()  # T_inv, which is less sure, does not take over
 
 
 def test_levels_change_while_it_runs():
