@@ -38,11 +38,12 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/; those with error bars, which ship, into runs/errorbars. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# Into runs/; those with error bars, which ship, into runs/errorbars, and those that track into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
 maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \
 		$(BIN)/kkl-gym errorbars runs/$$system/$$system.safetensors || exit 1; \
+		$(BIN)/kkl-gym tracking runs/errorbars/$$system.safetensors || exit 1; \
 		$(BIN)/kkl-gym train $$system --size small --resume || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
 	for system in $(CLOSED); do \
@@ -60,6 +61,13 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	mkdir -p docs/results/error_bars
 	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
+	mkdir -p docs/results/tracking
+	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-tracking --calibration \
+		--csv runs/error_bars/$$system-tracking.csv || exit 1; done
+	for system in $(SYSTEMS); do cp runs/error_bars/$$system-tracking.csv docs/results/tracking/ || exit 1; done
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures

@@ -18,23 +18,25 @@ how the arm's angle changes, not where it is.
 Eight runs hold few of the swings that a pendulum can do. A second observer therefore learns from motions of the
 device's equations as well, with the parameters that were fitted to the same eight runs, released from anywhere.
 
+When the arm sticks, its angle says no more, and the pendulum swings on. What knows how is its equation. So the second
+observer starts a Kalman filter as well, whose arm can stick, and takes it back where the two disagree.
+
 The recorded velocities are no measurements. They follow from the recorded angles exactly, sample by sample, as
 v_k+1 = 0.8 v_k + 50 (angle_k+1 - angle_k): a derivative behind a low-pass of 55.79 rad/s. Estimates of angles are taken
 through the same formula where they are compared with them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import tyro
+from qube_model import KEPT, BothAngles, Pushed, Qube, Sticking
 from rich.console import Console
 from scipy.signal import savgol_filter
 
-import kkl_gym
-from kkl_gym.elementary import cos, sin, tanh
 from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.storage import write
@@ -83,72 +85,19 @@ GUESSES = {
     "pendulum_friction": 4e-5,
 }
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
-LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)  # of estimators in the figure
+GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
+# Of estimators in the figure.
+LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)
 WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
 # Of the equations' motions: how many, how long in s, and what they are released with at most: rad of the arm beside any
 # angle of the pendulum, and rad/s. The eight runs begin with the arm up to 0.85 rad from the middle. The number was
 # chosen by --cross-validate among 8, 24 and 72.
 MOTIONS, LASTING, TURNED, MOVING = 24, 11.0, 0.9, (0.3, 0.5)
 ENCODER = 2 * np.pi / 2048  # rad, a step of either angle
-
-
-@dataclass(frozen=True)
-class Qube(kkl_gym.System):
-    """The device without motor input: x = (theta, alpha, theta', alpha'), alpha from above, y = theta.
-
-    Without dry friction and the spring of the arm's cable it is as published.
-
-    Lengths, masses and inertias are those of Quanser's script qube2_rotpen_param.m (that of the arm as published,
-    mass length^2 / 12). It has much more damping than these runs show; the two coefficients are those of
-    BlueRiverTech's quanser-openai-driver, file qube_simulator.py. The motor's terminals are open.
-    """
-
-    gravity: float = 9.81  # m/s^2
-    arm_length: float = 0.085  # m
-    arm_inertia: float = 5.72e-5  # kg m^2, 0.095 kg (0.085 m)^2 / 12
-    arm_damping: float = 0.00027  # N m s
-    arm_friction: float = 0.0  # N m
-    arm_spring: float = 0.0  # N m/rad
-    pendulum_mass: float = 0.024  # kg
-    pendulum_length: float = 0.129  # m
-    pendulum_inertia: float = 0.024 * 0.129**2 / 3  # kg m^2, about its joint
-    pendulum_damping: float = 0.00005  # N m s
-    pendulum_friction: float = 0.0  # N m
-
-    name: ClassVar[str] = "qube"
-    state_names: ClassVar = ("theta in rad", "alpha in rad", "theta' in rad/s", "alpha' in rad/s")
-    X: ClassVar = ((-1.5, 1.5), (0.0, 2 * np.pi), (-10.0, 10.0), (-25.0, 25.0))
-    bounds: ClassVar = ((-50.0, 50.0), (-500.0, 500.0), (-100.0, 100.0), (-200.0, 200.0))
-
-    def f(self, x):
-        """Drift: Lagrange's equations of the two angles, solved for their accelerations."""
-        theta, alpha, theta_dot, alpha_dot = x
-        half, sine, cosine = self.pendulum_length / 2, sin(alpha), cos(alpha)
-        inertia = self.pendulum_inertia
-        coupling = -self.pendulum_mass * self.arm_length * half
-        m11 = self.arm_inertia + self.pendulum_mass * self.arm_length**2 + inertia * sine * sine
-        m12, m22 = coupling * cosine, inertia
-        r1 = coupling * sine * alpha_dot**2 - 2 * inertia * sine * cosine * theta_dot * alpha_dot
-        r2 = inertia * sine * cosine * theta_dot**2 + self.pendulum_mass * self.gravity * half * sine
-        r1 = r1 - self.arm_damping * theta_dot - self.arm_friction * tanh(theta_dot / 0.1) - self.arm_spring * theta
-        r2 = r2 - self.pendulum_damping * alpha_dot - self.pendulum_friction * tanh(alpha_dot / 0.8)
-        determinant = m11 * m22 - m12 * m12
-        return theta_dot, alpha_dot, (m22 * r1 - m12 * r2) / determinant, (m11 * r2 - m12 * r1) / determinant
-
-    def h(self, x):
-        """Output."""
-        return (x[0],)
-
-
-@dataclass(frozen=True)
-class BothAngles(Qube):
-    """The same with both angles measured, as in the runs that its parameters are fitted to."""
-
-    name: ClassVar[str] = "qube-both-angles"
-
-    def h(self, x):
-        """Outputs."""
-        return x[0], x[1]
+# Of the filter that is guided, chosen on the training runs: samples of a motion that its model is fitted to; s at which
+# the observer starts it, how sure it is then, and how far apart, on the unit circle, the two may be.
+LONGER, STARTED, SURE, APART = 250, 0.3, (0.002, 0.3, 1.0, 4.0, 1.0), 0.5
+PUSHED = 1.0  # 0.1 mN m, standard deviation of the torque on the arm that nobody knows
 
 
 def main(
@@ -182,13 +131,15 @@ def main(
         runs, records, estimators = TRAINING, training, left_out_in_turn(training, settings, out)
     else:
         runs, records = HELD_OUT, read(path, HELD_OUT)
-        model = fitted(training)
-        print("fitted:", ", ".join(f"{name} = {model.parameters[name]:.3g}" for name in GUESSES))
+        model, sticking = fitted(training), fitted(training, Sticking())
+        for each in (model, sticking):
+            print(f"{each.name}, fitted:", ", ".join(f"{name} = {each.parameters[name]:.3g}" for name in GUESSES))
         alone, both = learned(training, model, settings, out)
         both.save(out / "qube.safetensors")
         estimators = {
             ALONE: [estimates(alone, record) for record in records],
             BOTH: [estimates(both, record) for record in records],
+            GUIDED: guided(both, sticking, rest(training), records),
             "extended Kalman filter, published model": kalman(records, Qube()),
             "extended Kalman filter, fitted model": kalman(records, Qube(**model.parameters)),
             "finite differences": [differences(record) for record in records],
@@ -209,20 +160,23 @@ def read(path: Path, runs: Sequence[int]) -> list[Record]:
     return [resampled(record, DT) for record in records]
 
 
-def fitted(records: Sequence[Record]) -> BothAngles:
-    """The device with parameters for which its motions follow those recorded, each for half a second."""
+def fitted(records: Sequence[Record], model: BothAngles | None = None) -> BothAngles:
+    """The device with parameters for which its motions follow those recorded, each for half a second, or LONGER."""
+    model, window, noise = (
+        (BothAngles(), WINDOW, None) if model is None else (model, LONGER, (ENCODER / 2, ENCODER / 2))
+    )
     first, last = round(RELEASED / DT), round(FITTED / DT)
     both, starts = [], {}
     for i, record in enumerate(records):
         angles = np.stack([record.y[:, 0], np.unwrap(np.arctan2(record.x[:, 1], record.x[:, 0]))], -1)
         rates = savgol_filter(angles, 11, 3, deriv=1, delta=DT, axis=0)
         both.append(replace(record, y=angles, x=None, signals=Signals("time")))
-        for k in range(first, min(last, len(angles) - WINDOW), WINDOW):
+        for k in range(first, min(last, len(angles) - window), window):
             starts[i, k] = np.concatenate([angles[k], rates[k]])
     guesses = np.array(list(GUESSES.values()))
     limits = {name: (0.0, 10 * guess) for name, guess in GUESSES.items()}
-    fit = shoot(Shooting(BothAngles(), DT, limits, guesses), guesses, windows(both, starts, WINDOW), rounds=12)
-    return replace(BothAngles(), **fit.parameters)
+    fit = shoot(Shooting(model, DT, limits, guesses), guesses, windows(both, starts, window), rounds=12, noise=noise)
+    return replace(model, **fit.parameters)
 
 
 def released(model: BothAngles) -> list[Record]:
@@ -258,10 +212,60 @@ def left_out_in_turn(records: Sequence[Record], settings: dict, out: Path) -> di
     found = {}
     for fold in FOLDS:
         kept = [record for run, record in zip(TRAINING, records, strict=True) if run not in fold]
-        observers = learned(kept, fitted(kept), settings, out / f"without-{'-'.join(map(str, fold))}")
-        for run in fold:
-            found[run] = [estimates(observer, records[TRAINING.index(run)]) for observer in observers]
-    return {name: [found[run][i] for run in TRAINING] for i, name in enumerate((ALONE, BOTH))}
+        alone, both = learned(kept, fitted(kept), settings, out / f"without-{'-'.join(map(str, fold))}")
+        left = [records[TRAINING.index(run)] for run in fold]
+        recursive = guided(both, fitted(kept, Sticking()), rest(kept), left)
+        for run, record, last in zip(fold, left, recursive, strict=True):
+            found[run] = estimates(alone, record), estimates(both, record), last
+    return {name: [found[run][i] for run in TRAINING] for i, name in enumerate((ALONE, BOTH, GUIDED))}
+
+
+def rest(records: Sequence[Record]) -> float:
+    """Where the recorded pendulum comes to rest on average, in rad from where a pendulum hangs."""
+    return float(np.mean([np.arcsin(-record.x[-round(1.0 / DT) :, 1]).mean() for record in records]))
+
+
+def guided(observer: Artifact, model: Sticking, zero: float, records: Sequence[Record]) -> list[np.ndarray]:
+    """Estimates of a Kalman filter that the observer starts, and starts again where both are far apart.
+
+    The arm's angle is measured and not estimated. Where the pendulum comes to rest is zero, in rad from where it hangs.
+    """
+    y = padded([record.y for record in records])
+    signals = padded([estimates(observer, record) for record in records])
+    kalman_filter = ExtendedKalmanFilter(
+        Pushed(**model.parameters),
+        DT,
+        Q=np.diag([0.0, 0.0, 0.0, 0.03, np.sqrt(2 / KEPT) * PUSHED]) ** 2,
+        R=np.array([[0.005**2]]),
+        start=(np.zeros(5), np.diag(SURE) ** 2),
+    )
+    kalman_filter.reset(y[0])
+    found = []
+    for k, (cosine, sine, alpha_dot, theta_dot) in enumerate(np.moveaxis(signals, -1, 1)):
+        if k:
+            kalman_filter.advance(y[k])
+        alpha = kalman_filter.x[:, 1]
+        lost = (np.hypot(np.cos(alpha) - cosine, np.sin(alpha) - sine) > APART) | (k * DT <= STARTED)
+        x = np.stack([y[k, :, 0], np.arctan2(sine, cosine), theta_dot, alpha_dot, 0.0 * alpha], -1)
+        kalman_filter.x = np.where(lost[:, None], x, kalman_filter.x)
+        kalman_filter.P = np.where(lost[:, None, None], np.diag(SURE) ** 2, kalman_filter.P)
+        found.append(kalman_filter.x)
+    return recorded_signals(np.stack([y[..., 0], np.array(found)[..., 1] + zero], -1), records)
+
+
+def padded(values: Sequence[np.ndarray]) -> np.ndarray:
+    """Signals (n, k) of several records as one array, of which the last samples of shorter ones are repeated."""
+    longest = max(len(each) for each in values)
+    return np.stack([np.pad(each, ((0, longest - len(each)), (0, 0)), mode="edge") for each in values], 1)
+
+
+def recorded_signals(angles: np.ndarray, records: Sequence[Record]) -> list[np.ndarray]:
+    """Angles theta and alpha, (n, runs, 2), as the records have them, each as long as its record."""
+    each = [np.unwrap(angles[: len(record.t), i], axis=0).T for i, record in enumerate(records)]
+    return [
+        np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
+        for theta, alpha in each
+    ]
 
 
 def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
@@ -269,10 +273,7 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
 
     It begins with a pendulum that hangs, give or take 1.8 rad, and velocities of 4 and 12 rad/s.
     """
-    longest = max(len(record.t) for record in records)
-    y = np.stack([np.pad(record.y[:, 0], (0, longest - len(record.t)), mode="edge") for record in records], 1)[
-        ..., None
-    ]
+    y = padded([record.y for record in records])
     kalman_filter = ExtendedKalmanFilter(
         model,
         DT,
@@ -281,11 +282,7 @@ def kalman(records: Sequence[Record], model: Qube) -> list[np.ndarray]:
         start=(np.array([0.0, np.pi, 0.0, 0.0]), np.diag([1.0, 1.8, 4.0, 12.0]) ** 2),
     )
     x = np.stack([kalman_filter.reset(y[0]), *(kalman_filter.step(each) for each in y[1:])])
-    found = [x[: len(record.t), i] for i, record in enumerate(records)]
-    return [
-        np.stack([np.cos(alpha), np.sin(alpha), recorded_velocity(alpha), recorded_velocity(theta)], -1)
-        for theta, alpha in (each[:, :2].T for each in found)
-    ]
+    return recorded_signals(x[..., :2], records)
 
 
 def differences(record: Record) -> np.ndarray:

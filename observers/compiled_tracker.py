@@ -107,7 +107,7 @@ class CompiledTracker:
         self._correct(ahead, y, rows, state)
 
     def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: Arrays) -> None:
-        """Take what T_inv says, where it is surer by the determinants of both covariances or the tracker is lost.
+        """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
 
         Parameters
         ----------
@@ -141,9 +141,11 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     central, others = (3 - nx) / 3 + 2.0, 1 / 6  # weights of the points in covariances
 
     @_inlined
-    def factor(P: np.ndarray, L: np.ndarray) -> None:
-        """A Cholesky factor; NaN where there is none."""
+    def draw(x: np.ndarray, P: np.ndarray, L: np.ndarray, points: np.ndarray) -> None:
+        """Sigma points, (2 nx + 1, nx), and the Cholesky factor; NaN where there is none."""
         for i in range(nx):
+            for p in range(count):
+                points[p, i] = x[i]
             for j in range(i + 1):
                 entry = P[i, j]
                 for k in range(j):
@@ -152,17 +154,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
                     L[i, j] = entry / L[j, j]
                 else:
                     L[i, j] = math.sqrt(entry) if entry > 0.0 else np.nan
-
-    @_inlined
-    def draw(x: np.ndarray, P: np.ndarray, L: np.ndarray, points: np.ndarray) -> None:
-        """Sigma points, (2 nx + 1, nx)."""
-        factor(P, L)
-        for i in range(nx):
-            for p in range(count):
-                points[p, i] = x[i]
-            for k in range(i + 1):
-                points[1 + k, i] += far * L[i, k]
-                points[1 + nx + k, i] -= far * L[i, k]
+                points[1 + j, i] += far * L[i, j]
+                points[1 + nx + j, i] -= far * L[i, j]
 
     @_inlined
     def centre(points: np.ndarray, mean: np.ndarray) -> None:
@@ -325,14 +318,12 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     @compiled
     def take(model: Arrays, said: Arrays, lost: np.ndarray, where: np.ndarray, state: Arrays) -> None:
         (states, _, _), (x_said, P_said), (x, P, mean_square) = model, said, state
-        L, own = np.empty((nx, nx)), np.empty((nx, nx))
         for k in range(len(where)):
-            row, ratio = where[k], 1.0
-            factor(P_said[k], L)
-            factor(P[row], own)
+            row, ours, theirs = where[k], 0.0, 0.0
             for i in range(nx):
-                ratio *= L[i, i] / (states[i, _SCALE] * own[i, i])
-            if lost[k] or ratio < 1.0:
+                ours += P[row, i, i]
+                theirs += P_said[k, i, i] / (states[i, _SCALE] * states[i, _SCALE])
+            if lost[k] or theirs < ours:
                 for i in range(nx):
                     x[row, i] = within(states, i, (x_said[k, i] - states[i, _OFFSET]) / states[i, _SCALE])
                     for j in range(nx):

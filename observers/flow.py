@@ -43,7 +43,7 @@ class Flow:
     least_measurement_noise : ndarray, shape (ny,)
         Standard deviations of measurement noise that are assumed at least.
     window : float
-        Seconds over which innovations are averaged.
+        Seconds over which innovations are averaged, and within which T_inv may say again where to begin.
     factors : Factors
         What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors.
 

@@ -11,7 +11,7 @@ from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
 from observers.sparse import MANY_ROWS
-from observers.unscented import Gaussian, corrected, factor, predicted
+from observers.unscented import Gaussian, corrected, predicted
 
 # A filter is lost where innovations are as large as that by chance once in 1e9: the normal distribution's quantile.
 _BEYOND_CHANCE = 5.998
@@ -23,10 +23,11 @@ class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
     It is as good as its flow once it is near the state, and cannot find it: that is what T_inv is for. T_inv says where
-    to begin. It says it again where it is surer, by the determinants of both covariances, for as long as the filter
-    z settles, and where the tracker is lost. That is where the mean square of its innovations, over the flow's window,
-    is beyond chance for the levels of noise told, or its covariance is none any more. What came before may then have
-    misled z too, so that T_inv is taken for no surer than so soon after a reset as the window is long.
+    to begin. Within the flow's window from there it says so again where it is surer, by the traces of both covariances
+    of scaled states. (Asked for longer, it is surer by chance now and then, and errors rise.) It also says so where the
+    tracker is lost: where the mean square of its innovations, over the window, is beyond chance for the levels of noise
+    told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
+    surer than so soon after a reset as the window is long.
 
     Parameters
     ----------
@@ -58,7 +59,6 @@ class Tracker:
         self._Q, self._R = np.diag(q), np.diag(r)
         self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
         self._units = flow.x_scale[:, None] * flow.x_scale
-        self._settled = artifact.inverse.age_max / self._dt
         self._window = max(1, round(flow.window / self._dt))
         self._share = -math.expm1(-1 / self._window)
         self._limit = _largest_mean_square(len(r) * (2 - self._share) / self._share)
@@ -158,11 +158,11 @@ class Tracker:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         if not self._batch:  # a single sample: every call of numpy would be felt
             age, one = float(age), not self._mean_square[0] <= self._limit  # lost where it is NaN too
-            if (one or age < self._settled) and (rows is None or rows):
+            if (one or age < self._window) and (rows is None or rows):
                 self._take(self._said_of_one(z, age, one), _FLAGS[one], _FIRST)
             return
         age = np.broadcast_to(age, self._batch).ravel()
-        lost, asked = ~(self._mean_square <= self._limit), age < self._settled
+        lost, asked = ~(self._mean_square <= self._limit), age < self._window
         if rows is not None:
             lost, asked = lost & rows.ravel(), asked & rows.ravel()
         where = np.flatnonzero(lost | asked)
@@ -179,8 +179,7 @@ class Tracker:
             self._machine.take(said, lost, where, self._state)
             return
         x, P = self._scaled(*said)
-        with np.errstate(over="ignore", invalid="ignore"):
-            taken = lost | _surer(P, self._P[where])
+        taken = lost | (_mean_square(P) < _mean_square(self._P[where]))
         if taken.any():
             self._own()
             self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
@@ -241,11 +240,12 @@ class Tracker:
         self._x, self._P, self._mean_square = (part.copy() for part in self._state)
 
 
-def _surer(P: np.ndarray, than: np.ndarray) -> np.ndarray:
-    """Which covariances (n, nx, nx) have smaller determinants than others: none where one of both is none."""
-    roots = factor(np.concatenate([P, than])).diagonal(0, 1, 2)
-    surer: np.ndarray = (roots[: len(P)] / roots[len(P) :]).prod(-1) < 1
-    return surer
+def _mean_square(P: np.ndarray) -> np.ndarray:
+    """Of errors with covariances (n, nx, nx), summed over the states: (n,).
+
+    Not the determinant: soon after a wrong start the tracker is far too sure along what is measured.
+    """
+    return np.asarray(np.trace(P, axis1=-2, axis2=-1))
 
 
 def _largest_mean_square(freedom: float) -> float:

@@ -65,6 +65,7 @@ TINY = {
     "estimates": lambda: DRAW["estimates"](0.3),
     "agents": DRAW["agents_over_time"],
     "errors over time": lambda: DRAW["errors_over_time"](trajectories=3, duration=0.5),
+    "tracking": lambda: DRAW["tracking"](trajectories=3, duration=0.5),
     "error bars": lambda: DRAW["error_bars"](duration=1.5),
     "noise levels": DRAW["noise_levels"],
     "faults": lambda: partial(faults.draw, found=results("faults/faults.csv", slice(None, None, 50))),

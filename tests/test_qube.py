@@ -2,6 +2,8 @@
 
 import os
 import runpy
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,25 +11,28 @@ import pytest
 
 from kkl_gym.simulate import simulate
 
-QUBE = runpy.run_path(str(Path(__file__).parent.parent / "examples" / "qube.py"))
+EXAMPLES = Path(__file__).parent.parent / "examples"
+sys.path.insert(0, str(EXAMPLES))  # as `python examples/qube.py` has it
+QUBE = runpy.run_path(str(EXAMPLES / "qube.py"))
+sys.path.remove(str(EXAMPLES))
+
+
+def energy(model, x):
+    alpha, arm, pendulum = x.T[1:4]
+    half = model.pendulum_length / 2
+    tip = model.arm_length * arm - half * np.cos(alpha) * pendulum  # its middle, along the circle
+    around = half * np.sin(alpha) * arm
+    up = half * np.sin(alpha) * pendulum
+    own = model.pendulum_mass * model.pendulum_length**2 / 12 * (pendulum**2 + (np.sin(alpha) * arm) ** 2)
+    moving = model.pendulum_mass * (tip**2 + around**2 + up**2) + own + model.arm_inertia * arm**2
+    return moving / 2 + model.pendulum_mass * model.gravity * half * np.cos(alpha)
 
 
 def test_the_model_keeps_its_energy_and_hangs():
     model = QUBE["Qube"](arm_damping=0.0, pendulum_damping=0.0)
-
-    def energy(x):
-        _, alpha, arm, pendulum = x.T
-        half = model.pendulum_length / 2
-        tip = model.arm_length * arm - half * np.cos(alpha) * pendulum  # its middle, along the circle
-        around = half * np.sin(alpha) * arm
-        up = half * np.sin(alpha) * pendulum
-        own = model.pendulum_mass * model.pendulum_length**2 / 12 * (pendulum**2 + (np.sin(alpha) * arm) ** 2)
-        moving = model.pendulum_mass * (tip**2 + around**2 + up**2) + own + model.arm_inertia * arm**2
-        return moving / 2 + model.pendulum_mass * model.gravity * half * np.cos(alpha)
-
     x = simulate(model, np.array([[0.1, 1.0, 2.0, 3.0], [0.0, 3.0, -1.0, 9.0]]), 200, 0.004)
     for run in np.moveaxis(x, 1, 0):
-        np.testing.assert_allclose(energy(run), energy(run)[0], rtol=1e-5)
+        np.testing.assert_allclose(energy(model, run), energy(model, run)[0], rtol=1e-5)
     hanging = simulate(QUBE["Qube"](), np.array([[0.1, 2.0, 0.0, 0.0]]), 2500, 0.004)[-1, 0]
     assert hanging[1] == pytest.approx(np.pi, abs=0.05)
 
@@ -60,11 +65,79 @@ def test_dry_friction_holds_the_arm_and_the_spring_turns_it():
     assert turned[0] < 0.01
 
 
+def test_what_pushes_the_arm_does_work_and_fades():
+    model = QUBE["Pushed"](arm_damping=0.0, pendulum_damping=0.0)
+    x = simulate(model, np.array([[0.1, 1.0, 2.0, 3.0, 2.0]]), 100, 0.004)[:, 0]
+    np.testing.assert_allclose(x[:, 4], 2.0 * np.exp(-0.004 * np.arange(101) / 0.1), rtol=1e-5)
+    power = 1e-4 * x[:, 4] * x[:, 2]
+    work = 0.004 * np.concatenate([[0.0], np.cumsum(power[1:] + power[:-1]) / 2])
+    assert np.abs(work).max() > 1e-5
+    np.testing.assert_allclose(energy(model, x) - energy(model, x)[0], work, atol=2e-7)
+
+
+def test_an_arm_sticks_until_it_is_pushed_while_the_pendulum_swings():
+    stuck, turned = simulate(
+        QUBE["Pushed"](**{**QUBE["GUESSES"], "arm_friction": 2e-4}),
+        np.array([[0.05, np.pi + 0.01, 0.0, 0.0, 0.0], [0.05, np.pi + 0.01, 0.0, 0.0, 6.0]]),
+        250,
+        0.004,
+    ).transpose(1, 0, 2)
+    assert np.abs(stuck[:, 0] - 0.05).max() < QUBE["ENCODER"] / 2
+    assert np.ptp(stuck[:, 1]) > 0.015
+    assert turned[-1, 0] > 0.05 + 3 * QUBE["ENCODER"]
+
+
 def test_parameters_are_found_again(tmp_path):
     write_runs(tmp_path, MODEL)
     found = QUBE["fitted"](QUBE["read"](tmp_path, (1, 2, 4, 5))).parameters
     for name in ("arm_length", "arm_inertia", "pendulum_inertia", "arm_damping", "arm_friction", "pendulum_friction"):
         assert found[name] == pytest.approx(getattr(MODEL, name), rel=0.02), name
+
+
+STICKS = QUBE["Sticking"](**{name: getattr(MODEL, name) for name in QUBE["GUESSES"]})
+
+
+def test_parameters_of_an_arm_that_sticks_are_found_again(tmp_path):
+    write_runs(tmp_path, STICKS)
+    found = QUBE["fitted"](QUBE["read"](tmp_path, (1, 2, 4, 5)), QUBE["Sticking"]()).parameters
+    for name in ("arm_length", "arm_inertia", "pendulum_inertia", "arm_damping", "arm_friction", "pendulum_friction"):
+        assert found[name] == pytest.approx(getattr(STICKS, name), rel=0.03), name
+    assert found["arm_slip"] == STICKS.arm_slip
+
+
+def test_where_pendulums_rest(tmp_path):
+    write_runs(tmp_path, STICKS)
+    records = QUBE["read"](tmp_path, (1, 2))
+    ends = [np.stack([0 * r.t - np.cos(d), 0 * r.t - np.sin(d)], -1) for r, d in zip(records, (0.003, 0.001))]
+    records = [replace(r, x=np.concatenate([e, r.x[:, 2:]], -1)) for r, e in zip(records, ends)]
+    assert QUBE["rest"](records) == pytest.approx(0.002)
+
+
+def test_a_filter_that_is_started_remembers_and_is_taken_back(tmp_path, monkeypatch):
+    """From estimates that are opposite at first, and later off by 0.3 rad, which is no reason."""
+    write_runs(tmp_path, STICKS)
+    records = QUBE["read"](tmp_path, (1, 2, 3))
+    truth = {record.name: record.x for record in records}
+    wrong, blind, c, s = round(0.5 / 0.004), round(1.6 / 0.004), np.cos(0.3), np.sin(0.3)
+
+    def said(observer, record):
+        x = truth[record.name].copy()
+        x[:wrong, :2] *= -1.0
+        cosine, sine = x[blind:, :2].T
+        x[blind:, :2] = np.stack([cosine * c - sine * s, sine * c + cosine * s], -1)
+        x[blind:, 2:] = 0.0
+        return x
+
+    monkeypatch.setitem(QUBE["guided"].__globals__, "estimates", said)
+    found = QUBE["guided"](None, STICKS, 0.0, records)
+    for x_hat, record in zip(found, records, strict=True):
+        assert x_hat.shape == record.x.shape
+        late = np.abs(x_hat - record.x)[round(0.8 / 0.004) :]
+        assert (late.max(0) < [0.05, 0.05, 0.8, 0.2]).all()
+        np.testing.assert_allclose(x_hat[:, 3], QUBE["recorded_velocity"](record.y[:, 0]))
+    beside = QUBE["guided"](None, STICKS, 0.01, records)
+    angles = [np.arctan2(each[0][:, 1], each[0][:, 0]) for each in (beside, found)]
+    np.testing.assert_allclose(np.angle(np.exp(1j * (angles[0] - angles[1]))), 0.01, atol=1e-9)
 
 
 def test_released_motions_are_recorded_as_the_device_records():
@@ -85,10 +158,11 @@ def test_released_motions_are_recorded_as_the_device_records():
 def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
     for setting, small in {"windows": 500, "samples": 10, "members": 1, "width": 16}.items():
         monkeypatch.setitem(QUBE["SETTINGS"], setting, small)
-    monkeypatch.setitem(QUBE["fitted"].__globals__, "fitted", lambda records: MODEL)
+    fitted = lambda records, model=None: STICKS if model else MODEL  # noqa: E731
+    monkeypatch.setitem(QUBE["fitted"].__globals__, "fitted", fitted)
     write_runs(tmp_path, QUBE["Qube"]())
     found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=60)
-    for name in (QUBE["ALONE"], QUBE["BOTH"]):
+    for name in (QUBE["ALONE"], QUBE["BOTH"], QUBE["GUIDED"]):
         assert np.isfinite(found[name]).all()
     assert not np.allclose(found[QUBE["ALONE"]], found[QUBE["BOTH"]])
     of_filters = [found[f"extended Kalman filter, {kind} model"] for kind in ("published", "fitted")]
@@ -100,7 +174,7 @@ def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
     assert "| finite differences | - | - | - | 0.00" in (tmp_path / "out" / "table.md").read_text()
     assert (tmp_path / "out" / "estimates.png").stat().st_size > 10_000
     found = QUBE["main"](tmp_path, out=tmp_path / "out", inverse_steps=10, cross_validate=True)
-    assert list(found) == [QUBE["ALONE"], QUBE["BOTH"]]
+    assert list(found) == [QUBE["ALONE"], QUBE["BOTH"], QUBE["GUIDED"]]
     assert "finite differences" in capsys.readouterr().out
 
 
@@ -110,3 +184,4 @@ def test_on_the_device(tmp_path):
         pytest.skip("REAL DATA NOT TESTED: set KKL_GYM_QUBE to the folder of the Qube's runs, see examples/qube.py")
     found = QUBE["main"](Path(path), out=tmp_path)
     assert (found[QUBE["BOTH"]] <= 0.05).all()
+    assert (found[QUBE["GUIDED"]] <= 0.04).all()

@@ -1,5 +1,6 @@
 """A Kalman filter that a learned KKL observer starts, watches over and starts again."""
 
+import dataclasses
 import os
 from collections.abc import Sequence
 
@@ -92,6 +93,7 @@ class GuidedKalmanFilter:
         Q = process_intensity(system, disturbed, dt) if Q is None else _checked(Q, system.nx)
         self.system = system
         self._batch: tuple[int, ...] | None = None
+        artifact = dataclasses.replace(artifact, flow=None)  # which would be a second filter of the kind
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
         self._filter = UnscentedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)

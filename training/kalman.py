@@ -7,16 +7,15 @@ import numpy as np
 
 from kkl_gym.simulate import advance_batch
 from kkl_gym.system import System
+from observers import unscented
+from observers.unscented import Gaussian
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
 LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
-UNSEEN = 1e12  # variance of a missing output, in multiples of the largest of those measured
 
-Gaussian = tuple[np.ndarray, np.ndarray]
-"""Means (n, nx) and covariances (n, nx, nx) of a batch, or those of one Gaussian, (nx,) and (nx, nx)."""
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
 
@@ -191,7 +190,7 @@ class KalmanFilter(ABC):
         missing = np.isnan(y)
         if not missing.any():
             return y - expected, self._R
-        unseen = UNSEEN * self._R.max() * np.eye(y.shape[1])
+        unseen = unscented.UNSEEN * self._R.max() * np.eye(y.shape[1])
         return np.where(missing, 0.0, y - expected), self._R + missing[:, None, :] * unseen
 
     @abstractmethod
@@ -248,30 +247,20 @@ class ExtendedKalmanFilter(KalmanFilter):
 
 
 class UnscentedKalmanFilter(KalmanFilter):
-    """A batch of unscented Kalman filters (Wan and van der Merwe, 2000).
+    """A batch of unscented Kalman filters (Wan and van der Merwe, 2000), see :mod:`observers.unscented`.
 
-    The sigma points are van der Merwe's scaled ones with alpha = 1, beta = 2 and kappa = 3 - nx: the mean, and the mean
-    +- sqrt(3) times each column of the covariance's Cholesky factor. They are drawn anew between prediction and
-    correction. A filter starts anew if its corrected mean leaves the system's declared bounds, or if its covariance is
-    no longer positive definite. Parameters are those of :class:`KalmanFilter`.
+    A filter starts anew if its corrected mean leaves the system's declared bounds, or if its covariance is no longer
+    positive definite. Parameters are those of :class:`KalmanFilter`.
     """
 
-    def __init__(
-        self, system: System, dt: float, *, Q: np.ndarray, R: np.ndarray, start: Gaussian | None = None
-    ) -> None:
-        super().__init__(system, dt, Q=Q, R=R, start=start)
-        nx = system.nx
-        self._mean_weights = np.array([(3 - nx) / 3, *[1 / 6] * (2 * nx)])
-        self._weights = self._mean_weights + np.array([2.0, *[0.0] * (2 * nx)])
-
-    @np.errstate(over="ignore", invalid="ignore")
     def _predicted(self, u: np.ndarray) -> Gaussian:
-        points = self._sigma_points(self.x, self.P)
-        count, n, nx = points.shape
-        flat = np.ascontiguousarray(points.reshape(-1, nx).T)
-        moved = advance_batch(self._system, flat, np.tile(u, count), np.zeros_like(flat), self._dt)
-        x, spread = self._moments(moved.T.reshape(count, n, nx))
-        return x, self._covariance(spread, spread) + self._Q * self._dt
+        def move(points: np.ndarray) -> np.ndarray:
+            flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
+            moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
+            return moved.T.reshape(points.shape)
+
+        with np.errstate(over="ignore", invalid="ignore"):
+            return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
@@ -283,27 +272,4 @@ class UnscentedKalmanFilter(KalmanFilter):
         return x, P, nis
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        points = self._sigma_points(x, P)
-        expected, spread = self._moments(self._system.output(points))
-        innovation, R = self._innovation(y, expected)
-        S = self._covariance(spread, spread) + R
-        K = np.linalg.solve(S, self._covariance(spread, points - x)).mT
-        return x + (K @ innovation[..., None])[..., 0], P - K @ S @ K.mT, _normalised(innovation, S, y)
-
-    def _sigma_points(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
-        """Points (2 nx + 1, n, nx); NaN where P is not positive definite."""
-        import torch  # for this alone: whoever needs no such filter need not wait for it
-
-        factor, failed = torch.linalg.cholesky_ex(torch.as_tensor(3.0 * P))
-        columns = np.where(failed.numpy()[:, None], np.nan, np.moveaxis(factor.numpy(), -1, 0))
-        return np.concatenate([x[None], x + columns, x - columns])
-
-    def _moments(self, points: np.ndarray) -> Gaussian:
-        """Weighted mean (n, k) of transformed points (2 nx + 1, n, k), and what the points differ from it by."""
-        mean = np.tensordot(self._mean_weights, points, 1)
-        return mean, points - mean
-
-    def _covariance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Weighted sum over points of outer products of (2 nx + 1, n, k) and (2 nx + 1, n, l), as (n, k, l)."""
-        products: np.ndarray = np.einsum("s,snk,snl->nkl", self._weights, a, b)
-        return products
+        return unscented.corrected(x, P, y, output=self._system.output, R=self._R)

@@ -206,6 +206,34 @@ def draw_errors_over_time(
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
 
 
+def tracking(trajectories: int = 100, duration: float | None = None) -> Draw:
+    """Errors at each step at noise 0.5, of observers that track beside those that do not."""
+    found = {}
+    for name, kind in SYSTEMS.items():
+        system, dt = kind(), Artifact.read(resolve(name)).filter.dt
+        runs = unseen_trajectories(system, dt, n=trajectories, duration=duration or system.duration, seed=0)
+        how = {"measurement_noise": LEVELS[-1], "seed": 0}
+        x_hats = [estimates_of(Artifact.read(resolve(one)), system, runs, **how) for one in (name, f"{name}-tracking")]
+        x_hats.append(kalman_estimates(system, runs, dt, **how))
+        found[name] = [np.median(percentage_error(runs.x, x_hat), axis=1) for x_hat in x_hats]
+    return partial(draw_tracking, found=found, dt=dt)
+
+
+def draw_tracking(path: Path, *, found: Mapping[str, Sequence[np.ndarray]], dt: float) -> None:
+    """Draw median errors (steps,) of T_inv alone, of tracking and of a Kalman filter: a panel for each system."""
+    labels = "T_inv alone", "tracking", "EKF with the exact equations"
+    with drawing(path, 10, 3.2) as figure:
+        axes = figure.subplots(1, len(SYSTEMS), sharey=True)
+        for ax, name in zip(axes, SYSTEMS, strict=True):
+            for errors, color, label in zip(found[name], (TARGET, ESTIMATE, RIVAL), labels, strict=True):
+                ax.plot(dt * np.arange(1, len(errors)), errors[1:], color=color, lw=0.9, label=label)
+            ax.set(xscale="log", yscale="log", title=name.replace("_", " "), xlabel="t in s", ylim=(0.1, 200.0))
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_major_formatter("{x:g}")
+        axes[0].set_ylabel("median error in %")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels))
+
+
 FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/estimates.png": estimates,
     "figures/portraits.gif": portraits,
@@ -213,6 +241,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "figures/agents.gif": agents_moving,
     "figures/agents.png": agents_over_time,
     "figures/errors_over_time.png": errors_over_time,
+    "figures/tracking.png": tracking,
     "figures/error_bars.png": error_bars,
     "results/noise_levels/noise_levels.png": noise_levels,
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),

@@ -82,6 +82,11 @@ def learn_error_bars(
         system.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
+    if artifact.flow is not None:
+        raise ValueError(
+            "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
+            "it was made from, then teach that to track"
+        )
     if steps < 1 or trajectories < 100 or seed < 0:
         raise ValueError(
             f"need a step at least, 100 trajectories and a seed that is not negative, got {steps}, {trajectories}, "

@@ -28,7 +28,7 @@ WIDTH, DEPTH, BATCH = 48, 2, 1024
 LEARNING_RATE = 3e-3
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
-JUDGED = 20_000  # increments of which the flow's error is taken
+JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 
 
@@ -37,7 +37,7 @@ def learn_tracking(
     system: System,
     *,
     steps: int = 40_000,
-    trajectories: int = 500,
+    trajectories: int = 200,
     seed: int = 0,
     policy: Controller | None = None,
     device: torch.device | None = None,
@@ -154,7 +154,8 @@ def _learned(
     rng = generator(Stream.CALIBRATION, seed, 5)
     with progress.phase("simulating motions"):
         drawn = draw_increments(system, dt, duration=duration, nu=nu, rng=rng, policy=policy)
-    judged, increments = drawn.part(slice(JUDGED)), drawn.part(slice(JUDGED, None))
+    held_out = round(JUDGED * len(drawn.x))
+    judged, increments = drawn.part(slice(held_out)), drawn.part(slice(held_out, None))
     u_scale = np.array(system.u_max[:nu], dtype=float)
     problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
     with tempfile.TemporaryDirectory() as folder:

@@ -82,13 +82,19 @@ class Exported:
         Raises
         ------
         ArtifactError
-            If there is no such observer, its file is damaged, or a number of it is beyond the range of floats.
+            If there is no such observer, its file is damaged, it tracks, or a number of it is beyond the range of
+            floats.
         ValueError
             If the precision is unknown, or a level of noise is out of range.
         """
         choice("precision", precision, PRECISIONS)
         text, path = os.fspath(name_or_path), resolve(name_or_path)
         artifact = Artifact.read(path)
+        if artifact.flow is not None:
+            raise ArtifactError(
+                f"{path.name} tracks, and what is exported is the filter and T_inv alone: export the map that it was "
+                "made from (kkl-gym tracking leaves it as it is)"
+            )
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
         exported = cls(
             artifact,

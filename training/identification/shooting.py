@@ -1,6 +1,6 @@
 """Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -226,9 +226,9 @@ class _Motions:
 class _Problem:
     """The least squares of one set of windows."""
 
-    def __init__(self, shooting: Shooting, windows: Windows) -> None:
+    def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
         self.shooting, self.windows = shooting, windows
-        spread = np.nanvar(windows.y.reshape(-1, windows.y.shape[-1]), axis=0)
+        spread = np.nanvar(windows.y.reshape(-1, windows.y.shape[-1]), axis=0) if noise is None else noise**2
         self.weight = 1.0 / np.where(spread > 0, spread, 1.0)
         low, high = np.array(shooting.system.bounds, dtype=float).T
         self.low, self.high = low + 1e-6 * (high - low), high - 1e-6 * (high - low)
@@ -331,9 +331,19 @@ def explained(each: np.ndarray) -> np.ndarray:
 
 
 def shoot(
-    shooting: Shooting, theta: np.ndarray, windows: Windows, *, precision: float = SMALL_STEP, rounds: int = ROUNDS
+    shooting: Shooting,
+    theta: np.ndarray,
+    windows: Windows,
+    *,
+    precision: float = SMALL_STEP,
+    rounds: int = ROUNDS,
+    noise: Sequence[float] | None = None,
 ) -> Fit:
     """Least squares over parameters and starts at one length of windows.
+
+    Windows that the model explains much worse than most do not count. Where a model is good for some motions and rough
+    for others, as of friction, tell the ``noise`` instead: all windows count then, the less the worse they are
+    explained: by the share 1 / (1 + mean square of the residuals over the noise's).
 
     Parameters
     ----------
@@ -347,6 +357,8 @@ def shoot(
         Size of a step, in standard errors of the parameters, from which on they are good enough.
     rounds : int
         Most steps.
+    noise : sequence of float, length ny, optional
+        Standard deviation of each output's residuals where the model is good.
 
     Returns
     -------
@@ -358,11 +370,14 @@ def shoot(
     UnexplainedError
         If the motions of all windows leave the system's bounds.
     """
-    problem, nx, damping, slow = _Problem(shooting, windows), shooting.system.nx, FIRST_DAMPING, 0
+    problem = _Problem(shooting, windows, None if noise is None else np.asarray(noise, dtype=float))
+    nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
+    # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
+    count = np.log1p if noise is not None else np.asarray
     at = problem.follow(theta, windows.x0, problem.rows)
     problem.settle(theta, at, problem.rows, SETTLING)
     for _ in range(rounds):
-        used = explained(at.each)
+        used = explained(at.each) if noise is None else np.isfinite(at.each)
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
             raise UnexplainedError(
@@ -371,8 +386,10 @@ def shoot(
                 f"{dict(zip(shooting.names, theta.round(6).tolist()))}; give other first guesses, or limits"
             )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
-        better = False
-        cost = at.each[used].mean()
+        better, cost = False, at.each[used].mean()
+        if noise is not None:
+            share = 1.0 / (1.0 + at.each)
+            H, g, cost = H * share[:, None, None], g * share[:, None], 1.0
         if cost < EXACT or _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision:
             break
         while damping < MOST_DAMPING and not better:
@@ -384,7 +401,8 @@ def shoot(
             tried = problem.follow(new, x0, problem.rows)
             problem.settle(new, tried, np.flatnonzero(tried.each > WORSE * at.each), RESETTLING)
             # Windows that chaos has thrown off count no more than what lies beyond the worst that is explained.
-            fall = at.each[used].sum() - np.minimum(tried.each[used], 2 * at.each[used].max()).sum()
+            worst = np.minimum(tried.each[used], 2 * at.each[used].max())
+            fall = count(at.each[used]).sum() - count(worst).sum()
             better = fall > 0
             damping = max(damping / 10.0, 1e-12) if better else damping * 10.0
         if not better:

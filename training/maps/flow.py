@@ -54,7 +54,6 @@ def draw_increments(
     duration: float,
     nu: int,
     rng: np.random.Generator,
-    runs: int = RUNS,
     policy: Controller | None = None,
 ) -> Increments:
     """Simulate motions, and from states about them one sample further.
@@ -71,8 +70,6 @@ def draw_increments(
         Number of inputs that the observer knows of: the system's, or 0, which then do not act.
     rng : numpy.random.Generator
         Of everything random.
-    runs : int
-        Number of motions without input, and as many under inputs.
     policy : callable, optional
         Acts on the motions in place of random inputs.
 
@@ -85,12 +82,12 @@ def draw_increments(
     kinds: list[Motions] = [] if policy else [Motions(box_factor=REACH)]
     if nu:
         kinds.append(Motions(kinds=DRIVEN, box_factor=REACH, policy=policy))
-    every = max(1, steps * runs * len(kinds) // STATES)
+    every = max(1, steps * RUNS * len(kinds) // STATES)
     along = np.concatenate(
         [
             x[::every].reshape(-1, system.nx)
             for motions in kinds
-            for x, _, _ in trajectories(system, n=runs, steps=steps, dt=dt, rng=rng, motions=motions)
+            for x, _, _ in trajectories(system, n=RUNS, steps=steps, dt=dt, rng=rng, motions=motions)
         ]
     )
     offset, scale = along.mean(0), along.std(0)

@@ -133,6 +133,14 @@ class ShippedSPINN(Shipped):
     suffix: ClassVar[str] = "-spinn"
 
 
+class ShippedTracking(Shipped):
+    """The maps that ship and track, likewise: ``kkl-gym benchmark --methods training.methods.kkl:ShippedTracking``."""
+
+    name: ClassVar[str] = "shipped-tracking"
+    label: ClassVar[str] = "kkl-gym tracking, as shipped"
+    suffix: ClassVar[str] = "-tracking"
+
+
 class SPINN(KKLMethod):
     """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
 

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
@@ -67,6 +68,28 @@ def fitted(measured, **guesses):
     values = np.array(list(guesses.values()))
     shooting = Shooting(system, system.dt, limits, values)
     return shooting, shoot(shooting, values, measured)
+
+
+def test_windows_count_less_the_worse_they_are_explained():
+    """Against the best rate of a search in one dimension, with the best starts in closed form."""
+    good = windows(Decay(), 20, 60, noise=0.01, process_noise=0.0, seed=0)
+    rough = windows(Decay(rate_constant=1.3), 15, 60, noise=0.01, process_noise=0.0, seed=1)
+    both = Windows(*(np.concatenate([getattr(w, each) for w in (good, rough)], axis) for each, axis in AXES.items()))
+    shooting = Shooting(Decay(), Decay.dt, {"rate_constant": (0.1, 10.0)}, np.array([1.0]))
+
+    def counted(rate):
+        shape = np.exp(-rate * Decay.dt * np.arange(61))
+        x0 = shape @ both.y[..., 0] / (shape @ shape)
+        return np.log1p(((both.y[..., 0] - shape[:, None] * x0) ** 2).mean(0) / 0.01**2).sum()
+
+    best = minimize_scalar(counted, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-6}).x
+    fit = shoot(shooting, np.array([0.9]), both, noise=(0.01,), precision=1e-4, rounds=100)
+    assert fit.parameters["rate_constant"] == pytest.approx(best, abs=1e-3)
+    alike = shoot(shooting, np.array([0.9]), both).parameters["rate_constant"]
+    assert abs(fit.parameters["rate_constant"] - 1.0) < abs(alike - 1.0) / 2
+
+
+AXES = {"y": 1, "u": 1, "x0": 0}  # along which windows follow each other
 
 
 @pytest.mark.parametrize(("process_noise", "coloured"), [(0.0, False), (0.3, True)])

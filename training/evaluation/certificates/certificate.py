@@ -182,6 +182,8 @@ def certify(
         If the observer was made for another system; also a ValueError.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
+    if artifact.flow is not None:
+        raise ValueError("the bounds are those of T_inv(z), and this observer tracks: certify the map it was made from")
     process_noise = system.process_noise if process_noise is None else process_noise
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:

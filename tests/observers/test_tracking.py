@@ -1,0 +1,314 @@
+"""Observers that track: on a linear system they are a Kalman filter, which T_inv starts and starts again."""
+
+import copy
+import dataclasses
+import json
+import pickle
+
+import numpy as np
+import pytest
+from error_bars import with_error_bars
+from linear_system import C
+from safetensors import safe_open
+from scipy.linalg import solve_discrete_are
+from tracking import DT, PROCESS, STD, KalmanFilter, exact_flow, exact_motion, plain_observer, tracking_observer
+
+from observers import MLP, Artifact, ArtifactError, Factors, KKLObserver, unscented
+
+LEVEL = 0.2
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}
+OLD = 400  # samples: far beyond age_max, where T_inv is asked no more
+
+
+def runs(steps=OLD, n=3, outputs=C):
+    """States of the oscillator and their noisy outputs, (steps, n, .)."""
+    rng, (Phi, _) = np.random.default_rng(0), exact_motion()
+    x = np.empty((steps, n, 2))
+    x[0] = rng.uniform(-1, 1, (n, 2))
+    for k in range(1, steps):
+        x[k] = x[k - 1] @ Phi.T + PROCESS * rng.standard_normal((n, 2))
+    return x, x @ outputs.T + LEVEL * rng.standard_normal((steps, n, len(outputs)))
+
+
+def followed(observer, outputs=C):
+    """A Kalman filter for each row that stands where the observer does."""
+    return [KalmanFilter(x, P, LEVEL, outputs) for x, P in zip(observer.decode(), observer.covariance, strict=True)]
+
+
+def settled(outputs=C, **options):
+    """An observer that T_inv tells nothing more, and the states and samples that come next."""
+    observer = KKLObserver(tracking_observer(outputs, **options), LEVEL, process_noise=0.0)
+    x, y = runs(steps=OLD + 200, outputs=outputs)
+    observer.reset(y[0])
+    for sample in y[1:OLD]:
+        observer.step(sample)
+    return observer, x[OLD:], y[OLD:]
+
+
+def test_it_is_the_kalman_filter_of_a_linear_system():
+    observer, _, y = settled()
+    filters = followed(observer)
+    for sample in y:
+        found = observer.step(sample)
+        expected = [each.step(row) for each, row in zip(filters, sample, strict=True)]
+        np.testing.assert_allclose(found, expected, **CLOSE)
+        np.testing.assert_allclose(observer.covariance, [each.P for each in filters], **CLOSE)
+    Phi, _ = exact_motion()
+    stationary = solve_discrete_are(Phi.T, C.T, PROCESS**2 * np.eye(2), [[LEVEL**2]])
+    K = stationary @ C.T / (C @ stationary @ C.T + LEVEL**2)
+    np.testing.assert_allclose(observer.covariance[0], (np.eye(2) - K @ C) @ stationary, rtol=1e-4)
+
+
+def test_t_inv_says_where_to_begin():
+    artifact, (_, y) = tracking_observer(), runs()
+    observer, plain = KKLObserver(artifact, LEVEL, process_noise=0.0), KKLObserver(plain_observer(), LEVEL)
+    np.testing.assert_allclose(observer.reset(y[0]), plain.reset(y[0]))
+    np.testing.assert_allclose(observer.std, np.full((3, 2), STD), rtol=1e-6)
+    for sample in y[1:4]:  # nothing is surer than the filter once it has begun
+        assert not np.allclose(observer.step(sample), plain.step(sample))
+
+
+def test_t_inv_takes_over_where_it_is_surer():
+    sure = tracking_observer()
+    spread = sure.inverse.spread
+    low = MLP(spread.mlp.weights, [spread.mlp.biases[0], np.array([-9.0, -9.0, 0.0])], "tanh")
+    inverse = dataclasses.replace(sure.inverse, spread=dataclasses.replace(spread, mlp=low))
+    observer, (_, y) = KKLObserver(dataclasses.replace(sure, inverse=inverse), LEVEL), runs()
+    plain = KKLObserver(plain_observer(), LEVEL)
+    observer.reset(y[0])
+    plain.reset(y[0])
+    old = round(sure.flow.window / DT)
+    for k in range(1, old + 10):
+        same = np.allclose(observer.step(y[k]), plain.step(y[k]))
+        assert same == (k < old), k
+
+
+def test_errors_are_those_of_the_covariance():
+    x, y = runs(n=400, steps=200)
+    observer = KKLObserver(tracking_observer(), LEVEL, process_noise=0.0)
+    error, P = x - observer.estimate(y), observer.estimate_covariance(y)
+    late = slice(100, None)
+    np.testing.assert_allclose(
+        (error**2)[late].mean((0, 1)), P[late].diagonal(axis1=-2, axis2=-1).mean((0, 1)), rtol=0.1
+    )
+
+
+def test_a_lost_estimate_is_found_again():
+    observer, x, y = settled()
+    jump = np.array([3.0, -2.0])
+    sound, window = observer.std.max(), round(observer.artifact.flow.window / DT)
+    for k in range(20):
+        observer.step(y[k])
+        np.testing.assert_allclose(observer.std.max(), sound, rtol=0.01)  # chance does not make it lost
+    (Phi, _), away, widest = exact_motion(), jump, 0.0
+    for k in range(20, 20 + 8 * window):
+        moved, away = x[k] + away, Phi @ away
+        found = observer.step(y[k] + (moved - x[k])[:, :1])
+        widest = max(widest, observer.std.max())
+    np.testing.assert_allclose(widest, STD, rtol=0.02)  # T_inv said it
+    assert np.abs(found - moved).max() < 0.3
+
+
+def test_a_missing_sample_corrects_nothing():
+    observer, _, y = settled()
+    filters = followed(observer)
+    for k, sample in enumerate(y[:40]):
+        gone = k % 4 == 1
+        found = observer.step(None if gone else sample)
+        expected = [each.step(None if gone else row) for each, row in zip(filters, sample, strict=True)]
+        np.testing.assert_allclose(found, expected, **CLOSE)
+
+
+def test_one_of_two_outputs_may_be_missing():
+    both = np.eye(2)
+    observer, _, y = settled(both)
+    filters = followed(observer, both)
+    for k, sample in enumerate(y[:40]):
+        sample[k % 3, k % 2] = np.nan
+        expected = [each.step(row) for each, row in zip(filters, sample, strict=True)]
+        np.testing.assert_allclose(observer.step(sample), expected, **CLOSE)
+
+
+def test_batches_are_rows_and_records_are_steps():
+    artifact, (_, y) = tracking_observer(), runs(n=4, steps=60)
+    batch = KKLObserver(artifact, LEVEL)
+    record, covariances = batch.estimate(y.reshape(60, 2, 2, 1)), batch.estimate_covariance(y)
+    for i in range(4):
+        single = KKLObserver(artifact, LEVEL)
+        for k in range(60):
+            x_hat = single.step(y[k, i]) if k else single.reset(y[k, i])
+            np.testing.assert_allclose(record[k, i // 2, i % 2], x_hat, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(covariances[k, i], single.covariance, rtol=1e-9, atol=1e-12)
+    with pytest.raises(RuntimeError, match="reset"):
+        batch.decode()  # its own state is as it was
+
+
+def test_some_rows_move_and_some_begin_anew():
+    observer, _, y = settled()
+    rows = np.array([True, False, True])
+    before, covariance = observer.decode(), observer.covariance
+    observer.advance(y[0], rows=rows)
+    np.testing.assert_array_equal(observer.decode()[1], before[1])
+    np.testing.assert_array_equal(observer.covariance[1], covariance[1])
+    assert (observer.decode()[rows] != before[rows]).all()
+    np.testing.assert_array_equal(observer.decode(rows), observer.decode()[rows])
+    np.testing.assert_array_equal(observer.decode_covariance(rows), observer.covariance[rows])
+    moved = observer.decode()
+    observer.restart(y[1][:1], [False, True, False])
+    fresh = KKLObserver(observer.artifact, LEVEL)
+    np.testing.assert_allclose(observer.decode()[1], fresh.reset(y[1][0]))
+    np.testing.assert_allclose(observer.std[1], [STD, STD])
+    np.testing.assert_array_equal(observer.decode()[[0, 2]], moved[[0, 2]])
+    observer.restart(np.zeros((0, 1)), [False] * 3)
+
+
+def test_a_known_start_is_begun_with():
+    observer, (x, y) = KKLObserver(tracking_observer(), LEVEL), runs()
+    np.testing.assert_allclose(observer.reset(y[0], x[0]), x[0])
+    assert (observer.std < 0.01).all()
+    known = np.array([[0.4, 0.6]])
+    observer.restart(y[1][:1], [True, False, False], known)
+    np.testing.assert_allclose(observer.decode()[0], known[0])
+
+
+def test_levels_change_while_it_runs():
+    observer, _, y = settled()
+    x_hat, P = observer.decode(), observer.covariance
+    observer.measurement_noise = 0.5
+    np.testing.assert_allclose(observer.decode(), x_hat)
+    np.testing.assert_allclose(observer.covariance, P)
+    single = KalmanFilter(x_hat[0], P[0], 0.5)
+    np.testing.assert_allclose(observer.step(y[0])[0], single.step(y[0, 0]), **CLOSE)
+    observer.process_noise = 3.0
+    single.Q = (3.0 * PROCESS) ** 2 * np.eye(2)
+    np.testing.assert_allclose(observer.step(y[1])[0], single.step(y[1, 0]), **CLOSE)
+
+
+def test_maps_are_replaced_while_it_runs():
+    observer, *_ = settled()
+    x_hat, P = observer.decode(), observer.covariance
+    observer.replace(tracking_observer(x_scale=(1.0, 3.0)))
+    np.testing.assert_allclose(observer.decode(), x_hat)
+    np.testing.assert_allclose(observer.covariance, P)
+    observer.replace(plain_observer())
+    plain = observer.decode()
+    assert not np.allclose(plain, x_hat)
+    observer.replace(tracking_observer())
+    np.testing.assert_allclose(observer.decode(), plain)  # it begins with what T_inv says
+    observer.step(np.zeros((3, 1)))
+
+
+def test_copies_and_pickles_go_on_alike():
+    observer, _, y = settled()
+    others = [pickle.loads(pickle.dumps(observer)), copy.deepcopy(observer)]
+    for sample in y[:5]:
+        found = observer.step(sample)
+        for other in others:
+            np.testing.assert_array_equal(other.step(sample), found)
+
+
+def test_what_it_returns_is_the_callers():
+    observer, *_ = settled()
+    x_hat, P = observer.decode(), observer.covariance
+    kept = x_hat.copy(), P.copy()
+    x_hat += 1.0
+    P += 1.0
+    np.testing.assert_array_equal(observer.decode(), kept[0])
+    np.testing.assert_array_equal(observer.covariance, kept[1])
+
+
+def test_factors_make_covariances_larger():
+    factors = Factors(np.array([0.0, 1.0]), np.array([0.0, 10.0]), np.array([[1.0, 1.0], [1.0, 16.0]]))
+    (plain, *_), (wide, *_) = settled(), settled(factors=factors)
+    # The logarithm is interpolated: age and level 0.2 of 1 give 16 ** (0.2 * 1) beyond the last age.
+    np.testing.assert_allclose(wide.covariance, plain.covariance * 16**0.2, rtol=1e-9)
+    np.testing.assert_array_equal(wide.decode(), plain.decode())
+
+
+def test_estimates_stay_within_bounds_and_finite():
+    artifact = tracking_observer()
+    narrow = dataclasses.replace(artifact, flow=dataclasses.replace(artifact.flow, low=-np.ones(2), high=np.ones(2)))
+    observer = KKLObserver(narrow, LEVEL)
+    observer.reset(np.array([0.0]))
+    for y in (1e14, -1e14, 0.0, 5.0, 1e14):
+        x_hat = observer.step(np.array([y]))
+        assert (np.abs(x_hat) <= 1.0 + 1e-12).all()
+        assert np.isfinite(observer.covariance).all()
+
+
+def test_bad_samples_change_nothing():
+    observer, _, y = settled()
+    x_hat = observer.decode()
+    for bad in (np.full((3, 1), np.nan), y[0][:2], np.full((3, 1), np.inf)):
+        with pytest.raises(ValueError, match="y "):
+            observer.step(bad)
+    np.testing.assert_array_equal(observer.decode(), x_hat)
+
+
+def test_files_hold_it(tmp_path):
+    path, artifact = tmp_path / "map.safetensors", tracking_observer()
+    artifact.save(path)
+    with safe_open(path, "np") as file:
+        assert json.loads(file.metadata()["kkl-gym"])["format"] == 6
+    _, y = runs(steps=30)
+    again = KKLObserver(Artifact.read(path), LEVEL).estimate(y)
+    np.testing.assert_allclose(again, KKLObserver(artifact, LEVEL).estimate(y), rtol=1e-6)
+    plain_observer().save(path)
+    assert Artifact.read(path).flow is None
+
+
+def test_what_does_not_fit_is_refused(make_artifact):
+    plain, flow = plain_observer(), tracking_observer().flow
+    replace = dataclasses.replace
+    with pytest.raises(ArtifactError, match="does not fit an observer of"):
+        replace(plain, flow=exact_flow())  # which has an input
+    with pytest.raises(ArtifactError, match="error bars and the output"):
+        replace(plain, inverse=replace(plain.inverse, spread=None), flow=flow)
+    with pytest.raises(ArtifactError, match="error bars and the output"):
+        replace(plain, C=None, flow=flow)
+    with pytest.raises(ArtifactError, match="by process noise"):
+        replace(plain, flow=replace(flow, factors=Factors(np.zeros(1), np.zeros(1), np.ones((2, 1, 1)))))
+    uncertain = with_error_bars(make_artifact("van_der_pol", estimated=True))
+    with pytest.raises(ArtifactError):
+        replace(uncertain, C=C, flow=replace(exact_flow()))
+    for name, value in (
+        ("x_scale", np.zeros(2)),
+        ("error", -np.ones(2)),
+        ("low", np.full(2, 50.0)),
+        ("window", 0.0),
+        ("window", np.nan),
+        ("linear", np.zeros((2, 3))),
+        ("gain", np.ones(3)),
+        ("least_measurement_noise", np.zeros(1)),
+    ):
+        with pytest.raises(ArtifactError):
+            replace(flow, **{name: value})
+    with pytest.raises(ArtifactError, match="kkl-gym tracking"):
+        plain.require_flow()
+
+
+def test_covariances_that_are_none_have_no_factor():
+    P = np.stack([np.eye(2), np.diag([1.0, -1.0]), np.full((2, 2), np.nan), 4.0 * np.eye(2)])
+    found = unscented.factor(P)
+    np.testing.assert_allclose(found[[0, 3]], [np.eye(2), 2.0 * np.eye(2)])
+    assert np.isnan(found[[1, 2]]).all()
+
+
+@pytest.mark.parametrize("nx", [1, 2, 3, 4, 6])
+def test_sigma_points_have_mean_and_covariance(nx):
+    rng = np.random.default_rng(nx)
+    root = rng.normal(size=(5, nx, nx))
+    x, P = rng.normal(size=(5, nx)), root @ root.mT + np.eye(nx)
+    A, Q = rng.normal(size=(nx, nx)), np.diag(rng.uniform(size=nx))
+    mean, covariance = unscented.predicted(x, P, move=lambda points: points @ A.T + 1.0, Q=Q)
+    np.testing.assert_allclose(mean, x @ A.T + 1.0)
+    np.testing.assert_allclose(covariance, A @ P @ A.T + Q)
+    H, R = rng.normal(size=(2, nx)), np.diag([0.3, 0.7])
+    y = rng.normal(size=(5, 2))
+    found, left, nis = unscented.corrected(x, P, y, output=lambda points: points @ H.T, R=R)
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    np.testing.assert_allclose(found, x + (K @ (y - x @ H.T)[..., None])[..., 0])
+    np.testing.assert_allclose(left, (np.eye(nx) - K @ H) @ P, rtol=1e-6, atol=1e-9)
+    apart = y - x @ H.T
+    np.testing.assert_allclose(nis, np.einsum("ni,nij,nj->n", apart, np.linalg.inv(S), apart) / 2)

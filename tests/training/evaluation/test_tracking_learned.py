@@ -1,0 +1,133 @@
+"""Observers that are taught to track, where the truth is known: on a linear system, and on one whose flow is exact."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from linear_system import Oscillator
+from rich.console import Console
+from tracking import DT, exact_motion, plain_observer, tracking_observer
+
+from kkl_gym import get_system
+from observers import Artifact, KKLObserver, load
+from training.commands.tracking import Tracking
+from training.evaluation import regions, tracking
+from training.evaluation.certificates.certificate import certify
+from training.evaluation.coverage import coverage
+from training.evaluation.errorbars import learn_error_bars
+from training.evaluation.errors import errors, unseen_trajectories
+from training.evaluation.tracking import learn_tracking
+from training.export.exported import Exported
+from training.guided import GuidedKalmanFilter
+from training.maps import flow
+
+
+class Noiseless(Oscillator):
+    """Process noise, which T_inv of the exact observer follows slowly, is not what is tested here."""
+
+    name = "oscillator"
+    process_noise = 0.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """Few simulations: a linear flow needs no more."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flow, "PAIRS", 20_000)
+        patch.setattr(flow, "RUNS", 40)
+        for module in (tracking, regions):
+            patch.setattr(module, "LEVELS", (0.0, 0.1, 0.3))
+        yield
+
+
+@pytest.fixture(scope="module")
+def learned():
+    return learn_tracking(plain_observer(), Noiseless(), steps=200, trajectories=200)
+
+
+def test_a_linear_flow_is_found_exactly(learned):
+    x, (Phi, _) = np.random.default_rng(0).uniform(-1, 1, (200, 2)), exact_motion()
+    np.testing.assert_allclose(learned.flow(x, np.zeros((200, 0))), x @ Phi.T, atol=1e-6)
+    assert (learned.flow.error < 1e-6).all()
+    assert learned.flow.window == pytest.approx(0.5 * Noiseless().pace)
+
+
+def test_t_inv_stays_as_it_is(learned):
+    before, after = plain_observer().inverse, learned.inverse
+    np.testing.assert_array_equal(before.mlp.weights[0], after.mlp.weights[0])
+    np.testing.assert_array_equal(before.spread.factors, after.spread.factors)
+
+
+@pytest.mark.parametrize("level", [0.1, 0.3])
+def test_errors_fall_and_regions_hold_them(learned, level):
+    system = Noiseless()
+    runs = unseen_trajectories(system, DT, n=400, duration=12.0, seed=7)
+    plain, tracked = (
+        errors(each, system, runs, measurement_noise=level, seed=7) for each in (plain_observer(), learned)
+    )
+    assert np.median(tracked.late) < 0.7 * np.median(plain.late)
+    (late,) = coverage(learned, system, runs, measurement_noise=level, seed=7, spans=(slice(100, None),))
+    assert late.joint[1] == pytest.approx(0.9, abs=0.04)
+
+
+def test_it_is_the_same_again():
+    one, other = (learn_tracking(plain_observer(), Noiseless(), steps=3, trajectories=50, seed=1) for _ in range(2))
+    np.testing.assert_array_equal(one.flow.mlp.weights[0], other.flow.mlp.weights[0])
+    np.testing.assert_array_equal(one.flow.factors.factors, other.flow.factors.factors)
+
+
+def test_inputs_are_learned():
+    artifact = load("van_der_pol").artifact
+    system = get_system("van_der_pol")
+    short = dataclasses.replace(artifact, limits=None, training={**artifact.training, "duration": 4.0})
+    found = learn_tracking(short, system, steps=600, trajectories=50)
+    assert found.flow.nu == 1
+    x = np.array([[1.5, 0.3]])
+    still, pushed = (found.flow(x, np.array([[u]]))[0, 1] for u in (0.0, 5.0))
+    assert pushed - still == pytest.approx(5.0 * 0.01, rel=0.2)
+
+
+def test_what_cannot_track_is_refused(make_artifact):
+    with pytest.raises(ValueError, match="no error bars"):
+        learn_tracking(dataclasses.replace(plain_observer(), inverse=_bare()), Noiseless())
+    with pytest.raises(ValueError, match="50 trajectories"):
+        learn_tracking(plain_observer(), Noiseless(), trajectories=3)
+    ranged = dataclasses.replace(plain_observer(), parameters={"k": 1.0}, parameter_ranges={"k": (0.9, 1.1)})
+    object.__setattr__(ranged, "check", lambda *_, **__: None)  # a system with such a parameter
+    with pytest.raises(ValueError, match="of one plant"):
+        learn_tracking(ranged, Noiseless())
+    with pytest.raises(ValueError, match="made for the system"):
+        learn_tracking(plain_observer(), get_system("lorenz"))
+
+
+def _bare():
+    return dataclasses.replace(plain_observer().inverse, spread=None)
+
+
+def test_who_needs_t_inv_alone_says_so(tmp_path):
+    artifact = tracking_observer()
+    artifact.save(tmp_path / "map.safetensors")
+    with pytest.raises(ValueError, match="tracks"):
+        Exported.read(tmp_path / "map.safetensors")
+    with pytest.raises(ValueError, match="tracks"):
+        certify(artifact, Noiseless())
+    with pytest.raises(ValueError, match="tracks"):
+        learn_error_bars(artifact, Noiseless())
+    guided = GuidedKalmanFilter(Noiseless(), artifact=artifact, measurement_noise=0.2)
+    assert guided._observer.artifact.flow is None
+
+
+def test_the_command_writes_it(tmp_path, monkeypatch):
+    console, source = Console(width=200, record=True), tmp_path / "map-v3.safetensors"
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "training.commands.tracking.read_observers", lambda *_: [("map", plain_observer(), Noiseless())]
+    )
+    plain_observer().save(source)
+    found = Tracking(str(source), steps=2, trajectories=50).run(console)
+    written = Artifact.read(tmp_path / "runs/tracking/map-tracking.safetensors")
+    np.testing.assert_array_equal(written.flow.factors.factors, found.flow.factors.factors)
+    y = np.random.default_rng(0).normal(size=(20, 2, 1))
+    assert not np.allclose(KKLObserver(written, 0.2).estimate(y), KKLObserver(plain_observer(), 0.2).estimate(y))
+    with pytest.raises(ValueError, match=r"must end in \.safetensors"):
+        Tracking(str(source), out=tmp_path / "map").run(console)
