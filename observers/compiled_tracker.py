@@ -1,4 +1,4 @@
-"""A tracker's step as machine code, where Numba is installed: one call for a single sample, a few for a batch.
+"""A tracker's step as machine code, where Numba is installed: two calls for a single sample, a few for a batch.
 
 It computes what :mod:`observers.unscented` does, on the flow of :mod:`observers.flow` and for outputs C x. The kernels
 are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly overhead. Of a batch, the
