@@ -153,7 +153,13 @@ class KKLObserver:
         if self.artifact.flow is None:
             return None
         level, process_noise = self._measurement_noise, self._process_noise
-        return Tracker(self.artifact, self._states, measurement_noise=level, process_noise=process_noise)
+        return Tracker(
+            self.artifact,
+            self._states,
+            measurement_noise=level,
+            process_noise=process_noise,
+            compiled=self._compiled,
+        )
 
     def _decoders(self, outputs: slice) -> Decoders:
         """The maps, or what of their outputs is meant, at the levels of noise."""
@@ -173,6 +179,8 @@ class KKLObserver:
         parts, _ = self._states.estimate(linear.advance_single(z, y, np.zeros(linear.nu), y), 0.0)
         if self.artifact.inverse.spread is not None:
             self._states.covariance(parts)
+        if self._tracker is not None:
+            self._tracker.warm_up(z)
 
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.

@@ -5,6 +5,7 @@ sqrt(3) times each column of the covariance's Cholesky factor (Wan and van der M
 prediction and correction.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -63,20 +64,21 @@ def corrected(
     points = sigma_points(x, P)
     expected, spread = _moments(output(points))
     missing = np.isnan(y)
-    innovation, noise = y - expected, R
+    innovation, S, measured = y - expected, _products(spread, spread) + R, y.shape[1]
     if missing.any():
-        innovation = np.where(missing, 0.0, innovation)
-        noise = R + missing[:, None, :] * (UNSEEN * R.max() * np.eye(y.shape[1]))
-    S = _products(spread, spread) + noise
-    K = np.linalg.solve(S, _products(spread, points - x)).mT
-    squared = (innovation * np.linalg.solve(S, innovation[..., None])[..., 0]).sum(-1)
-    nis = squared / np.maximum((~missing).sum(-1), 1)
-    return x + (K @ innovation[..., None])[..., 0], P - K @ S @ K.mT, nis
+        innovation[missing] = 0.0
+        S += missing[:, None, :] * (UNSEEN * R.max() * np.eye(y.shape[1]))
+        measured = np.maximum(y.shape[1] - missing.sum(-1), 1)
+    told = np.concatenate([_products(spread, points - x), innovation[..., None]], axis=-1)
+    solved = told / S if y.shape[1] == 1 else np.linalg.solve(S, told)
+    nis = (innovation * solved[..., -1]).sum(-1) / measured
+    change = solved[..., :-1].mT @ told  # K S K^T, and K times the innovation
+    return x + change[..., -1], P - change[..., :-1], nis
 
 
 def sigma_points(x: np.ndarray, P: np.ndarray) -> np.ndarray:
     """Sigma points (2 nx + 1, n, nx) of means (n, nx) and covariances (n, nx, nx); NaN where these are none."""
-    columns = np.moveaxis(np.sqrt(3.0) * factor(P), -1, 0)
+    columns = math.sqrt(3.0) * factor(P).transpose(2, 0, 1)
     return np.concatenate([x[None], x + columns, x - columns])
 
 
@@ -103,9 +105,10 @@ def _moments(points: np.ndarray) -> Gaussian:
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Weighted sum over points of outer products of (2 nx + 1, n, k) and (2 nx + 1, n, l), as (n, k, l)."""
     nx = len(a) // 2
-    weights = np.array([(3 - nx) / 3 + 2.0, *[1 / 6] * (2 * nx)])
-    weighted = a * weights[:, None, None]
-    return np.asarray(np.moveaxis(weighted, 0, -1) @ np.moveaxis(b, 0, 1))
+    weighted = a / 6
+    weighted[0] *= 6 * ((3 - nx) / 3 + 2.0)
+    products: np.ndarray = weighted.transpose(1, 2, 0) @ b.transpose(1, 0, 2)
+    return products
 
 
 __all__ = ["corrected", "factor", "predicted", "sigma_points"]

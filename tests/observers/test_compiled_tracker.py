@@ -1,0 +1,356 @@
+"""The tracker's machine code against NumPy, which is the reference."""
+
+import copy
+import itertools
+import pickle
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from error_bars import with_error_bars
+from random_artifacts import random_artifact
+
+import observers
+from observers import MLP, Expression, KKLObserver, compiled_tracker
+from observers.compiled_tracker import CompiledTracker
+from observers.factors import Factors
+from observers.flow import Flow
+from observers.observer import SOON
+from observers.sparse import MANY_ROWS
+from observers.unscented import corrected, predicted
+
+pytest.importorskip("numba")
+
+ROWS = 200
+MISSING, RESTART, LEVELS = 7, 60, 1150  # now and then, and once
+JUMPS = (600, 605)  # samples that no motion explains
+
+
+def a_flow(nx, nu, ny, seed=0):
+    """A damped rotation, bent a little by a network."""
+    rng = np.random.default_rng(seed)
+    sizes = (nx + nu, 13, 11, nx)
+    mlp = MLP(
+        [rng.normal(size=(b, a)) / a**0.5 for a, b in itertools.pairwise(sizes)],
+        [rng.normal(size=b) for b in sizes[1:]],
+        "tanh",
+    )
+    turn = rng.normal(size=(nx, nx))
+    linear = np.hstack([0.05 * (turn - turn.T) - 0.02 * np.eye(nx), 0.1 * rng.normal(size=(nx, nu))])
+    return Flow(
+        mlp=mlp,
+        x_offset=rng.normal(size=nx),
+        x_scale=rng.uniform(0.5, 2.0, nx),
+        u_scale=rng.uniform(0.5, 2.0, nu),
+        bias=0.01 * rng.normal(size=nx),
+        gain=0.02 * rng.uniform(0.5, 1.0, nx),
+        linear=linear,
+        low=np.full(nx, -8.0),
+        high=np.full(nx, 8.0),
+        error=np.full(nx, 2e-3),
+        process_noise=np.full(nx, 1e-2),
+        least_process_noise=0.1,
+        least_measurement_noise=np.full(ny, 0.02),
+        window=0.2,
+        factors=Factors(np.array([0.0, 0.5]), np.array([0.0, 1.0]), np.array([[2.0, 1.0], [1.5, 0.7]])),
+    )
+
+
+def tracking(outputs=1, inputs=True, surer=0.0):
+    """An observer of two states whose T_inv nobody trained, however sure it is, but whose flow is the truth."""
+    artifact = with_error_bars(random_artifact(inputs=inputs, outputs=outputs))
+    spread = artifact.inverse.spread
+    bars = MLP(spread.mlp.weights, [spread.mlp.biases[0], spread.mlp.biases[1] - surer], "tanh")
+    artifact = replace(artifact, inverse=replace(artifact.inverse, spread=replace(spread, mlp=bars)))
+    C = np.random.default_rng(3).normal(size=(outputs, artifact.nx))
+    return replace(artifact, C=C, flow=a_flow(artifact.nx, artifact.nu, outputs))
+
+
+def signals(artifact, steps, batch=()):
+    """Outputs along the flow with noise, which jump for a while, and inputs."""
+    rng, flow = np.random.default_rng(1), artifact.flow
+    u = np.sin(np.cumsum(0.3 * rng.normal(size=(steps, *batch, artifact.nu)), axis=0))
+    u[: steps // 10] = 0.0
+    x, y = flow.x_offset + flow.x_scale * rng.normal(size=(*batch, artifact.nx)), []
+    for k in range(steps):
+        x = flow(x, u[k]) + 0.002 * rng.normal(size=x.shape)
+        y.append(x @ artifact.C.T + 0.1 * rng.normal(size=(*batch, artifact.ny)))
+    y = np.array(y)
+    y[slice(*JUMPS)] += 6.0
+    return y, u
+
+
+def along(observer, y, u):
+    """Estimates, covariances and mean squares of innovations, with all that may happen on the way."""
+    found = [], [], []
+    batch, (steps, *_) = y.shape[1:-1], y.shape
+    rng = np.random.default_rng(2)
+    observer.reset(y[0])
+    for k in range(1, steps):
+        some = rng.random(batch) < 0.5
+        sample = y[k].copy()
+        if k % MISSING == 3 and y.shape[-1] > 1:
+            sample[..., 0] = np.nan
+        if k == LEVELS:
+            observer.measurement_noise, observer.process_noise = 0.3, 0.5
+        if k % RESTART == 20:
+            observer.restart(y[k][some], some)
+        if k % MISSING == 5:
+            observer.advance(None, u[k - 1])
+        elif k % 3 == 0:
+            observer.advance(sample, u[k - 1], some)
+        else:
+            observer.advance(sample, u[k - 1])
+        found[0].append(observer.decode())
+        found[1].append(observer.covariance)
+        found[2].append(observer._tracker._mean_square.copy())
+    return [np.array(each) for each in found]
+
+
+def assert_alike(found, expected, flow, within=1e-4):
+    """Estimates in units of their standard deviations, and covariances in units of themselves."""
+    (x, P, mean_square), (x_expected, P_expected, mean_square_expected) = found, expected
+    size = np.sqrt(P_expected.diagonal(0, -2, -1))
+    assert np.isfinite(x_expected).all()
+    assert np.abs((x - x_expected) / size).max() < within
+    assert np.abs((P - P_expected) / (size[..., :, None] * size[..., None, :])).max() < within
+    np.testing.assert_allclose(mean_square, mean_square_expected, rtol=within, atol=within)
+
+
+def numpy_alone(monkeypatch):
+    """Takes every batch for a small one."""
+    for module in (observers.tracker, observers.decoder, observers.network, observers.filter):
+        monkeypatch.setattr(module, "MANY_ROWS", 10**9)
+
+
+@pytest.mark.parametrize(("outputs", "inputs", "surer"), [(1, True, 0.0), (1, False, 0.0), (2, True, 2.0)])
+def test_two_thousand_single_samples(outputs, inputs, surer):
+    artifact = tracking(outputs, inputs, surer)
+    y, u = signals(artifact, 2000)
+    one, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
+    expected = along(other, y, u)
+    found = along(one, y, u)
+    assert one._tracker._machine is not None
+    assert other._tracker._machine is None
+    assert_alike(found, expected, artifact.flow)
+    assert not np.array_equal(found[0], expected[0])  # not the same arithmetic
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+def test_two_thousand_samples_of_many_rows(outputs, monkeypatch):
+    artifact = tracking(outputs)
+    y, u = signals(artifact, 2000, (ROWS,))
+    one, other = KKLObserver(artifact, 0.1), KKLObserver(artifact, 0.1)
+    found = along(one, y, u)
+    assert one._tracker._machine is not None
+    numpy_alone(monkeypatch)
+    expected = along(other, y, u)
+    assert other._tracker._machine is None
+    assert_alike(found, expected, artifact.flow)
+    assert not np.array_equal(found[0], expected[0])
+
+
+def test_rows_are_lost_found_and_taken_as_numpy_does_it(monkeypatch):
+    """From the same states at each sample, so that nothing adds up: covariances of all sizes, some of them none."""
+    artifact = tracking(2)
+    steps = 60
+    y, u = signals(artifact, steps, (ROWS,))
+    y[20:25, ::3] += 9.0
+    one, other = KKLObserver(artifact, 0.1), KKLObserver(artifact, 0.1)
+    rng, seen = np.random.default_rng(0), np.zeros(3, dtype=int)
+    one.reset(y[0])
+    other.reset(y[0])
+    for k in range(1, steps):
+        tracker = one._tracker
+        root = np.exp(rng.uniform(-3, 3, (ROWS, 1, 1))) * rng.normal(size=tracker._P.shape)
+        tracker._P[::4] = (root @ root.mT)[::4]
+        tracker._P[1::16] *= -1.0
+        tracker._x[2::32, 0] = 1e308 * (-1) ** k
+        other._z, other._y, other._age, other._tracker = one._z, one._y, one._age, copy.deepcopy(tracker)
+        rows, before = rng.random(ROWS) < 0.8, tracker._x.copy()
+        with monkeypatch.context() as patch:
+            one.advance(y[k], u[k], rows)
+            assert "_compiled" in vars(tracker)
+            numpy_alone(patch)
+            other.advance(y[k], u[k], rows)
+            assert "_compiled" not in vars(other._tracker)
+        beside = other._tracker
+        assert np.array_equal(tracker._x[~rows], before[~rows])
+        assert np.abs(tracker._x - beside._x).max() < 1e-4
+        np.testing.assert_allclose(tracker._P, beside._P, rtol=1e-3, atol=1e-6)
+        np.testing.assert_allclose(tracker._mean_square, beside._mean_square, rtol=1e-4)
+        said = tracker._scaled(*tracker._said(one._z, np.full(ROWS, float(k))))[1]
+        same = np.isclose(tracker._P, said, rtol=1e-3).all((1, 2))
+        seen += same[rows].sum(), (tracker._mean_square[rows] == 1.0).sum(), (~same[rows]).sum()
+    assert (seen > 100).all()
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_single_sample_is_a_row_of_a_batch(compiled):
+    """Also where it is lost long after a reset: T_inv counts for no surer than it would be soon after one."""
+    artifact, last = tracking(1), JUMPS[1] + 5
+    y, u = signals(artifact, last, (3,))
+    together = KKLObserver(artifact, 0.1)
+    alone = [KKLObserver(artifact, 0.1, compiled=compiled) for _ in range(3)]
+    together.reset(y[0])
+    for observer, first in zip(alone, y[0], strict=True):
+        observer.reset(first)
+    found = 0
+    for k in range(1, last):
+        x_hat, std = together.step(y[k], u[k]), together.std
+        for row, observer in enumerate(alone):
+            assert np.abs((observer.step(y[k, row], u[k, row]) - x_hat[row]) / std[row]).max() < 1e-4
+            np.testing.assert_allclose(observer.std, std[row], rtol=1e-4)
+        found += (together._tracker._mean_square == 1.0).sum()
+    assert found > 3
+
+
+@pytest.mark.parametrize(("nx", "nu", "ny"), [(1, 0, 1), (5, 2, 3)])
+def test_steps_of_other_sizes(nx, nu, ny):
+    """A single sample's and a batch's, of one more row than any loop would like."""
+    rng, flow = np.random.default_rng(nx), a_flow(nx, nu, ny)
+    C = rng.normal(size=(ny, nx))
+    low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
+    q, r = flow.variances(0.3, 0.1)
+    machine = CompiledTracker(flow, C, variances=(q, r), share=0.1)
+    for n in (1, 129):
+        x, root, u = rng.normal(size=(n, nx)), rng.normal(size=(n, nx, nx)), rng.normal(size=(n, nu))
+        P, y, before = root @ root.mT / 9 + 1e-6 * np.eye(nx), rng.normal(size=(n, ny)), rng.uniform(0.5, 2.0, n)
+        y[::3, 0], y[::4] = np.nan, np.nan
+        none = np.arange(n) % 10 == 5  # is a covariance there
+        P[none] *= -1.0
+        v = np.tile(u / flow.u_scale, (2 * nx + 1, 1))
+
+        def move(s):
+            return flow.scaled(np.clip(s, low, high).reshape(-1, nx), v).reshape(s.shape)  # noqa: B023
+
+        ahead = predicted(x, P, move=move, Q=np.diag(q))
+        expected = corrected(*ahead, y, output=lambda s: (flow.x_offset + flow.x_scale * s) @ C.T, R=np.diag(r))
+        state = x.copy(), P.copy(), before.copy()
+        found = machine.ahead(state, u)
+        for one, other in zip(found, ahead, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+        machine.correct(found, y, None, state)
+        share = 0.1 * ~np.isnan(y).all(-1)
+        wanted = np.clip(expected[0], low, high), expected[1], before + share * (expected[2] - before)
+        for one, other, start in zip(state, wanted, (np.clip(x, low, high), P, np.inf), strict=True):
+            other[none] = start[none] if np.ndim(start) else start
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+
+def test_outputs_that_are_not_linear_stay_with_numpy():
+    artifact = tracking(1)
+    C = artifact.C[0].tolist()
+    terms = ["+", *(["*", weight, ["x", i]] for i, weight in enumerate(C))]
+    curved = replace(artifact, C=None, h=Expression([terms]))
+    y, u = signals(artifact, 30)
+    one, other = (KKLObserver(each, 0.1, compiled=True) for each in (artifact, curved))
+    assert_alike(along(other, y, u), along(one, y, u), artifact.flow)
+    assert one._tracker._machine is not None
+    assert other._tracker._machine is None
+
+
+def test_a_run_compiles_nothing_in_its_midst():
+    """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, a filter that is old."""
+    artifact = tracking(2)
+    compiled_tracker._tracking.cache_clear()
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    kernels = compiled_tracker._tracking(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny)
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 0, 1, 1]
+    frozen, y = np.array([0.2]), np.array([0.1, 0.2])
+    frozen.flags.writeable = False
+    observer.reset(y)
+    for u in (np.broadcast_to(0.3, (1,)), frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0], None):
+        observer.step(y, u)
+    for sample in (None, [np.nan, 0.3], [np.nan, np.nan], np.full((2, 2), 0.1)[:, 1], [0, 0]):
+        observer.advance(sample)
+        observer.advance(sample, rows=np.array(True))
+        observer.advance(sample, rows=np.broadcast_to(False, ()))
+    observer.restart([y], np.array(True))
+    observer.step(y + 1e6)
+    observer._age = np.inf
+    observer.step(y)
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 0, 1, 1]
+
+
+def test_a_long_simulation_is_compiled_at_a_reset():
+    artifact = tracking(1)
+    observer, y = KKLObserver(artifact, 0.1), np.array([0.1])
+    observer.reset(y)
+    for _ in range(SOON):
+        observer.step(y)
+    assert observer._tracker._machine is None
+    observer.reset(y)
+    assert observer._tracker._machine is not None
+    observer.measurement_noise = 0.2
+    assert observer._tracker._machine is not None
+
+
+def test_one_row_of_a_batch_is_numpys():
+    artifact = tracking(1)
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    observer.reset(np.zeros((1, 1)))
+    assert observer._tracker._machine is None
+    observer.reset(np.zeros((MANY_ROWS, 1)))
+    assert observer._tracker._machine is not None
+
+
+@pytest.mark.parametrize("batch", [(), (ROWS,)])
+def test_machine_code_stays_when_an_observer_travels(batch):
+    artifact = tracking(1)
+    y, u = signals(artifact, 60, batch)
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    observer.reset(y[0])
+    for k in range(1, 30):
+        observer.step(y[k], u[k])
+    assert "_compiled" in vars(observer._tracker)
+    packed = pickle.dumps(observer)
+    assert b"CompiledTracker" not in packed
+    there, twin = pickle.loads(packed), copy.deepcopy(observer)
+    expected = np.array([observer.step(y[k], u[k]) for k in range(30, 60)])
+    for other in (there, twin):
+        assert np.array_equal(np.array([other.step(y[k], u[k]) for k in range(30, 60)]), expected)
+        np.testing.assert_array_equal(other.covariance, observer.covariance)
+
+
+@pytest.mark.parametrize(("batch", "again"), [((), 10_000), ((ROWS,), 100)])
+def test_observers_of_one_artifact_in_threads(batch, again):
+    """Samples, and then the same prediction again and again, which takes little of Python's time beside the kernels."""
+    artifact = tracking(1)
+    y, u = signals(artifact, 100, batch)
+    found = {}
+
+    def work(i):
+        observer = KKLObserver(artifact, 0.1 * (i + 1), compiled=True)
+        observer.reset((1 + 0.1 * i) * y[0])
+        for k in range(1, 100):
+            observer.step((1 + 0.1 * i) * y[k], u[k])
+        ahead = {observer._tracker.ahead(u[0])[0].tobytes() for _ in range(again)}
+        found[i] = observer.decode(), ahead
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for i in range(4):
+        x_hat, ahead = found.pop(i)
+        work(i)
+        assert np.array_equal(x_hat, found[i][0])
+        assert len(ahead) == 1
+        assert ahead == found[i][1]
+
+
+def test_what_is_looked_at_stays_as_it_was():
+    artifact = tracking(1)
+    y, u = signals(artifact, 20)
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    seen = [observer.reset(y[0])]
+    for k in range(1, 20):
+        seen.extend([observer.step(y[k], u[k]), observer.covariance, observer.std])
+        copies = [each.copy() for each in seen]
+        seen[-3] += 1.0  # the caller's own
+        copies[-3] += 1.0
+        observer.decode()
+        assert all(map(np.array_equal, seen, copies))
