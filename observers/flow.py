@@ -9,6 +9,8 @@ from observers.errors import ArtifactError, check_shapes
 from observers.factors import Factors
 from observers.network import MLP
 
+_LARGEST = 1e12  # of a window and of a level of noise, whose squares and quotients by dt then stay finite
+
 
 @dataclass(frozen=True)
 class Flow:
@@ -87,8 +89,8 @@ class Flow:
             raise ArtifactError(f"bounds of a flow must go from low to high, got {self.low} and {self.high}")
         for name in ("least_process_noise", "window"):
             value = getattr(self, name)
-            if not is_finite(value) or not value > 0:
-                raise ArtifactError(f"{name} of a flow must be a positive, finite number, got {value!r}")
+            if not is_finite(value) or not 0 < value <= _LARGEST:
+                raise ArtifactError(f"{name} of a flow must be positive and at most {_LARGEST:g}, got {value!r}")
 
     @property
     def nx(self) -> int:

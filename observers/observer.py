@@ -234,8 +234,8 @@ class KKLObserver:
         x0 : array_like, shape (..., nx), optional
             The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
             beside a motion without input: there is no transient, and a map that is told the age is told that it is
-            past it. An observer that tracks begins at x0 itself, with T or without. Where it is known in some rows
-            only, :meth:`restart` those.
+            past it. An observer that tracks begins at x0 itself, cut at the flow's bounds, with T or without. Where it
+            is known in some rows only, :meth:`restart` those.
 
         Returns
         -------

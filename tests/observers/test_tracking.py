@@ -283,6 +283,8 @@ def test_what_does_not_fit_is_refused(make_artifact):
         ("low", np.full(2, 50.0)),
         ("window", 0.0),
         ("window", np.nan),
+        ("window", 1e308),
+        ("least_process_noise", 1e200),
         ("linear", np.zeros((2, 3))),
         ("gain", np.ones(3)),
         ("least_measurement_noise", np.zeros(1)),

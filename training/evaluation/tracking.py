@@ -28,6 +28,7 @@ WIDTH, DEPTH, BATCH = 48, 2, 1024
 LEARNING_RATE = 3e-3
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
+OF_OUTPUT = 1e-4  # the same in multiples of each output's standard deviation: below, covariances would be rounding
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 
@@ -150,7 +151,6 @@ def _learned(
 ) -> Flow:
     """The flow, with factors that are none yet."""
     dt, nu, device = artifact.filter.dt, artifact.nu, device or torch.device("cpu")
-
     rng = generator(Stream.CALIBRATION, seed, 5)
     with progress.phase("simulating motions"):
         drawn = draw_increments(system, dt, duration=duration, nu=nu, rng=rng, policy=policy)
@@ -171,6 +171,8 @@ def _learned(
         optimise(stage, problem.network, problem.loss, progress, resume=False)
     low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
     usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
+    outputs = np.nanstd(system.output(increments.x), axis=0)
+    least = np.maximum(LEAST_MEASUREMENT_NOISE * usual, OF_OUTPUT * outputs)
     flow = Flow(
         problem.network.export(),
         x_offset=increments.x_offset,
@@ -184,7 +186,7 @@ def _learned(
         error=np.zeros(system.nx),
         process_noise=np.array(system.scale) / increments.x_scale * dt / np.sqrt(3),
         least_process_noise=LEAST_PROCESS_NOISE / system.pace,
-        least_measurement_noise=np.maximum(LEAST_MEASUREMENT_NOISE * usual, 1e-9),
+        least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
         factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
     )

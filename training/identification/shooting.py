@@ -342,8 +342,8 @@ def shoot(
     """Least squares over parameters and starts at one length of windows.
 
     Windows that the model explains much worse than most do not count. Where a model is good for some motions and rough
-    for others, as of friction, tell the ``noise`` instead: all windows count then, the less the worse they are
-    explained: by the share 1 / (1 + mean square of the residuals over the noise's).
+    for others, as of friction, tell the ``noise`` instead. All windows count then, by the share 1 / (1 + mean square of
+    their residuals over the noise's): the less, the worse they are explained.
 
     Parameters
     ----------
@@ -369,8 +369,13 @@ def shoot(
     ------
     UnexplainedError
         If the motions of all windows leave the system's bounds.
+    ValueError
+        If ``noise`` is not a positive number for each output.
     """
-    problem = _Problem(shooting, windows, None if noise is None else np.asarray(noise, dtype=float))
+    deviations = None if noise is None else np.asarray(noise, dtype=float)
+    if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
+        raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
+    problem = _Problem(shooting, windows, deviations)
     nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
     # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
     count = np.log1p if noise is not None else np.asarray

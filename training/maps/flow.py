@@ -71,7 +71,7 @@ def draw_increments(
     rng : numpy.random.Generator
         Of everything random.
     policy : callable, optional
-        Acts on the motions in place of random inputs.
+        Acts on the motions in place of random inputs, where the observer knows of inputs.
 
     Returns
     -------
@@ -79,7 +79,7 @@ def draw_increments(
         Up to ``PAIRS`` of them; those that leave the system's bounds are left out.
     """
     steps = round(duration / dt)
-    kinds: list[Motions] = [] if policy else [Motions(box_factor=REACH)]
+    kinds: list[Motions] = [] if policy and nu else [Motions(box_factor=REACH)]
     if nu:
         kinds.append(Motions(kinds=DRIVEN, box_factor=REACH, policy=policy))
     every = max(1, steps * RUNS * len(kinds) // STATES)

@@ -76,6 +76,34 @@ def test_it_is_the_same_again():
     np.testing.assert_array_equal(one.flow.factors.factors, other.flow.factors.factors)
 
 
+def test_a_sensor_without_noise_is_taken_to_have_a_little():
+    sure = dataclasses.replace(plain_observer(), measurement_noise=0.0)
+    found = learn_tracking(sure, Noiseless(), steps=200, trajectories=50)
+    assert found.flow.least_measurement_noise == pytest.approx(1e-4 * found.flow.x_scale[:1], rel=0.1)
+    (Phi, _), x = exact_motion(), [np.array([0.7, -0.4])]
+    for _ in range(300):
+        x.append(Phi @ x[-1])
+    observer = KKLObserver(found, 0.0, process_noise=0.0)
+    observer.reset(x[0][:1])
+    for state in x[1:]:
+        x_hat = observer.step(state[:1])
+        assert (np.linalg.eigvalsh(observer.covariance) > 0).all()
+    np.testing.assert_allclose(x_hat, x[-1], atol=1e-3)
+    sure_of_it = observer.std
+    for _ in range(100):
+        observer.step(None)
+    assert (observer.std > 2 * sure_of_it).all()  # what is missing tells nothing
+
+
+def test_a_policy_needs_an_observer_that_knows_of_inputs():
+    rng = [np.random.default_rng(0) for _ in range(2)]
+    alone, under = (
+        flow.draw_increments(Noiseless(), DT, duration=1.0, nu=0, rng=each, policy=policy)
+        for each, policy in zip(rng, (None, lambda x: -x[..., :1]), strict=True)
+    )
+    np.testing.assert_array_equal(alone.change, under.change)
+
+
 def test_inputs_are_learned():
     artifact = load("van_der_pol").artifact
     system = get_system("van_der_pol")

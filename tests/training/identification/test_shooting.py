@@ -85,6 +85,9 @@ def test_windows_count_less_the_worse_they_are_explained():
     best = minimize_scalar(counted, bounds=(0.5, 2.0), method="bounded", options={"xatol": 1e-6}).x
     fit = shoot(shooting, np.array([0.9]), both, noise=(0.01,), precision=1e-4, rounds=100)
     assert fit.parameters["rate_constant"] == pytest.approx(best, abs=1e-3)
+    for wrong in ((0.01, 0.01), (0.0,), (np.nan,)):
+        with pytest.raises(ValueError, match="1 positive numbers"):
+            shoot(shooting, np.array([0.9]), both, noise=wrong)
     alike = shoot(shooting, np.array([0.9]), both).parameters["rate_constant"]
     assert abs(fit.parameters["rate_constant"] - 1.0) < abs(alike - 1.0) / 2
 
