@@ -625,7 +625,7 @@ def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
 
 def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> Flow:
     arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
-    factors = {
+    factors: dict[str, Any] = {
         kind: Factors(*(tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS))
         for kind in _FLOW_FACTORS
         if kind == _FLOW_FACTORS[0] or f"flow.{kind}.{_SPREAD_ARRAYS[0]}" in tensors
