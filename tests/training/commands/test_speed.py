@@ -109,7 +109,7 @@ def test_speed_measures_every_environment(capsys):
             assert name.endswith("KKL")
             assert 100 * (reached - 0.51) / (most + 0.51) - 0.51 <= share
             assert share * (most - 0.51) <= 100 * (reached + 0.51) + 0.51 * (most - 0.51)
-    assert sum(any(speeds) for _, _, _, *speeds in alone) == 4 * 2
+    assert sum(any(speeds) for _, _, _, *speeds in alone) == 4 * 3
 
 
 def test_what_a_memory_takes_is_the_difference_to_the_bare_environment(monkeypatch):
