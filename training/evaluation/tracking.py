@@ -125,12 +125,22 @@ def learn_tracking(
                 rng = generator(Stream.CALIBRATION, seed, 8 + table)
                 told = partial(_tell, report, begun)
                 tables.append(_factors(tracking, system, runs, level, regions=regions, rng=rng, report=told))
-        factors = dataclasses.replace(flow.factors, factors=np.array(tables) if len(tables) > 1 else tables[0])
-        tracking = dataclasses.replace(tracking, flow=dataclasses.replace(flow, factors=factors))
+        driven, free = ([table[i] for table in tables] for i in range(2))
+        flow = dataclasses.replace(
+            flow,
+            factors=_with_tables(flow.factors, driven),
+            free_factors=_with_tables(flow.factors, free) if artifact.nu else None,
+        )
+        tracking = dataclasses.replace(tracking, flow=flow)
         if tracking.limits is not None:
             with progress.phase("finding the monitor's limits", PARTS) as report:
                 tracking = calibrate(tracking, system, policy=policy, report=report)
     return tracking
+
+
+def _with_tables(factors: Factors, tables: list[np.ndarray]) -> Factors:
+    """Factors with a table for each level of process noise, or the only one."""
+    return dataclasses.replace(factors, factors=np.array(tables) if len(tables) > 1 else tables[0])
 
 
 def _tell(report: Callable[[float], object], begun: int, done: int) -> None:
@@ -203,8 +213,11 @@ def _factors(
     regions: Regions,
     rng: np.random.Generator,
     report: Callable[[int], object],
-) -> np.ndarray:
-    """Factors (levels, knots) from the errors of an observer that tracks, along runs of a level of process noise."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Factors (levels, knots) from the errors of an observer that tracks, along runs of a level of process noise.
+
+    Those of motions on which an input has acted, and of others; the same where the observer knows of no inputs.
+    """
     x, u = runs
     clean, distances = system.output(x), list[np.ndarray]()
     for done, share in enumerate(LEVELS, 1):
@@ -220,4 +233,9 @@ def _factors(
                 found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
         distances.append(np.array(found))
         report(done)
-    return regions.factors(distances, np.ones(distances[0].shape, dtype=bool))
+    everywhere = np.ones(distances[0].shape, dtype=bool)
+    if not artifact.nu:
+        return (regions.factors(distances, everywhere),) * 2
+    acted = np.maximum.accumulate((u != 0).any(-1), axis=0)
+    driven = np.concatenate([np.zeros_like(acted[:1]), acted])[regions.ages]
+    return regions.factors(distances, driven), regions.factors(distances, ~driven)

@@ -79,9 +79,10 @@ def test_environments_take_turns_and_the_first_turn_does_not_count():
 def test_speed_measures_every_environment(capsys):
     """The printed times, of a single turn, are those that the ratios are made of."""
     ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
-    parts = {"": "", "x_hat": ", x_hat", "bars": ", x_hat, error bars", "small": ", x_hat, small", "z": ", z"}
+    parts = {"": "", "x_hat": ", x_hat", "bars": ", x_hat, error bars", "z": ", z"}
+    parts |= {kind: f", x_hat, {kind}" for kind in ("small", "tracking")}
     names = {what: {f"{env}{part}" for env in kkl_gym.ENV_IDS.values()} for what, part in parts.items()}
-    single = {"Pendulum-v1"} | names[""] | names["x_hat"] | names["bars"] | names["small"]
+    single = {"Pendulum-v1"} | names[""] | names["x_hat"] | names["bars"] | names["small"] | names["tracking"]
     batched = {"CartPole-v1"} | (single - {"Pendulum-v1"}) | names["z"]
     assert set(ratios) == single | {f"{name}, 8 rows" for name in batched}
     assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 8 rows"]) == (1.0, 1.0)
@@ -97,9 +98,9 @@ def test_speed_measures_every_environment(capsys):
             if rows:
                 simulated, network = ("%" in part for part in parts)
                 assert simulated == (name != reference)
-                assert network == (name in names["x_hat"] | names["bars"] | names["small"])
+                assert network == (name in single - {"Pendulum-v1"} - names[""])
     alone = [[cell.strip() for cell in cells] for cells in lines if len(cells) == 6]
-    assert len(alone) == 4 * (6 + 4)  # the default map has error bars, the small one none
+    assert len(alone) == 4 * (6 + 4 + 6)  # the small map alone has no error bars
     for name, one, many, *speeds in alone:
         assert float(one) > 0
         assert bool(many) == (not name.endswith("NumPy"))
@@ -108,7 +109,7 @@ def test_speed_measures_every_environment(capsys):
             assert name.endswith("KKL")
             assert 100 * (reached - 0.51) / (most + 0.51) - 0.51 <= share
             assert share * (most - 0.51) <= 100 * (reached + 0.51) + 0.51 * (most - 0.51)
-    assert sum(any(speeds) for _, _, _, *speeds in alone) == 4 * 2
+    assert sum(any(speeds) for _, _, _, *speeds in alone) == 4 * 3
 
 
 def test_what_a_memory_takes_is_the_difference_to_the_bare_environment(monkeypatch):
