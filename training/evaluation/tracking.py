@@ -216,7 +216,8 @@ def _factors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Factors (levels, knots) from the errors of an observer that tracks, along runs of a level of process noise.
 
-    Those of motions on which an input has acted, and of others; the same where the observer knows of no inputs.
+    Those of motions on which an input has acted, and of others; the same where the observer knows of no inputs, or
+    inputs act on all motions.
     """
     x, u = runs
     clean, distances = system.output(x), list[np.ndarray]()
@@ -233,9 +234,8 @@ def _factors(
                 found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
         distances.append(np.array(found))
         report(done)
-    everywhere = np.ones(distances[0].shape, dtype=bool)
-    if not artifact.nu:
-        return (regions.factors(distances, everywhere),) * 2
     acted = np.maximum.accumulate((u != 0).any(-1), axis=0)
     driven = np.concatenate([np.zeros_like(acted[:1]), acted])[regions.ages]
+    if not artifact.nu or driven[-1].all():  # under a policy no motion stays free, and later ages would have no factors
+        return (regions.factors(distances, np.ones_like(driven)),) * 2
     return regions.factors(distances, driven), regions.factors(distances, ~driven)

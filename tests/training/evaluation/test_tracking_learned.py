@@ -20,6 +20,7 @@ from training.evaluation.tracking import learn_tracking
 from training.export.exported import Exported
 from training.guided import GuidedKalmanFilter
 from training.maps import flow
+from training.trajectories.controllers import linear_quadratic
 
 
 class Noiseless(Oscillator):
@@ -113,6 +114,14 @@ def test_inputs_are_learned():
     x = np.array([[1.5, 0.3]])
     still, pushed = (found.flow(x, np.array([[u]]))[0, 1] for u in (0.0, 5.0))
     assert pushed - still == pytest.approx(5.0 * 0.01, rel=0.2)
+
+
+def test_under_a_policy_there_is_no_free_motion_to_calibrate_on():
+    artifact, system = load("van_der_pol").artifact, get_system("van_der_pol")
+    short = dataclasses.replace(artifact, limits=None, training={**artifact.training, "duration": 2.0})
+    found = learn_tracking(short, system, steps=3, trajectories=50, policy=linear_quadratic(system)).flow
+    np.testing.assert_array_equal(found.free_factors.factors, found.factors.factors)
+    assert np.ptp(found.factors.factors[0, 0]) > 0
 
 
 def test_what_cannot_track_is_refused(make_artifact):
