@@ -9,7 +9,7 @@ from rich.console import Console
 from tracking import DT, exact_motion, plain_observer, tracking_observer
 
 from kkl_gym import get_system
-from observers import Artifact, KKLObserver, load
+from observers import Artifact, KKLObserver, Limits, load
 from training.commands.tracking import Tracking
 from training.evaluation import regions, tracking
 from training.evaluation.certificates.certificate import certify
@@ -21,6 +21,7 @@ from training.export.exported import Exported
 from training.guided import GuidedKalmanFilter
 from training.maps import flow
 from training.trajectories.controllers import linear_quadratic
+from training.trajectories.noise import draw_process_noise
 
 
 class Noiseless(Oscillator):
@@ -51,6 +52,33 @@ def test_a_linear_flow_is_found_exactly(learned):
     np.testing.assert_allclose(learned.flow(x, np.zeros((200, 0))), x @ Phi.T, atol=1e-6)
     assert (learned.flow.error < 1e-6).all()
     assert learned.flow.window == pytest.approx(0.5 * Noiseless().pace)
+
+
+class Slow(Noiseless):
+    scale = (2.0, 0.5)
+    pace = 4.0
+
+
+def test_process_noise_is_that_of_simulations_at_the_systems_pace():
+    found = learn_tracking(plain_observer(), Slow(), steps=2, trajectories=50).flow
+    w = draw_process_noise(Slow(), 1.0, n=100, steps=200, rng=np.random.default_rng(0))
+    np.testing.assert_allclose(found.process_noise * found.x_scale, DT * w.std((0, 1)), rtol=0.03)
+    assert found.least_process_noise == pytest.approx(0.005 / 4.0)
+
+
+def test_the_monitors_limits_are_those_of_the_observer_that_tracks(monkeypatch):
+    limits = Limits(np.zeros(1), np.ones((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), 0.5, 1.0, 0.01, 20.0)
+    seen = []
+
+    def calibrate(artifact, system, **options):
+        seen.append(artifact)
+        return artifact
+
+    monkeypatch.setattr(tracking, "calibrate", calibrate)
+    sure = dataclasses.replace(plain_observer(), limits=limits)
+    found = learn_tracking(sure, Noiseless(), steps=2, trajectories=50)
+    assert [each.flow for each in seen] == [found.flow]
+    assert np.ptp(found.flow.factors.factors) > 0  # after its covariances
 
 
 def test_t_inv_stays_as_it_is(learned):
