@@ -38,7 +38,7 @@ def learn_tracking(
     system: System,
     *,
     steps: int = 40_000,
-    trajectories: int = 200,
+    trajectories: int = 400,
     seed: int = 0,
     policy: Controller | None = None,
     device: torch.device | None = None,
