@@ -182,6 +182,14 @@ class KKLObserver:
         if self._tracker is not None:
             self._tracker.warm_up(z)
 
+    def __copy__(self) -> "KKLObserver":
+        """Another that stands where this one does: it goes its own way, as everything but the tracker is replaced."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        if self._z is not None and self._tracker is not None:
+            other._tracker = self._tracker.copied()
+        return other
+
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 

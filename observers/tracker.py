@@ -108,6 +108,12 @@ class Tracker:
         self._own()
         self._x[where], self._P[where], self._mean_square[where] = begun._x, begun._P, begun._mean_square
 
+    def copied(self) -> "Tracker":
+        """Another that stands where this one does, and goes its own way."""
+        other = copy.copy(self)
+        other._own()
+        return other
+
     def go_on(self, other: "Tracker") -> None:
         """Go on where another stands, which may be told other levels of noise or have another flow."""
         self._batch = other._batch
@@ -136,11 +142,11 @@ class Tracker:
 
     def expected(self, ahead: Gaussian) -> np.ndarray:
         """The outputs (..., ny) that belong to it."""
-        return self._output(ahead[0]).reshape(*self._batch, -1)
+        return self._output(ahead[0]).reshape(*self._batch, len(self._R))
 
     def correct(self, ahead: Gaussian, y: np.ndarray, rows: np.ndarray | None = None) -> None:
         """Take in samples (..., ny), NaN where they are missing, in all rows or some (...,)."""
-        y = y.reshape(len(self._x), -1)
+        y = y.reshape(len(self._x), len(self._R))
         if self._machine is not None:
             self._machine.correct(ahead, y, None if rows is None else rows.flatten(), self._state)
             return

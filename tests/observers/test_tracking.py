@@ -206,11 +206,21 @@ def test_maps_are_replaced_while_it_runs():
 
 def test_copies_and_pickles_go_on_alike():
     observer, _, y = settled()
-    others = [pickle.loads(pickle.dumps(observer)), copy.deepcopy(observer)]
+    others = [pickle.loads(pickle.dumps(observer)), copy.deepcopy(observer), copy.copy(observer)]
     for sample in y[:5]:
         found = observer.step(sample)
         for other in others:
             np.testing.assert_array_equal(other.step(sample), found)
+
+
+def test_batches_may_have_no_rows():
+    observer = KKLObserver(tracking_observer(), LEVEL)
+    for shape in ((0,), (2, 0)):
+        observer.reset(np.zeros((*shape, 1)))
+        assert observer.step(np.zeros((*shape, 1))).shape == (*shape, 2)
+        assert observer.step(None).shape == (*shape, 2)
+        assert observer.covariance.shape == (*shape, 2, 2)
+        assert observer.estimate(np.zeros((3, *shape, 1))).shape == (3, *shape, 2)
 
 
 def test_what_it_returns_is_the_callers():

@@ -5,7 +5,7 @@ import itertools
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -334,6 +334,7 @@ def _self_consistent(
 
 def _estimates(observer: Artifact, noise: np.ndarray) -> Guess:
     """What an observer estimates in a record."""
+    observer = replace(observer, flow=None)  # which is of its own plant
     level = observer.inverse.within(np.minimum(noise, np.max(observer.inverse.measurement_noise_max)))
 
     def guess(record: Record, at: np.ndarray) -> np.ndarray:
