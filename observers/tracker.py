@@ -82,7 +82,12 @@ class Tracker:
 
     def covariance(self, z: np.ndarray, age: np.ndarray | float) -> np.ndarray:
         """Covariances of the estimates' errors, (..., nx, nx), beside z, (..., size), at ages in samples."""
-        acted = z[..., len(self._artifact.filter.A) :].any(-1)  # exactly 0 until an input does
+        nz = len(self._artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
+        if not self._batch:  # a single sample: every call of numpy would be felt
+            ages, logs = self._log_roots if any(z[nz:].tolist()) else self._free_log_roots
+            log = logs[-1] if age >= ages[-1] else np.interp(age, ages, logs)
+            return self._P[0] * (self._units * math.exp(2 * log))
+        acted = z[..., nz:].any(-1)
         logs = np.where(acted, np.interp(age, *self._log_roots), np.interp(age, *self._free_log_roots))
         factors = np.exp(2 * logs)
         P = self._P * self._units
