@@ -35,7 +35,7 @@ class Flow:
     linear : ndarray, shape (nx, nx + nu)
         As above.
     low, high : ndarray, shape (nx,)
-        Bounds of the motion, in units of the states: an estimate beyond them is lost.
+        Bounds of the motion, in units of the states, at which estimates are cut.
     error : ndarray, shape (nx,)
         Standard deviation of what the flow itself is off by, at each sample.
     process_noise : ndarray, shape (nx,)
