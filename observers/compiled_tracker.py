@@ -1,8 +1,8 @@
-"""A tracker's step as machine code, where Numba is installed: two calls for a single sample, a few for a batch.
+"""A tracker's step as machine code, where Numba is installed: one call for a single sample, a few for a batch.
 
-It computes what :mod:`observers.unscented` does, on the flow of :mod:`observers.flow` and for outputs C x. The kernels
-are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly overhead. Of a batch, the
-flow's network evaluates all sigma points at once, by BLAS.
+It computes what :mod:`observers.unscented` does, on the flow of :mod:`observers.flow` and for outputs C x with noise of
+each its own. The kernels are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly
+overhead. Of a batch, the flow's network evaluates all sigma points at once, by BLAS.
 """
 
 import functools
@@ -14,21 +14,20 @@ import numpy as np
 
 from observers.compiled import _kernels
 from observers.flow import Flow
-from observers.unscented import UNSEEN, Gaussian
+from observers.unscented import Gaussian
 
-Arrays = tuple[np.ndarray, ...]
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _BIAS, _GAIN, _NOISE, _OFFSET, _SCALE, _LINEAR = range(8)  # columns of the table of states
-_MEAN, _VARIANCE, _UNSEEN, _SHARE, _C = range(5)  # columns of the table of outputs
+_MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 _ALL = np.ones(1, dtype=bool)
 
 
 class CompiledTracker:
-    """Prediction and correction of an unscented Kalman filter on a learned flow, whose states are scaled.
+    """A step of an unscented Kalman filter on a learned flow, whose states are scaled.
 
-    Where a method takes a state, that is (x, P, mean_square) of shapes (n, nx), (n, nx, nx) and (n,), in memory without
-    gaps: estimates, covariances, and the running mean square of the innovations.
+    Where a method takes a state, that is an array (n, nx + nx^2 + 1) in memory without gaps, which is written over. A
+    row holds the estimate, its covariance, and the running mean square of the innovations.
 
     Parameters
     ----------
@@ -53,60 +52,44 @@ class CompiledTracker:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
         low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
         states = low, high, flow.bias, flow.gain, q, flow.x_offset, flow.x_scale, flow.linear
-        outputs = C @ flow.x_offset, r, np.full(len(r), UNSEEN * r.max()), np.full(len(r), share), C * flow.x_scale
-        model = np.column_stack(states), np.column_stack(outputs), np.array(flow.u_scale, dtype=float)
-        kernels = _tracking(network.activation, flow.nx, flow.nu, len(C))
-        of_one = network.packed, network.widths, network.between
-        self._network, self._points = network, 2 * flow.nx + 1
-        self._ahead = functools.partial(kernels[0], model, of_one)
-        self._enter, self._leave, self._correct, self._take = (functools.partial(each, model) for each in kernels[1:])
-        self._next = np.empty((1, flow.nx)), np.empty((1, flow.nx, flow.nx))
+        outputs = C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale
+        model = _packed(states), _packed(outputs), 1.0 / np.array(flow.u_scale, dtype=float)
+        self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
+        one, *others = _tracking(network.activation, flow.nx, flow.nu, len(C))
+        self._one = functools.partial(one, *model, network.packed, network.widths, network.between)
+        self._enter, self._leave, self._take = (functools.partial(each, *model) for each in others)
 
-    def ahead(self, state: Arrays, u: np.ndarray) -> Gaussian:
-        """Predict a sample, before it is known.
+    def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
+        """Predict a sample, and take it in.
 
         Parameters
         ----------
-        state : tuple of ndarray
-            The state now.
+        state : ndarray, shape (n, nx + nx^2 + 1)
+            The state.
         u : ndarray, shape (n, nu)
             Inputs.
-
-        Returns
-        -------
-        tuple of ndarray
-            Estimates and covariances; NaN where a covariance was none. Those of a single sample last until the next.
-        """
-        x, P, _ = state
-        if len(x) == 1:
-            self._ahead(state, u, self._next)
-            return self._next
-        moved = np.empty((len(x), self._points, x.shape[1]))
-        inputs = np.empty((*moved.shape[:2], x.shape[1] + u.shape[1]), np.float32)
-        self._enter(x, P, u, inputs, moved)
-        h, found = self._network.batch(inputs.reshape(-1, inputs.shape[-1])), (np.empty_like(x), np.empty_like(P))
-        self._leave(h.reshape(moved.shape), moved, *found)
-        return found
-
-    def correct(self, ahead: Gaussian, y: np.ndarray, rows: np.ndarray | None, state: Arrays) -> None:
-        """Take in samples.
-
-        Parameters
-        ----------
-        ahead : tuple of ndarray
-            What :meth:`ahead` says.
         y : ndarray, shape (n, ny)
             Samples; NaN where they are missing.
         rows : ndarray of bool, shape (n,), optional
             The rows that take them in, by default all.
-        state : tuple of ndarray
-            The state before, which is written over.
-        """
-        if rows is None:
-            rows = _ALL if len(y) == 1 else np.ones(len(y), dtype=bool)
-        self._correct(ahead, y, rows, state)
 
-    def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: Arrays) -> None:
+        Returns
+        -------
+        ndarray, shape (n, ny)
+            The outputs that were predicted; NaN where a covariance was none.
+        """
+        expected = np.empty((len(y), self._ny))
+        if len(y) == 1:
+            self._one(u, y, _ALL if rows is None else rows, state, expected)
+            return expected
+        moved = np.empty((len(y), self._points, self._nx))
+        inputs = np.empty((*moved.shape[:2], self._nx + u.shape[1]), np.float32)
+        self._enter(u, state, inputs, moved)
+        h = self._network.batch(inputs.reshape(-1, inputs.shape[-1])).reshape(moved.shape)
+        self._leave(h, moved, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, expected)
+        return expected
+
+    def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:
         """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
 
         Parameters
@@ -117,10 +100,14 @@ class CompiledTracker:
             Where the tracker is lost.
         where : ndarray of int, shape (k,)
             The rows that these are.
-        state : tuple of ndarray
-            The state, which is written over.
+        state : ndarray, shape (n, nx + nx^2 + 1)
+            The state.
         """
-        self._take(said, lost, where, state)
+        self._take(*said, lost, where, state)
+
+
+def _packed(columns: tuple[np.ndarray, ...]) -> np.ndarray:
+    return np.ascontiguousarray(np.column_stack(columns))
 
 
 def _inlined(function: _F) -> _F:
@@ -138,16 +125,30 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
 
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     evaluate, count, far = _kernels(activation)[1], 2 * nx + 1, math.sqrt(3.0)
-    central, others = (3 - nx) / 3 + 2.0, 1 / 6  # weights of the points in covariances
+    central, others, entries = (3 - nx) / 3 + 2.0, 1 / 6, nx * nx  # weights of the points in covariances
 
     @_inlined
-    def draw(x: np.ndarray, P: np.ndarray, L: np.ndarray, points: np.ndarray) -> None:
-        """Sigma points, (2 nx + 1, nx), and the Cholesky factor; NaN where there is none."""
+    def within(states: np.ndarray, i: int, s: float) -> float:
+        s = states[i, _LOW] if s < states[i, _LOW] else s
+        return states[i, _HIGH] if s > states[i, _HIGH] else s
+
+    @_inlined
+    def before(
+        states: np.ndarray,
+        scale: np.ndarray,
+        row: np.ndarray,
+        u: np.ndarray,
+        L: np.ndarray,
+        inputs: np.ndarray,
+        moved: np.ndarray,
+    ) -> None:
+        """The sigma points of a row, as the network is given them, and where they go without it."""
+        points = moved  # in which they are drawn, (2 nx + 1, nx); NaN where there is no Cholesky factor
         for i in range(nx):
             for p in range(count):
-                points[p, i] = x[i]
+                points[p, i] = row[i]
             for j in range(i + 1):
-                entry = P[i, j]
+                entry = row[nx + nx * i + j]
                 for k in range(j):
                     entry -= L[i, k] * L[j, k]
                 if i > j:
@@ -156,179 +157,164 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
                     L[i, j] = math.sqrt(entry) if entry > 0.0 else np.nan
                 points[1 + j, i] += far * L[i, j]
                 points[1 + nx + j, i] -= far * L[i, j]
-
-    @_inlined
-    def centre(points: np.ndarray, mean: np.ndarray) -> None:
-        """The weighted mean of transformed points, (2 nx + 1, k), which is taken from them."""
-        for i in range(len(mean)):
-            total = 2 * (3 - nx) * points[0, i]
-            for p in range(1, count):
-                total += points[p, i]
-            mean[i] = total / 6
-            for p in range(count):
-                points[p, i] -= mean[i]
-
-    @_inlined
-    def product(a: np.ndarray, i: int, b: np.ndarray, j: int) -> float:
-        """Weighted sum over points of products of what they differ by."""
-        total = central * a[0, i] * b[0, j]
-        for p in range(1, count):
-            total += others * a[p, i] * b[p, j]
-        return total
-
-    @_inlined
-    def within(states: np.ndarray, i: int, s: float) -> float:
-        s = states[i, _LOW] if s < states[i, _LOW] else s
-        return states[i, _HIGH] if s > states[i, _HIGH] else s
-
-    @_inlined
-    def before(model: Arrays, u: np.ndarray, points: np.ndarray, inputs: np.ndarray, moved: np.ndarray) -> None:
-        """What the network is given of a row, and where its points go without it."""
-        states, _, u_scale = model
         for p in range(count):
             for i in range(nx):
                 points[p, i] = within(states, i, points[p, i])
                 inputs[p, i] = points[p, i]
             for j in range(nu):
-                inputs[p, nx + j] = u[j] / u_scale[j]
-        for i in range(nx):
-            held = states[i, _BIAS]
-            for j in range(nu):
-                held += states[i, _LINEAR + nx + j] * (u[j] / u_scale[j])
-            for p in range(count):
-                total = points[p, i] + held
-                for j in range(nx):
-                    total += states[i, _LINEAR + j] * points[p, j]
-                moved[p, i] = total
-
-    @_inlined
-    def after(states: np.ndarray, h: np.ndarray, moved: np.ndarray, x_next: np.ndarray, P_next: np.ndarray) -> None:
-        """Moments of where the points of a row go with it."""
+                inputs[p, nx + j] = u[j] * scale[j]
         for p in range(count):
             for i in range(nx):
-                moved[p, i] += states[i, _GAIN] * h[p, i]
-        centre(moved, x_next)
+                total = points[p, i] + states[i, _BIAS]
+                for j in range(nu):
+                    total += states[i, _LINEAR + nx + j] * (u[j] * scale[j])
+                for j in range(nx):
+                    total += states[i, _LINEAR + j] * points[p, j]
+                L[0, i] = total  # the factor is no longer needed
+            for i in range(nx):
+                moved[p, i] = L[0, i]
+
+    @_inlined
+    def after(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        h: np.ndarray,
+        moved: np.ndarray,
+        y: np.ndarray,
+        takes: bool,
+        found: np.ndarray,
+        across: np.ndarray,
+        row: np.ndarray,
+        expected: np.ndarray,
+    ) -> None:
+        """Moments of where the points of a row go with it, and a sample taken in, one output after another."""
         for i in range(nx):
+            total = 0.0
+            for p in range(count):
+                moved[p, i] += states[i, _GAIN] * h[p, i]
+                total += moved[p, i]
+            mean = (total + (2 * (3 - nx) - 1) * moved[0, i]) / 6
+            for p in range(count):
+                moved[p, i] -= mean
+            found[i] = mean
             for j in range(i + 1):
-                P_next[i, j] = P_next[j, i] = product(moved, i, moved, j)
-            P_next[i, i] += states[i, _NOISE]
+                entry = central * moved[0, i] * moved[0, j]
+                for p in range(1, count):
+                    entry += others * moved[p, i] * moved[p, j]
+                found[nx + nx * i + j] = entry
+            found[nx + nx * i + i] += states[i, _NOISE]
+        for k in range(ny):
+            expected[k] = outputs[k, _MEAN]
+            for i in range(nx):
+                expected[k] += outputs[k, _C + i] * found[i]
+        if takes:
+            squared, seen = 0.0, 0
+            for k in range(ny):
+                if np.isnan(y[k]):
+                    continue
+                apart, pivot = y[k] - outputs[k, _MEAN], outputs[k, _VARIANCE]
+                for i in range(nx):
+                    across[i] = 0.0
+                    for j in range(nx):
+                        across[i] += outputs[k, _C + j] * found[nx + (nx * i + j if j < i else nx * j + i)]
+                    apart -= outputs[k, _C + i] * found[i]
+                for i in range(nx):
+                    pivot += outputs[k, _C + i] * across[i]
+                squared += apart * apart / pivot
+                seen += 1
+                for i in range(nx):
+                    gain = across[i] / pivot
+                    found[i] += gain * apart
+                    for j in range(i + 1):
+                        found[nx + nx * i + j] -= gain * across[j]
+            total = 0.0
+            for i in range(nx):
+                total += found[i]
+                for j in range(i + 1):
+                    total += found[nx + nx * i + j]
+            if np.isfinite(total):
+                for i in range(nx):
+                    row[i] = within(states, i, found[i])
+                    for j in range(i + 1):
+                        row[nx + nx * i + j] = row[nx + nx * j + i] = found[nx + nx * i + j]
+                if seen > 0:
+                    row[nx + entries] += outputs[0, _SHARE] * (squared / seen - row[nx + entries])
+            else:
+                row[nx + entries] = np.inf
 
     @compiled
-    def ahead(model: Arrays, network: Arrays, state: Arrays, u: np.ndarray, found: Arrays) -> None:
-        memory, (x, P, _), (x_next, P_next) = np.empty((2, count, nx)), state, found
-        packed, widths, between = network
+    def one(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        packed: np.ndarray,
+        widths: np.ndarray,
+        between: np.ndarray,
+        u: np.ndarray,
+        y: np.ndarray,
+        rows: np.ndarray,
+        state: np.ndarray,
+        expected: np.ndarray,
+    ) -> None:
+        L, moved, found, across = np.empty((nx, nx)), np.empty((count, nx)), np.empty(nx + entries), np.empty(nx)
         inputs, h = np.empty((count, nx + nu), np.float32), np.empty((count, nx), np.float32)
-        draw(x[0], P[0], P_next[0], memory[0])
-        before(model, u[0], memory[0], inputs, memory[1])
+        before(states, scale, state[0], u[0], L, inputs, moved)
         for p in range(count):
             evaluate(inputs[p], packed, widths, between, h[p])
-        after(model[0], h, memory[1], x_next[0], P_next[0])
+        after(states, outputs, h, moved, y[0], rows[0], found, across, state[0], expected[0])
 
     @compiled
     def enter(
-        model: Arrays, x: np.ndarray, P: np.ndarray, u: np.ndarray, inputs: np.ndarray, moved: np.ndarray
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        u: np.ndarray,
+        state: np.ndarray,
+        inputs: np.ndarray,
+        moved: np.ndarray,
     ) -> None:
-        L, points = np.empty((nx, nx)), np.empty((count, nx))
-        for row in range(len(x)):
-            draw(x[row], P[row], L, points)
-            before(model, u[row], points, inputs[row], moved[row])
+        L = np.empty((nx, nx))
+        for row in range(len(state)):
+            before(states, scale, state[row], u[row], L, inputs[row], moved[row])
 
     @compiled
-    def leave(model: Arrays, h: np.ndarray, moved: np.ndarray, x_next: np.ndarray, P_next: np.ndarray) -> None:
-        for row in range(len(moved)):
-            after(model[0], h[row], moved[row], x_next[row], P_next[row])
-
-    @_inlined
-    def compare(outputs: np.ndarray, y: np.ndarray, points: np.ndarray, found: Arrays) -> int:
-        """A row's outputs with a sample: innovations, S and its products with the states; how many were measured."""
-        expected, innovation, S, cross = found
-        seen = 0
-        for p in range(count):
-            for j in range(ny):
-                total = outputs[j, _MEAN]
-                for i in range(nx):
-                    total += outputs[j, _C + i] * points[p, i]
-                expected[p, j] = total
-        centre(expected, innovation)
-        for i in range(nx):
-            mean = points[0, i]
-            for p in range(count):
-                points[p, i] -= mean
-        for j in range(ny):
-            for k in range(j + 1):
-                S[j, k] = product(expected, j, expected, k)
-            for i in range(nx):
-                cross[j, i] = product(expected, j, points, i)
-            missing = np.isnan(y[j])
-            S[j, j] += outputs[j, _VARIANCE] + (outputs[j, _UNSEEN] if missing else 0.0)
-            innovation[j] = 0.0 if missing else y[j] - innovation[j]
-            seen += 0 if missing else 1
-        return seen
-
-    @_inlined
-    def condition(x: np.ndarray, P: np.ndarray, innovation: np.ndarray, S: np.ndarray, cross: np.ndarray) -> float:
-        """Correct a row by one output after another; the innovations squared, in units of S."""
-        squared = 0.0
-        for k in range(ny):
-            apart, pivot = innovation[k], S[k, k]
-            squared += apart * apart / pivot
-            for i in range(nx):
-                gain = cross[k, i] / pivot
-                x[i] += gain * apart
-                for j in range(i + 1):
-                    P[i, j] -= gain * cross[k, j]
-            for j in range(k + 1, ny):  # and take from the others what it tells of them
-                ratio = S[j, k] / pivot
-                innovation[j] -= ratio * apart
-                for i in range(nx):
-                    cross[j, i] -= ratio * cross[k, i]
-                for m in range(k + 1, j + 1):
-                    S[j, m] -= ratio * S[m, k]
-        return squared
+    def leave(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        h: np.ndarray,
+        moved: np.ndarray,
+        y: np.ndarray,
+        rows: np.ndarray,
+        state: np.ndarray,
+        expected: np.ndarray,
+    ) -> None:
+        found, across = np.empty(nx + entries), np.empty(nx)
+        for row in range(len(state)):
+            after(states, outputs, h[row], moved[row], y[row], rows[row], found, across, state[row], expected[row])
 
     @compiled
-    def correct(model: Arrays, ahead: Arrays, y: np.ndarray, rows: np.ndarray, state: Arrays) -> None:
-        (states, outputs, _), (x_next, P_next), (x, P, mean_square) = model, ahead, state
-        new, L, points = np.empty(nx), np.empty((nx, nx)), np.empty((count, nx))
-        expected, innovation, S, cross = np.empty((count, ny)), np.empty(ny), np.empty((ny, ny)), np.empty((ny, nx))
-        for row in range(len(x)):
-            if not rows[row]:
-                continue
-            draw(x_next[row], P_next[row], L, points)
-            seen = compare(outputs, y[row], points, (expected, innovation, S, cross))
-            for i in range(nx):
-                new[i] = x_next[row, i]
-                for j in range(i + 1):
-                    L[i, j] = P_next[row, i, j]
-            squared, sound = condition(new, L, innovation, S, cross), True
-            for i in range(nx):
-                sound &= np.isfinite(new[i])
-                for j in range(i + 1):
-                    sound &= np.isfinite(L[i, j])
-            if not sound:
-                mean_square[row] = np.inf
-            elif seen > 0:
-                mean_square[row] += outputs[0, _SHARE] * (squared / seen - mean_square[row])
-            for i in range(nx):
-                x[row, i] = within(states, i, new[i] if sound else x[row, i])
-                if sound:
-                    for j in range(i + 1):
-                        P[row, i, j] = P[row, j, i] = L[i, j]
-
-    @compiled
-    def take(model: Arrays, said: Arrays, lost: np.ndarray, where: np.ndarray, state: Arrays) -> None:
-        (states, _, _), (x_said, P_said), (x, P, mean_square) = model, said, state
+    def take(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        x: np.ndarray,
+        P: np.ndarray,
+        lost: np.ndarray,
+        where: np.ndarray,
+        state: np.ndarray,
+    ) -> None:
         for k in range(len(where)):
-            row, ours, theirs = where[k], 0.0, 0.0
+            row, ours, theirs = state[where[k]], 0.0, 0.0
             for i in range(nx):
-                ours += P[row, i, i]
-                theirs += P_said[k, i, i] / (states[i, _SCALE] * states[i, _SCALE])
+                ours += row[nx + nx * i + i]
+                theirs += P[k, i, i] / (states[i, _SCALE] * states[i, _SCALE])
             if lost[k] or theirs < ours:
                 for i in range(nx):
-                    x[row, i] = within(states, i, (x_said[k, i] - states[i, _OFFSET]) / states[i, _SCALE])
+                    row[i] = within(states, i, (x[k, i] - states[i, _OFFSET]) / states[i, _SCALE])
                     for j in range(nx):
-                        P[row, i, j] = P_said[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
+                        row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
-                    mean_square[row] = 1.0
+                    row[nx + entries] = 1.0
 
-    return ahead, enter, leave, correct, take
+    return one, enter, leave, take

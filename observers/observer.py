@@ -410,11 +410,9 @@ class KKLObserver:
             gaps = self._check_output(y, batch)
         tracker = self._tracker
         if tracker is not None:
-            ahead = tracker.ahead(u)
-            samples = y if gaps is None else np.where(gaps, np.nan, y)
-        if gaps is not None and tracker is not None:
-            h = tracker.expected(ahead)
-            y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
+            h = tracker.advance(y if gaps is None else np.where(gaps, np.nan, y), u, rows)
+            if gaps is not None:
+                y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
         elif gaps is not None:
             y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
         linear = self.artifact.filter
@@ -433,7 +431,6 @@ class KKLObserver:
             self._age = self._age + rows
         self._x_hat, self._parts = None, None
         if tracker is not None:
-            tracker.correct(ahead, samples, rows)
             tracker.supervise(self._z, self._age, rows)
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()

@@ -11,10 +11,10 @@ from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
 from observers.sparse import MANY_ROWS
-from observers.unscented import Gaussian, corrected, predicted
+from observers.unscented import Gaussian, conditioned, predicted, transformed
 
-# A filter is lost where innovations are as large as that by chance once in 1e9: the normal distribution's quantile.
-_BEYOND_CHANCE = 5.998
+# A filter is lost where innovations are as large as that by chance once in 1e5: the normal distribution's quantile.
+_BEYOND_CHANCE = 4.265
 KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scaled states
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample
 
@@ -58,6 +58,7 @@ class Tracker:
         self._variances = q, r = flow.variances(measurement_noise, process_noise)
         self._Q, self._R = np.diag(q), np.diag(r)
         self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
+        self._C = None if artifact.C is None else artifact.C * flow.x_scale
         self._units = flow.x_scale[:, None] * flow.x_scale
         self._window = max(1, round(flow.window / self._dt))
         self._share = -math.expm1(-1 / self._window)
@@ -68,16 +69,32 @@ class Tracker:
             for each in (flow.factors, flow.free_factors or flow.factors)
         )
         self._batch: tuple[int, ...]
-        self._x: np.ndarray  # scaled states (n, nx) of the flattened batch
-        self._P: np.ndarray
-        self._mean_square: np.ndarray
+        self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
+
+    @property
+    def _x(self) -> np.ndarray:
+        """Scaled states, (n, nx)."""
+        return self._state[:, : self._flow.nx]
+
+    @property
+    def _P(self) -> np.ndarray:
+        """Their covariances, (n, nx, nx)."""
+        nx = self._flow.nx
+        return self._state[:, nx:-1].reshape(len(self._state), nx, nx)
+
+    @property
+    def _mean_square(self) -> np.ndarray:
+        """Of the innovations, over the window, (n,)."""
+        return self._state[:, -1]
 
     @property
     def estimate(self) -> np.ndarray:
         """The estimates, (..., nx)."""
         flow = self._flow
         if not self._batch:  # a single sample: every call of numpy would be felt
-            return flow.x_offset + flow.x_scale * self._x[0]
+            x: np.ndarray = self._state[0, : flow.nx] * flow.x_scale
+            x += flow.x_offset
+            return x
         return (flow.x_offset + flow.x_scale * self._x).reshape(*self._batch, flow.nx)
 
     def covariance(self, z: np.ndarray, age: np.ndarray | float) -> np.ndarray:
@@ -110,70 +127,70 @@ class Tracker:
             return
         begun, where = copy.copy(self), rows.ravel()
         begun.reset(z, age, x0)
-        self._own()
-        self._x[where], self._P[where], self._mean_square[where] = begun._x, begun._P, begun._mean_square
+        self._state = self._state.copy()  # others may look at what there was
+        self._state[where] = begun._state
 
     def copied(self) -> "Tracker":
         """Another that stands where this one does, and goes its own way."""
         other = copy.copy(self)
-        other._own()
+        other._state = self._state.copy()
         return other
 
     def go_on(self, other: "Tracker") -> None:
         """Go on where another stands, which may be told other levels of noise or have another flow."""
         self._batch = other._batch
         self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units)
-        self._mean_square = other._mean_square.copy()
+        self._mean_square[:] = other._mean_square
 
     def warm_up(self, z: np.ndarray) -> None:
         """Make the machine code for single samples now, by one of z, (size,), that is forgotten."""
         one = copy.copy(self)
         one.reset(z, 0)
-        one.correct(one.ahead(np.zeros(self._flow.nu)), np.zeros(len(self._R)))
+        one.advance(np.zeros(len(self._R)), np.zeros(self._flow.nu))
         one.supervise(z, 0)
 
-    def ahead(self, u: np.ndarray) -> Gaussian:
-        """Scaled estimates and covariances a sample later, under inputs (..., nu), before that sample is known."""
-        flow, n = self._flow, len(self._x)
+    def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Go on under inputs (..., nu), and take in samples (..., ny), NaN where they are missing, in all rows or some.
+
+        Returns the outputs that were expected, (..., ny), which are not finite where a covariance broke down.
+        """
+        n, ny = len(self._state), len(self._R)
+        y, rows = y.reshape(n, ny), None if rows is None else rows.flatten()
         if self._machine is not None:
-            return self._machine.ahead(self._state, u.copy().reshape(n, flow.nu))  # the user's own may be read-only
-        v = np.concatenate([u.reshape(n, flow.nu) / flow.u_scale] * (2 * flow.nx + 1))
+            inputs = u.copy().reshape(n, self._flow.nu)  # the user's own may be read-only
+            return self._machine.advance(self._state, inputs, y, rows).reshape(*self._batch, ny)
+        with np.errstate(over="ignore", invalid="ignore"):
+            x, P = self._ahead(u)
+            if self._C is None:
+                expected, S, across = transformed(x, P, function=self._output)
+            else:
+                expected, across = self._output(x), P @ self._C.T
+                S = self._C @ across
+            x, P, nis = conditioned(x, P, y - expected, S + self._R, across, R=self._R)
+        sound = np.isfinite(x.sum(-1) + P.sum((1, 2)))
+        taken = sound if rows is None else sound & rows
+        mean_square = self._mean_square + self._share * ~np.isnan(y).all(-1) * (nis - self._mean_square)
+        state = self._packed(x.clip(self._low, self._high), P, mean_square)
+        if not taken.all():
+            state = np.where(taken[:, None], state, self._state)
+            state[~sound if rows is None else ~sound & rows, -1] = np.inf
+        self._state = state
+        return expected.reshape(*self._batch, ny)
+
+    def _ahead(self, u: np.ndarray) -> Gaussian:
+        """Scaled estimates and covariances a sample later, before that sample is known."""
+        flow = self._flow
+        v = np.concatenate([u.reshape(len(self._state), flow.nu) / flow.u_scale] * (2 * flow.nx + 1))
 
         def move(s: np.ndarray) -> np.ndarray:
             return flow.scaled(s.clip(self._low, self._high).reshape(-1, flow.nx), v).reshape(s.shape)
 
-        with np.errstate(over="ignore", invalid="ignore"):
-            return predicted(self._x, self._P, move=move, Q=self._Q)
-
-    def expected(self, ahead: Gaussian) -> np.ndarray:
-        """The outputs (..., ny) that belong to it."""
-        return self._output(ahead[0]).reshape(*self._batch, len(self._R))
-
-    def correct(self, ahead: Gaussian, y: np.ndarray, rows: np.ndarray | None = None) -> None:
-        """Take in samples (..., ny), NaN where they are missing, in all rows or some (...,)."""
-        y = y.reshape(len(self._x), len(self._R))
-        if self._machine is not None:
-            self._machine.correct(ahead, y, None if rows is None else rows.flatten(), self._state)
-            return
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, P, nis = corrected(*ahead, y, output=self._output, R=self._R)
-            sound = math.isfinite(x.sum() + P.sum())  # all of them, most often
-        mean_square = self._mean_square + self._share * ~np.isnan(y).all(-1) * (nis - self._mean_square)
-        if not sound:
-            broken = ~(np.isfinite(P).all((1, 2)) & np.isfinite(x).all(-1))
-            mean_square[broken] = np.inf
-            x[broken], P[broken] = self._x[broken], self._P[broken]
-        x = x.clip(self._low, self._high)
-        if rows is not None:
-            rows = rows.ravel()
-            x, P = np.where(rows[:, None], x, self._x), np.where(rows[:, None, None], P, self._P)
-            mean_square = np.where(rows, mean_square, self._mean_square)
-        self._x, self._P, self._mean_square = x, P, mean_square
+        return predicted(self._x, self._P, move=move, Q=self._Q)
 
     def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         if not self._batch:  # a single sample: every call of numpy would be felt
-            age, one = float(age), not self._mean_square[0] <= self._limit  # lost where it is NaN too
+            age, one = float(age), not self._state[0, -1] <= self._limit  # lost where it is NaN too
             if (one or age < self._window) and (rows is None or rows):
                 self._take(self._said_of_one(z, age, one), _FLAGS[one], _FIRST)
             return
@@ -197,7 +214,7 @@ class Tracker:
         x, P = self._scaled(*said)
         taken = lost | (_mean_square(P) < _mean_square(self._P[where]))
         if taken.any():
-            self._own()
+            self._state = self._state.copy()  # others may look at what there was
             self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
             self._mean_square[where[lost]] = 1.0
 
@@ -219,8 +236,10 @@ class Tracker:
 
     def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
         """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
-        self._x, self._P = map(np.ascontiguousarray, self._scaled(x, P))
-        self._mean_square = np.ones(len(x))
+        self._state = self._packed(*self._scaled(x, P), np.ones(len(x)))
+
+    def _packed(self, x: np.ndarray, P: np.ndarray, mean_square: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), mean_square[:, None]], axis=1)
 
     def _output(self, s: np.ndarray) -> np.ndarray:
         return self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
@@ -233,13 +252,9 @@ class Tracker:
         return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
 
     @property
-    def _state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self._x, self._P, self._mean_square
-
-    @property
     def _machine(self) -> CompiledTracker | None:
         """What takes NumPy's place for as many rows as there are, None where nothing does."""
-        return self._compiled if len(self._x) >= MANY_ROWS or (self._singly and not self._batch) else None
+        return self._compiled if len(self._state) >= MANY_ROWS or (self._singly and not self._batch) else None
 
     @functools.cached_property
     def _compiled(self) -> CompiledTracker | None:
@@ -250,10 +265,6 @@ class Tracker:
             return CompiledTracker(self._flow, C, variances=self._variances, share=self._share)
         except ImportError:
             return None
-
-    def _own(self) -> None:
-        """Take copies to change: others may look at what there was."""
-        self._x, self._P, self._mean_square = (part.copy() for part in self._state)
 
 
 def _mean_square(P: np.ndarray) -> np.ndarray:

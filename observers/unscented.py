@@ -61,16 +61,60 @@ def corrected(
     nis : ndarray, shape (n,)
         Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
     """
+    expected, S, across = transformed(x, P, function=output)
+    return conditioned(x, P, y - expected, S + R, across, R=R)
+
+
+def transformed(
+    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What a function makes of a batch of Gaussians.
+
+    Parameters
+    ----------
+    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
+        Means and covariances.
+    function : callable
+        Takes points (2 nx + 1, n, nx) to (2 nx + 1, n, k).
+
+    Returns
+    -------
+    tuple of ndarray, shapes (n, k), (n, k, k) and (n, nx, k)
+        Means, covariances, and covariances of the states with them; NaN where a covariance was none.
+    """
     points = sigma_points(x, P)
-    expected, spread = _moments(output(points))
-    missing = np.isnan(y)
-    innovation, S, measured = y - expected, _products(spread, spread) + R, y.shape[1]
+    mean, spread = _moments(function(points))
+    return mean, _products(spread, spread), _products(points - x, spread)
+
+
+def conditioned(
+    x: np.ndarray, P: np.ndarray, innovation: np.ndarray, S: np.ndarray, across: np.ndarray, *, R: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Condition a batch of Gaussians on what samples differ by from what was expected.
+
+    Parameters
+    ----------
+    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
+        Means and covariances.
+    innovation : ndarray, shape (n, ny)
+        Samples less what was expected; NaN where they are missing, which corrects nothing.
+    S, across : ndarray, shapes (n, ny, ny) and (n, nx, ny)
+        Covariances of the innovations, and of the states with them.
+    R : ndarray, shape (ny, ny)
+        Covariance of the noise on the samples, the part of S that is theirs.
+
+    Returns
+    -------
+    x, P, nis
+        As :func:`corrected` has them.
+    """
+    missing, measured = np.isnan(innovation), innovation.shape[1]
     if missing.any():
-        innovation[missing] = 0.0
-        S += missing[:, None, :] * (UNSEEN * R.max() * np.eye(y.shape[1]))
-        measured = np.maximum(y.shape[1] - missing.sum(-1), 1)
-    told = np.concatenate([_products(spread, points - x), innovation[..., None]], axis=-1)
-    solved = told / S if y.shape[1] == 1 else np.linalg.solve(S, told)
+        innovation = np.where(missing, 0.0, innovation)
+        S = S + missing[:, None, :] * (UNSEEN * R.max() * np.eye(len(R)))
+        measured = np.maximum(measured - missing.sum(-1), 1)
+    told = np.concatenate([across.mT, innovation[..., None]], axis=-1)
+    solved = told / S if len(R) == 1 else np.linalg.solve(S, told)
     nis = (innovation * solved[..., -1]).sum(-1) / measured
     change = solved[..., :-1].mT @ told  # K S K^T, and K times the innovation
     return x + change[..., -1], P - change[..., :-1], nis
@@ -111,4 +155,4 @@ def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return products
 
 
-__all__ = ["corrected", "factor", "predicted", "sigma_points"]
+__all__ = ["conditioned", "corrected", "factor", "predicted", "sigma_points", "transformed"]

@@ -30,7 +30,7 @@ class Tracking:
     policy: OwnPolicy = None
     steps: int = 40_000
     """Batches for the network."""
-    trajectories: int = 400
+    trajectories: int = 1600
     """Number of motions on which covariances are calibrated."""
     seed: int = 0
     """Seed of everything random."""

@@ -24,7 +24,7 @@ from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
-WIDTH, DEPTH, BATCH = 48, 2, 1024
+WIDTH, DEPTH, BATCH = 32, 2, 1024
 LEARNING_RATE = 3e-3
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
@@ -38,7 +38,7 @@ def learn_tracking(
     system: System,
     *,
     steps: int = 40_000,
-    trajectories: int = 400,
+    trajectories: int = 1600,
     seed: int = 0,
     policy: Controller | None = None,
     device: torch.device | None = None,
@@ -237,5 +237,5 @@ def _factors(
     acted = np.maximum.accumulate((u != 0).any(-1), axis=0)
     driven = np.concatenate([np.zeros_like(acted[:1]), acted])[regions.ages]
     if not artifact.nu or driven[-1].all():  # under a policy no motion stays free, and later ages would have no factors
-        return (regions.factors(distances, np.ones_like(driven)),) * 2
-    return regions.factors(distances, driven), regions.factors(distances, ~driven)
+        return (regions.factors(distances, np.ones_like(driven), lenient=True),) * 2
+    return regions.factors(distances, driven, lenient=True), regions.factors(distances, ~driven, lenient=True)
