@@ -105,8 +105,10 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	$(BIN)/kkl-gym agent compare --systems $(CLOSED) --information x_hat_std --no-more-noise
+	$(BIN)/kkl-gym agent compare --information state x_hat --observers $(SYSTEMS:%=%-tracking) --out runs/agents/tracking
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
+	cp runs/agents/tracking/results.csv docs/results/agents/tracking.csv
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
 	cp runs/agents/comparison/jobs/van_der_pol-0.5/y/0/agent.safetensors training/agents/shipped/van_der_pol-y.safetensors
