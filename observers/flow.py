@@ -123,8 +123,9 @@ class Flow:
         return self.x_offset + self.x_scale * self.scaled((x - self.x_offset) / self.x_scale, u / self.u_scale)
 
     def scaled(self, s: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """The same of scaled states (..., nx) and scaled inputs (..., nu)."""
-        inputs = np.concatenate([s, v], axis=-1)
+        """The same of scaled states (..., nx) and scaled inputs (..., nu), which may be the same for many of them."""
+        inputs = np.empty((*s.shape[:-1], s.shape[-1] + v.shape[-1]))
+        inputs[..., : s.shape[-1]], inputs[..., s.shape[-1] :] = s, v
         return np.asarray(s + self.bias + inputs @ self.linear.T + self.gain * self.mlp(inputs))
 
     def variances(
