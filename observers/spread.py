@@ -12,7 +12,7 @@ from observers.compiled_covariance import CompiledCovariance
 from observers.factors import Factors
 from observers.network import MLP
 
-_LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
+LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class Covariance:
         if out.ndim == 1:  # a single sample: every call would be felt
             return np.array(_entries(out.tolist(), nx, self._log_factor(float(age)))).reshape(nx, nx)
         values = np.moveaxis(out, -1, 0).astype(float, order="C")
-        np.minimum(values[:nx], _LARGEST_LOG, out=values[:nx])
+        np.minimum(values[:nx], LARGEST_LOG, out=values[:nx])
         values[:nx] += np.interp(age, self._ages, self._log_factors)
         np.exp(values[:nx], out=values[:nx])
         covariance = np.empty((*out.shape[:-1], nx * nx))
@@ -119,7 +119,7 @@ class Covariance:
                 nx=self._nx,
                 ages=self._ages,
                 log_factors=self._log_factors,
-                largest_log=_LARGEST_LOG,
+                largest_log=LARGEST_LOG,
                 **inputs,
             )
         except ImportError:
@@ -143,7 +143,7 @@ class Covariance:
 
 def _entries(values: list[float], nx: int, factor: float) -> list[float]:
     """The covariance of one sample, row by row; written out for two or three states: loops take thrice as long."""
-    exp, end = math.exp, _LARGEST_LOG
+    exp, end = math.exp, LARGEST_LOG
     if nx == 2:
         a, b, d = values
         a, b = exp((end if a > end else a) + factor), exp((end if b > end else b) + factor)
@@ -185,4 +185,4 @@ def deviations(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(covariance.diagonal(0, -2, -1))
 
 
-__all__ = ["Covariance", "Spread", "deviations"]
+__all__ = ["LARGEST_LOG", "Covariance", "Spread", "deviations"]
