@@ -53,6 +53,12 @@ class Spread:
         """Number of states."""
         return (math.isqrt(8 * self.mlp.outputs + 1) - 1) // 2
 
+    def in_units(self, scale: np.ndarray) -> MLP:
+        """The network with the scale of the states (nx,) in its last biases: the logarithms are of D in their units."""
+        *biases, bias = (np.array(each, dtype=float) for each in self.mlp.biases)
+        bias[: self.nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
+        return MLP(self.mlp.weights, [*biases, bias], self.mlp.activation)
+
 
 class Covariance:
     """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
@@ -68,11 +74,7 @@ class Covariance:
     """
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
-        nx = self._nx = spread.nx
-        *weights, last = spread.mlp.weights
-        *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
-        bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
-        self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
+        self._nx, self._mlp = spread.nx, spread.in_units(scale)
         self._ages = spread.ages.tolist()
         self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from observers.flow import Flow
-from observers.inverse import InverseMap
 from observers.network import MLP
 from observers.spread import LARGEST_LOG, Spread
 from observers.tracker import supervision
@@ -25,7 +24,7 @@ _LARGER = "#define LARGER(a, b) ((a) > (b) ? (a) : (b))\n"
 
 def tracker_networks(exported: Exported, flow: Flow) -> list[MLP]:
     """The networks beside those of T_inv."""
-    return [flow.mlp, *(spread.mlp for spread in _spreads(exported, flow).values())]
+    return [flow.mlp, *(spread.mlp for spread in _spreads(exported).values())]
 
 
 def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
@@ -57,7 +56,7 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
         block("double", "Q", f"[{len(Q)}]", Q),
         block("double", "R", f"[{len(R)}]", R),
     ]
-    for label, spread in _spreads(exported, flow).items():
+    for label, spread in _spreads(exported).items():
         parts.append(f"\n/* How sure T_inv is, of {label} motion: logarithms of standard deviations, and rises. */\n")
         parts += network_arrays(f"{label}_bars", spread.mlp)
         parts += [array("double", f"{label}_{name}", getattr(spread, name)) for name in ("ages", "levels")]
@@ -72,7 +71,7 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
     nx, free = flow.nx, "free" in exported.maps
     parts = [map_functions(exported, label, inverse) for label, inverse in exported.maps.items()]
     parts.append(c_tracker_templates.INTERPOLATED)
-    parts += [_covariance(exported, label, spread, words) for label, spread in _spreads(exported, flow).items()]
+    parts += [_covariance(exported, label, spread, words) for label, spread in _spreads(exported).items()]
     ask = c_templates.ASK_TWO if free else c_templates.ASK_ONE
     parts.append(ask.format(**words, head=c_tracker_templates.INVERT.format(**words), what="map(observer, x_hat)"))
     head = c_tracker_templates.COVARIANCE_OF_ONE.format(**words)
@@ -96,18 +95,13 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
     return "".join(parts)
 
 
-def _spreads(exported: Exported, flow: Flow) -> dict[str, Spread]:
-    """Error bars of each map, of networks that give logarithms in scaled states."""
-    return {label: _scaled(inverse, flow) for label, inverse in exported.maps.items()}
-
-
-def _scaled(inverse: InverseMap, flow: Flow) -> Spread:
-    spread = inverse.spread
-    assert spread is not None  # or the artifact could not have a flow
-    *biases, last = (np.array(each, dtype=float) for each in spread.mlp.biases)
-    scale = np.maximum(np.abs(inverse.x_scale), np.finfo(float).tiny)
-    last[: spread.nx] += np.log(scale) - np.log(flow.x_scale)
-    return replace(spread, mlp=MLP(spread.mlp.weights, [*biases, last], spread.mlp.activation))
+def _spreads(exported: Exported) -> dict[str, Spread]:
+    """Error bars of each map, of networks that give logarithms in units of the states."""
+    found = {}
+    for label, inverse in exported.maps.items():
+        assert inverse.spread is not None  # or the artifact could not have a flow
+        found[label] = replace(inverse.spread, mlp=inverse.spread.in_units(inverse.x_scale))
+    return found
 
 
 def _covariance(exported: Exported, label: str, spread: Spread, words: dict[str, Any]) -> str:

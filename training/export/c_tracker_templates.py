@@ -33,7 +33,7 @@ static void {map}_covariance(const {NAME}_observer *observer, unsigned long age,
     }}
 {process}    const real *below = {last} + {nx};
     for (size_t i = 0; i < {nx}; i++) {{
-        double scale = exp(({last}[i] < {largest} ? {last}[i] : {largest}) + rise[0]);
+        double scale = exp(({last}[i] < {largest} ? {last}[i] : {largest}) + rise[0]) / flow_x_scale[i];
         for (size_t j = 0; j < i; j++)
             P[i][j] = scale * *below++;
         P[i][i] = scale;

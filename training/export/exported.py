@@ -119,9 +119,10 @@ class Exported:
             )
 
     def _check_range(self) -> None:
-        flow = self.artifact.flow
-        scaled = [*self.maps.values(), *([] if flow is None else [flow])]
-        largest = max(float(np.abs([*each.x_offset, *each.x_scale]).max()) for each in scaled)
+        flow, scales = self.artifact.flow, [(each.x_offset, each.x_scale) for each in self.maps.values()]
+        if flow is not None:
+            scales.append((flow.x_offset, flow.x_scale))
+        largest = float(np.abs(np.concatenate(scales, axis=None)).max())
         if largest > float(np.finfo(np.float32).max):
             raise ArtifactError(
                 f"the scale of the estimates of {self.source}, {largest:g}, is beyond the range of floats: export it "
