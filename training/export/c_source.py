@@ -175,6 +175,7 @@ def _program(exported: Exported, words: dict[str, Any]) -> str:
         MACRO=macro,
         outputs=outputs,
         line=f"the input that led to the next sample, {inputs}, then the sample" if nu else "the next sample",
+        missing="" if exported.artifact.flow is None else " * Outputs that are missing are nan, but for the first.\n",
         digits=9 if exported.precision == "float" else 17,
         declared=f"    {exported.name}_real u[{macro}_NU];\n" if nu else "",
         first=f"u, {macro}_NU" if nu else f"y, {macro}_NY",

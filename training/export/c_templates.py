@@ -177,7 +177,7 @@ PROGRAM = """\
  * Reads samples, writes estimates: cc -std=c99 -O2 {NAME}.c {NAME}_main.c -lm && ./a.out < steps.txt
  *
  * The first line of steps.txt holds {outputs}. Every further line holds {line}.
- */
+{missing} */
 #include <stdio.h>
 
 #include "{NAME}.h"

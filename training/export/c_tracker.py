@@ -66,7 +66,7 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
 
 
 def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> str:
-    """All that comes before ``NAME_estimate``, and that itself."""
+    """``NAME_estimate``, and all functions that come before it."""
     window, share, limit = supervision(flow, exported.artifact.filter.dt)
     nx, free = flow.nx, "free" in exported.maps
     parts = [map_functions(exported, label, inverse) for label, inverse in exported.maps.items()]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import compiled, estimates, fed, needs_cc
-from exported_steps import apart, exported_of, in_doubles, motion, noise
+from exported_steps import UNTRACKED, apart, exported_of, in_doubles, motion, noise
 from rollout_observers import observer_of
 
 from observers import shipped
@@ -55,7 +55,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
         *(
             pytest.param(name, precision, tolerance, marks=pytest.mark.slow)
             for name in sorted(set(shipped().values()))
-            for precision, tolerance in (("float", 5e-5), ("double", 5e-9))
+            for precision, tolerance in (("float", 5e-5 if name in UNTRACKED else 2e-4), ("double", 5e-9))
         ),
     ],
 )
