@@ -12,7 +12,7 @@ from observers.compiled_covariance import CompiledCovariance
 from observers.factors import Factors
 from observers.network import MLP
 
-_LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
+LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,12 @@ class Spread:
         """Number of states."""
         return (math.isqrt(8 * self.mlp.outputs + 1) - 1) // 2
 
+    def in_units(self, scale: np.ndarray) -> MLP:
+        """The network with the scale of the states (nx,) in its last biases: the logarithms are of D in their units."""
+        *biases, bias = (np.array(each, dtype=float) for each in self.mlp.biases)
+        bias[: self.nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
+        return MLP(self.mlp.weights, [*biases, bias], self.mlp.activation)
+
 
 class Covariance:
     """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
@@ -68,11 +74,7 @@ class Covariance:
     """
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
-        nx = self._nx = spread.nx
-        *weights, last = spread.mlp.weights
-        *biases, bias = (np.array(each, dtype=float) for each in spread.mlp.biases)
-        bias[:nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
-        self._mlp = MLP([*weights, last], [*biases, bias], spread.mlp.activation)
+        self._nx, self._mlp = spread.nx, spread.in_units(scale)
         self._ages = spread.ages.tolist()
         self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 
@@ -95,7 +97,7 @@ class Covariance:
         if out.ndim == 1:  # a single sample: every call would be felt
             return np.array(_entries(out.tolist(), nx, self._log_factor(float(age)))).reshape(nx, nx)
         values = np.moveaxis(out, -1, 0).astype(float, order="C")
-        np.minimum(values[:nx], _LARGEST_LOG, out=values[:nx])
+        np.minimum(values[:nx], LARGEST_LOG, out=values[:nx])
         values[:nx] += np.interp(age, self._ages, self._log_factors)
         np.exp(values[:nx], out=values[:nx])
         covariance = np.empty((*out.shape[:-1], nx * nx))
@@ -119,7 +121,7 @@ class Covariance:
                 nx=self._nx,
                 ages=self._ages,
                 log_factors=self._log_factors,
-                largest_log=_LARGEST_LOG,
+                largest_log=LARGEST_LOG,
                 **inputs,
             )
         except ImportError:
@@ -143,7 +145,7 @@ class Covariance:
 
 def _entries(values: list[float], nx: int, factor: float) -> list[float]:
     """The covariance of one sample, row by row; written out for two or three states: loops take thrice as long."""
-    exp, end = math.exp, _LARGEST_LOG
+    exp, end = math.exp, LARGEST_LOG
     if nx == 2:
         a, b, d = values
         a, b = exp((end if a > end else a) + factor), exp((end if b > end else b) + factor)
@@ -185,4 +187,4 @@ def deviations(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(covariance.diagonal(0, -2, -1))
 
 
-__all__ = ["Covariance", "Spread", "deviations"]
+__all__ = ["LARGEST_LOG", "Covariance", "Spread", "deviations"]

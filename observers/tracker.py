@@ -10,6 +10,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
+from observers.flow import Flow
 from observers.sparse import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
@@ -60,9 +61,7 @@ class Tracker:
         self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
         self._C = None if artifact.C is None else artifact.C * flow.x_scale
         self._units = flow.x_scale[:, None] * flow.x_scale
-        self._window = max(1, round(flow.window / self._dt))
-        self._share = -math.expm1(-1 / self._window)
-        self._limit = _largest_mean_square(len(r) * (2 - self._share) / self._share)
+        self._window, self._share, self._limit = supervision(flow, self._dt)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._log_roots, self._free_log_roots = (  # of factors, by age in samples
             (each.ages / self._dt, each.log_roots(*shares))
@@ -279,10 +278,34 @@ def _mean_square(P: np.ndarray) -> np.ndarray:
     return np.asarray(np.trace(P, axis1=-2, axis2=-1))
 
 
+def supervision(flow: Flow, dt: float) -> tuple[int, float, float]:
+    """How innovations are watched.
+
+    Parameters
+    ----------
+    flow : Flow
+        The motion over a sample.
+    dt : float
+        Seconds from sample to sample.
+
+    Returns
+    -------
+    window : int
+        Samples over which they are averaged, and within which T_inv may say again where to begin.
+    share : float
+        Of the newest innovation in the mean square.
+    limit : float
+        Of the mean square, beyond which the tracker is lost.
+    """
+    window = max(1, round(flow.window / dt))
+    share = -math.expm1(-1 / window)
+    return window, share, _largest_mean_square(len(flow.least_measurement_noise) * (2 - share) / share)
+
+
 def _largest_mean_square(freedom: float) -> float:
     """Of as many standard normal numbers, beyond chance: by Wilson and Hilferty's cube root of chi-square."""
     spread = 2 / (9 * freedom)
     return float((1 - spread + _BEYOND_CHANCE * math.sqrt(spread)) ** 3)
 
 
-__all__ = ["Tracker"]
+__all__ = ["Tracker", "supervision"]

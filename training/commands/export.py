@@ -20,7 +20,8 @@ class ExportCommand:
 
     All take in a sample and the input before it, and give the filter's next state and the estimate, as
     observers.KKLObserver does. All maps can be exported: those that ship, of your own systems, from records and from
-    rollouts. Missing samples and the monitor are in JavaScript alone.
+    rollouts. Those that track need --format c and an output that is linear. Missing samples are in JavaScript and, of
+    maps that track, in C. The monitor is in JavaScript alone.
 
     --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
     extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library's math.h alone, and
@@ -36,7 +37,8 @@ class ExportCommand:
     """What to write."""
     precision: Literal["float", "double"] = "float"
     """Type of the network, of samples and of estimates; JavaScript knows doubles alone. The filter is of doubles in any
-    case, as floats would not do: what the network is told of it are small differences."""
+    case, as floats would not do: what the network is told of it are small differences. So is the covariance of maps
+    that track."""
     measurement_noise: Annotated[
         NoiseLevel, tyro.conf.arg(aliases=["--noise"], help_behavior_hint="(default: what is usual for the map)")
     ] = None

@@ -29,7 +29,7 @@ typedef {real} {NAME}_real;
 typedef struct {{
     double z[{size}]; /* the filter's state */
     {NAME}_real y[{ny}]; /* the last sample */
-{age}}} {NAME}_observer;
+{age}{tracker}}} {NAME}_observer;
 
 /* Forget the past and take in the first sample. */
 void {NAME}_reset({NAME}_observer *observer, const {NAME}_real y[{ny}]);
@@ -78,39 +78,46 @@ static void activate_{activation}(real *h, size_t n)
 """
 
 MAP = """
-static void {map}_map(const {NAME}_observer *observer, real *x_hat)
+static void {map}_read(const {NAME}_observer *observer{age}, real *a)
 {{
-    real a[{width}], b[{width}];
     for (size_t i = 0; i < {modes}; i++) {{
         double mode = 0.0;
         for (size_t j = 0; j < {size}; j++)
             mode += {map}_whiten[i][j] * (observer->z[j] - {map}_z_offset[j]);
         a[i] = (real)({gain}mode);
     }}
-{told}{layers}    for (size_t i = 0; i < {nx}; i++)
+{told}}}
+
+static void {map}_map(const {NAME}_observer *observer, real *x_hat)
+{{
+    real a[{width}], b[{width}];
+    {map}_read(observer{age_now}, a);
+{layers}    for (size_t i = 0; i < {nx}; i++)
         x_hat[i] = (real)({map}_x_offset[i] + {map}_x_scale[i] * {last}[i]);
 }}
 """
 
-ESTIMATE_FREE = """
-void {NAME}_estimate(const {NAME}_observer *observer, real x_hat[{nx}])
+ASK_ONE = """
+{head}
 {{
-    for (size_t i = {nz}; i < {size}; i++) {{
-        if (observer->z[i] != 0.0) {{ /* an input has acted */
-            driven_map(observer, x_hat);
-            return;
-        }}
-    }}
-    free_map(observer, x_hat);
+    driven_{what};
 }}
 """
 
-ESTIMATE = """
-void {NAME}_estimate(const {NAME}_observer *observer, real x_hat[{nx}])
+ASK_TWO = """
+{head}
 {{
-    driven_map(observer, x_hat);
+    for (size_t i = {nz}; i < {size}; i++) {{
+        if (observer->z[i] != 0.0) {{ /* an input has acted */
+            driven_{what};
+            return;
+        }}
+    }}
+    free_{what};
 }}
 """
+
+ESTIMATE = "void {NAME}_estimate(const {NAME}_observer *observer, real x_hat[{nx}])"
 
 RESET = """
 void {NAME}_reset({NAME}_observer *observer, const real y[{ny}])
@@ -122,7 +129,7 @@ void {NAME}_reset({NAME}_observer *observer, const real y[{ny}])
             observer->z[i] += equilibrium[i][j] * y[j];
         observer->y[j] = y[j];
     }}
-{age_zero}}}
+{begin}}}
 """
 
 ADVANCE = """
@@ -146,13 +153,13 @@ STEP = """
 void {NAME}_step({NAME}_observer *observer, const real y[{ny}]{u}, real x_hat[{nx}])
 {{
     double *z = observer->z;
-    advance(z);
+{take}    advance(z);
     for (size_t i = 0; i < {nz}; i++)
         for (size_t j = 0; j < {ny}; j++)
             z[i] += early_y[i][j] * observer->y[j] + late_y[i][j] * y[j];
 {inputs}    for (size_t j = 0; j < {ny}; j++)
         observer->y[j] = y[j];
-{age_next}    {NAME}_estimate(observer, x_hat);
+{age_next}{supervise}    {NAME}_estimate(observer, x_hat);
 }}
 """
 
@@ -170,7 +177,7 @@ PROGRAM = """\
  * Reads samples, writes estimates: cc -std=c99 -O2 {NAME}.c {NAME}_main.c -lm && ./a.out < steps.txt
  *
  * The first line of steps.txt holds {outputs}. Every further line holds {line}.
- */
+{missing} */
 #include <stdio.h>
 
 #include "{NAME}.h"

@@ -15,6 +15,7 @@ from observers.errors import ArtifactError
 from observers.inverse import InverseMap
 from observers.names import resolve
 from observers.storage import checksum
+from observers.tracker import supervision
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -82,19 +83,13 @@ class Exported:
         Raises
         ------
         ArtifactError
-            If there is no such observer, its file is damaged, it tracks, or a number of it is beyond the range of
-            floats.
+            If there is no such observer, its file is damaged, or a number of it is beyond the range of floats.
         ValueError
             If the precision is unknown, or a level of noise is out of range.
         """
         choice("precision", precision, PRECISIONS)
         text, path = os.fspath(name_or_path), resolve(name_or_path)
         artifact = Artifact.read(path)
-        if artifact.flow is not None:
-            raise ArtifactError(
-                f"{path.name} tracks, and what is exported is the filter and T_inv alone: export the map that it was "
-                "made from (kkl-gym tracking leaves it as it is)"
-            )
         observer = KKLObserver(artifact, measurement_noise, process_noise=process_noise)
         exported = cls(
             artifact,
@@ -109,8 +104,25 @@ class Exported:
             exported._check_range()
         return exported
 
+    def refuse_flow(self) -> None:
+        """See that the filter and T_inv are all there is.
+
+        Raises
+        ------
+        ArtifactError
+            If it tracks.
+        """
+        if self.artifact.flow is not None:
+            raise ArtifactError(
+                f"{self.source} tracks, which --format c alone can export. For others export the map that it was made "
+                "from (kkl-gym tracking leaves it as it is), which is T_inv alone"
+            )
+
     def _check_range(self) -> None:
-        largest = max(float(np.abs([*inverse.x_offset, *inverse.x_scale]).max()) for inverse in self.maps.values())
+        flow, scales = self.artifact.flow, [(each.x_offset, each.x_scale) for each in self.maps.values()]
+        if flow is not None:
+            scales.append((flow.x_offset, flow.x_scale))
+        largest = float(np.abs(np.concatenate(scales, axis=None)).max())
         if largest > float(np.finfo(np.float32).max):
             raise ArtifactError(
                 f"the scale of the estimates of {self.source}, {largest:g}, is beyond the range of floats: export it "
@@ -143,6 +155,8 @@ class Exported:
     def last_age(self) -> int:
         """Samples since the first after which the age no longer matters; 0 if it never does."""
         ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
+        if self.artifact.flow is not None:
+            ends.append(supervision(self.artifact.flow, self.artifact.filter.dt)[0] * self.artifact.filter.dt)
         return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
 
     @property

@@ -33,9 +33,12 @@ def onnx_model(exported: Exported) -> Any:
 
     Raises
     ------
+    ArtifactError
+        If it tracks.
     ModuleNotFoundError
         Without the extra ``onnx``.
     """
+    exported.refuse_flow()
     from onnx import checker, helper
 
     artifact, linear = exported.artifact, exported.artifact.filter

@@ -35,9 +35,12 @@ def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
 
     Raises
     ------
+    ArtifactError
+        If it tracks.
     OSError
         If the file cannot be written.
     """
+    exported.refuse_flow()
     artifact, linear = exported.artifact, exported.artifact.filter
     nz = len(linear.A)
     block = linear.transition[:nz, :nz]

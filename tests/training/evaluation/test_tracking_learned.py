@@ -18,6 +18,8 @@ from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.tracking import learn_tracking
 from training.export.exported import Exported
+from training.export.onnx_graph import onnx_model
+from training.export.step_file import write_step
 from training.guided import GuidedKalmanFilter
 from training.maps import flow
 from training.trajectories.controllers import linear_quadratic
@@ -172,8 +174,11 @@ def _bare():
 def test_who_needs_t_inv_alone_says_so(tmp_path):
     artifact = tracking_observer()
     artifact.save(tmp_path / "map.safetensors")
-    with pytest.raises(ValueError, match="tracks"):
-        Exported.read(tmp_path / "map.safetensors")
+    exported = Exported.read(tmp_path / "map.safetensors")
+    with pytest.raises(ValueError, match="tracks, which --format c alone can export"):
+        write_step(tmp_path / "step.safetensors", exported)
+    with pytest.raises(ValueError, match="tracks, which --format c alone can export"):
+        onnx_model(exported)
     with pytest.raises(ValueError, match="tracks"):
         certify(artifact, Noiseless())
     with pytest.raises(ValueError, match="tracks"):

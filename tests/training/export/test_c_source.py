@@ -3,12 +3,12 @@
 import math
 import re
 import shutil
-import subprocess
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import apart, exported_of, in_doubles, motion, noise
+from compiled_c import compiled, estimates, fed, needs_cc
+from exported_steps import UNTRACKED, apart, exported_of, in_doubles, motion, noise
 from rollout_observers import observer_of
 
 from observers import shipped
@@ -16,31 +16,6 @@ from training.export import Exported
 from training.export.c_source import c_files
 from training.export.exported import identifier
 from training.export.footprint import footprint
-
-WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
-needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler, cc")
-
-
-def compiled(exported, folder, *options):
-    """The program around an exported observer."""
-    for name, text in c_files(exported).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    program, sources = folder / "program", [folder / f"{exported.name}{end}.c" for end in ("", "_main")]
-    done = subprocess.run(["cc", *WARNINGS, *options, *sources, "-lm", "-o", program], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return program
-
-
-def fed(program, text):
-    return subprocess.run([program], input=text, capture_output=True, text=True)
-
-
-def estimates(program, y, u):
-    """What the program prints for a record."""
-    rows = np.concatenate([u[:-1], y[1:]], axis=-1).tolist()
-    done = fed(program, "\n".join(" ".join(map(repr, row)) for row in [y[0].tolist(), *rows]) + "\n")
-    assert (done.returncode, done.stderr) == (0, "")
-    return np.array([line.split() for line in done.stdout.splitlines()], dtype=float)
 
 
 def activated(artifact, activation):
@@ -80,7 +55,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
         *(
             pytest.param(name, precision, tolerance, marks=pytest.mark.slow)
             for name in sorted(set(shipped().values()))
-            for precision, tolerance in (("float", 5e-5), ("double", 5e-9))
+            for precision, tolerance in (("float", 5e-5 if name in UNTRACKED else 2e-4), ("double", 5e-9))
         ),
     ],
 )

@@ -4,10 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from exported_steps import apart, exported_of, in_doubles, motion, noise
+from exported_steps import UNTRACKED, apart, exported_of, in_doubles, motion, noise
 from rollout_observers import observer_of
 
-from observers import shipped
 from observers.errors import ArtifactError
 from observers.names import resolve
 from observers.storage import checksum
@@ -67,7 +66,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
 
 @pytest.mark.parametrize(
     "name",
-    ["van_der_pol", *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(set(shipped().values())))],
+    ["van_der_pol", *(pytest.param(name, marks=pytest.mark.slow) for name in UNTRACKED)],
 )
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 5e-5), ("double", 5e-9)])
 def test_what_ships(name, precision, tolerance):

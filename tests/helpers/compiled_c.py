@@ -1,0 +1,34 @@
+"""Exported C, compiled and run."""
+
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from training.export.c_source import c_files
+
+WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler, cc")
+
+
+def compiled(exported, folder, *options):
+    """The program around an exported observer."""
+    for name, text in c_files(exported).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    program, sources = folder / "program", [folder / f"{exported.name}{end}.c" for end in ("", "_main")]
+    done = subprocess.run(["cc", *WARNINGS, *options, *sources, "-lm", "-o", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def fed(program, text):
+    return subprocess.run([program], input=text, capture_output=True, text=True)
+
+
+def estimates(program, y, u):
+    """What the program prints for a record."""
+    rows = np.concatenate([u[:-1], y[1:]], axis=-1).tolist()
+    done = fed(program, "\n".join(" ".join(map(repr, row)) for row in [y[0].tolist(), *rows]) + "\n")
+    assert (done.returncode, done.stderr) == (0, "")
+    return np.array([line.split() for line in done.stdout.splitlines()], dtype=float)

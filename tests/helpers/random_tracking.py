@@ -1,0 +1,66 @@
+"""Observers that track by a flow that is the truth, with a T_inv of random weights."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+from error_bars import with_error_bars
+from random_artifacts import random_artifact
+
+from observers import MLP, Factors, Flow
+
+JUMPS = (600, 605)  # samples that no motion explains
+
+
+def a_flow(nx, nu, ny, seed=0, process=None):
+    """A damped rotation, bent a little by a network."""
+    rng, factors = np.random.default_rng(seed), np.array([[[2.0, 1.0], [1.5, 0.7]], [[2.5, 1.5], [1.0, 0.9]]])
+    sizes = (nx + nu, 13, 11, nx)
+    mlp = MLP(
+        [rng.normal(size=(b, a)) / a**0.5 for a, b in itertools.pairwise(sizes)],
+        [rng.normal(size=b) for b in sizes[1:]],
+        "tanh",
+    )
+    turn = rng.normal(size=(nx, nx))
+    linear = np.hstack([0.05 * (turn - turn.T) - 0.02 * np.eye(nx), 0.1 * rng.normal(size=(nx, nu))])
+    return Flow(
+        mlp=mlp,
+        x_offset=rng.normal(size=nx),
+        x_scale=rng.uniform(0.5, 2.0, nx),
+        u_scale=rng.uniform(0.5, 2.0, nu),
+        bias=0.01 * rng.normal(size=nx),
+        gain=0.02 * rng.uniform(0.5, 1.0, nx),
+        linear=linear,
+        low=np.full(nx, -8.0),
+        high=np.full(nx, 8.0),
+        error=np.full(nx, 2e-3),
+        process_noise=np.full(nx, 1e-2),
+        least_process_noise=0.1,
+        least_measurement_noise=np.full(ny, 0.02),
+        window=0.2,
+        factors=Factors(np.array([0.0, 0.5]), np.array([0.0, 1.0]), factors[0] if process is None else factors),
+    )
+
+
+def tracking(outputs=1, inputs=True, surer=0.0, **options):
+    """An observer of two states whose T_inv nobody trained, however sure it is, but whose flow is the truth."""
+    artifact = with_error_bars(random_artifact(inputs=inputs, outputs=outputs, **options))
+    spread = artifact.inverse.spread
+    bars = MLP(spread.mlp.weights, [spread.mlp.biases[0], spread.mlp.biases[1] - surer], "tanh")
+    artifact = replace(artifact, inverse=replace(artifact.inverse, spread=replace(spread, mlp=bars)))
+    C = np.random.default_rng(3).normal(size=(outputs, artifact.nx))
+    return replace(artifact, C=C, flow=a_flow(artifact.nx, artifact.nu, outputs, process=artifact.process_noise_max))
+
+
+def signals(artifact, steps, batch=()):
+    """Outputs along the flow with noise, which jump for a while, and inputs."""
+    rng, flow = np.random.default_rng(1), artifact.flow
+    u = np.sin(np.cumsum(0.3 * rng.normal(size=(steps, *batch, artifact.nu)), axis=0))
+    u[: steps // 10] = 0.0
+    x, y = flow.x_offset + flow.x_scale * rng.normal(size=(*batch, artifact.nx)), []
+    for k in range(steps):
+        x = flow(x, u[k]) + 0.002 * rng.normal(size=x.shape)
+        y.append(x @ artifact.C.T + 0.1 * rng.normal(size=(*batch, artifact.ny)))
+    y = np.array(y)
+    y[slice(*JUMPS)] += 6.0
+    return y, u

@@ -1,0 +1,221 @@
+"""C99 as templates for :mod:`training.export.c_tracker`, with what differs between observers in braces."""
+
+FIELDS = """\
+    double x[{nx}], P[{nx}][{nx}]; /* the estimate and its covariance, in scaled states */
+    double mean_square; /* of the innovations; beyond its limit the estimate is lost */
+"""
+
+INTERPOLATED = """
+/* Between points that rise from 0; beyond the last, its value. */
+static double interpolated(double at, const double *points, const double *values, size_t n)
+{
+    size_t i = 1;
+    while (i < n && at >= points[i])
+        i++;
+    if (i == n)
+        return values[n - 1];
+    return values[i - 1] + (at - points[i - 1]) / (points[i] - points[i - 1]) * (values[i] - values[i - 1]);
+}
+"""
+
+# D L L^T D, whose D has the first outputs of the network as logarithms, and L the others below ones.
+COVARIANCE = """
+/* How far that is off: the covariance in scaled states. The age is in samples. */
+static void {map}_covariance(const {NAME}_observer *observer, unsigned long age, double P[{nx}][{nx}])
+{{
+    real a[{width}], b[{width}];
+    double by_level[{levels}], rise[{tables}];
+    {map}_read(observer{age}, a);
+{layers}    for (size_t i = 0; i < {tables}; i++) {{
+        for (size_t j = 0; j < {levels}; j++)
+            by_level[j] = interpolated((double)age * {dt}, {map}_ages, {map}_rise[i * {levels} + j], {ages});
+        rise[i] = interpolated({measurement_share}, {map}_levels, by_level, {levels});
+    }}
+{process}    const real *below = {last} + {nx};
+    for (size_t i = 0; i < {nx}; i++) {{
+        double scale = exp(({last}[i] < {largest} ? {last}[i] : {largest}) + rise[0]) / flow_x_scale[i];
+        for (size_t j = 0; j < i; j++)
+            P[i][j] = scale * *below++;
+        P[i][i] = scale;
+    }}
+    for (size_t i = {nx}; i-- > 0;) {{ /* its square takes its place: from the end on, nothing is needed that is gone */
+        for (size_t j = i + 1; j-- > 0;) {{
+            double sum = 0.0;
+            for (size_t k = 0; k <= j; k++)
+                sum += P[i][k] * P[j][k];
+            P[i][j] = P[j][i] = sum;
+        }}
+    }}
+}}
+"""
+
+BETWEEN_TABLES = "    rise[0] += {share} * (rise[1] - rise[0]);\n"
+
+INVERT = "static void invert(const {NAME}_observer *observer, real *x_hat)"
+
+COVARIANCE_OF_ONE = "static void covariance(const {NAME}_observer *observer, unsigned long age, double P[{nx}][{nx}])"
+
+TRACKER = """
+/* The bounds of the motion. */
+static double within(double s, size_t i)
+{{
+    s = s < low[i] ? low[i] : s;
+    return s > high[i] ? high[i] : s;
+}}
+
+/* Scaled states, behind which lie scaled inputs, a sample later. */
+static void flow(const double in[{inputs}], double next[{nx}])
+{{
+    real a[{width}], b[{width}];
+    for (size_t i = 0; i < {inputs}; i++)
+        a[i] = (real)in[i];
+{layers}    for (size_t i = 0; i < {nx}; i++) {{
+        next[i] = in[i] + flow_bias[i] + flow_gain[i] * {last}[i];
+        for (size_t j = 0; j < {inputs}; j++)
+            next[i] += flow_linear[i][j] * in[j];
+    }}
+}}
+
+/* Estimate and covariance a sample later: of the mean, and the mean +- sqrt(3) times each column of P's factor. */
+static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P[{nx}][{nx}])
+{{
+    double L[{nx}][{nx}], in[{inputs}], points[{count}][{nx}];
+    for (size_t i = 0; i < {nx}; i++) {{
+        for (size_t j = 0; j <= i; j++) {{
+            double entry = observer->P[i][j];
+            for (size_t k = 0; k < j; k++)
+                entry -= L[i][k] * L[j][k];
+            if (i > j)
+                L[i][j] = entry / L[j][j];
+            else
+                L[i][j] = entry > 0.0 ? sqrt(entry) : NAN; /* which spreads, and is noticed in track */
+        }}
+    }}
+{scaled_inputs}    for (size_t p = 0; p < {count}; p++) {{
+        for (size_t i = 0; i < {nx}; i++) {{
+            double s = observer->x[i];
+            if (p > 0 && i >= (p - 1) / 2)
+                s += (p % 2 ? {far} : -{far}) * L[i][(p - 1) / 2];
+            in[i] = within(s, i);
+        }}
+        flow(in, points[p]);
+    }}
+    for (size_t i = 0; i < {nx}; i++) {{
+        x[i] = {central_mean} * points[0][i];
+        for (size_t p = 1; p < {count}; p++)
+            x[i] += points[p][i] / 6.0;
+        for (size_t p = 0; p < {count}; p++)
+            points[p][i] -= x[i];
+        for (size_t j = 0; j <= i; j++) {{
+            double sum = 0.0;
+            for (size_t p = 1; p < {count}; p++)
+                sum += points[p][i] * points[p][j];
+            P[i][j] = P[j][i] = sum / 6.0 + {central} * points[0][i] * points[0][j];
+        }}
+        P[i][i] += Q[i];
+    }}
+}}
+
+/* Predict, and take in a sample, one output after another. What is missing is replaced by what was predicted. */
+static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{ny}])
+{{
+    double x[{nx}], P[{nx}][{nx}], across[{nx}], squared = 0.0, total = 0.0;
+    size_t seen = 0;
+    predict(observer{pass_u}, x, P);
+    for (size_t k = 0; k < {ny}; k++) {{
+        double expected = output_mean[k];
+        for (size_t i = 0; i < {nx}; i++)
+            expected += C[k][i] * x[i];
+        if (isnan(y[k]))
+            whole[k] = isfinite(expected) ? (real)expected : observer->y[k];
+        else
+            whole[k] = y[k];
+    }}
+    for (size_t k = 0; k < {ny}; k++) {{
+        double apart = y[k] - output_mean[k], pivot = R[k];
+        if (isnan(y[k]))
+            continue;
+        for (size_t i = 0; i < {nx}; i++) {{
+            across[i] = 0.0;
+            for (size_t j = 0; j < {nx}; j++)
+                across[i] += C[k][j] * P[i][j];
+            apart -= C[k][i] * x[i];
+        }}
+        for (size_t i = 0; i < {nx}; i++)
+            pivot += C[k][i] * across[i];
+        squared += apart * apart / pivot;
+        seen++;
+        for (size_t i = 0; i < {nx}; i++) {{
+            x[i] += across[i] / pivot * apart;
+            for (size_t j = 0; j <= i; j++)
+                P[i][j] = P[j][i] = P[i][j] - across[i] / pivot * across[j];
+        }}
+    }}
+    for (size_t i = 0; i < {nx}; i++) {{
+        total += x[i];
+        for (size_t j = 0; j <= i; j++)
+            total += P[i][j];
+    }}
+    if (!isfinite(total)) {{
+        observer->mean_square = INFINITY; /* lost */
+        return;
+    }}
+    for (size_t i = 0; i < {nx}; i++) {{
+        observer->x[i] = within(x[i], i);
+        for (size_t j = 0; j < {nx}; j++)
+            observer->P[i][j] = P[i][j];
+    }}
+    if (seen)
+        observer->mean_square += {share} * (squared / seen - observer->mean_square);
+}}
+
+/* Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost. */
+static void supervise({NAME}_observer *observer)
+{{
+    int lost = !(observer->mean_square <= {limit}); /* also where it is no number */
+    double P[{nx}][{nx}], ours = 0.0, theirs = 0.0;
+    real x_hat[{nx}];
+    if (!lost && observer->age >= {window}ul)
+        return;
+    /* what came before it was lost may have misled z: T_inv is no surer than so soon after a reset */
+    covariance(observer, observer->age < {window}ul ? observer->age : {window}ul, P);
+    for (size_t i = 0; i < {nx}; i++) {{
+        ours += observer->P[i][i];
+        theirs += P[i][i];
+    }}
+    if (!lost && !(theirs < ours))
+        return;
+    invert(observer, x_hat);
+    for (size_t i = 0; i < {nx}; i++) {{
+        observer->x[i] = within((x_hat[i] - flow_x_offset[i]) / flow_x_scale[i], i);
+        for (size_t j = 0; j < {nx}; j++)
+            observer->P[i][j] = P[i][j];
+    }}
+    if (lost)
+        observer->mean_square = 1.0;
+}}
+"""
+
+SCALED_INPUTS = """\
+    for (size_t j = 0; j < {nu}; j++)
+        in[{nx} + j] = u[j] / flow_u_scale[j];
+"""
+
+ESTIMATE_TRACKED = """
+{head}
+{{
+    for (size_t i = 0; i < {nx}; i++)
+        x_hat[i] = (real)(flow_x_offset[i] + flow_x_scale[i] * observer->x[i]);
+}}
+"""
+
+BEGIN = """\
+    observer->mean_square = INFINITY; /* lost as yet */
+    supervise(observer);
+"""
+
+TAKE = """\
+    real whole[{ny}];
+    track(observer, y{pass_u}, whole);
+    y = whole;
+"""
