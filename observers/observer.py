@@ -1,5 +1,6 @@
 """The observer at run time: filter the output, invert the map."""
 
+import copy
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -51,10 +52,11 @@ class KKLObserver:
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
-        Whether single samples go through machine code, which takes two seconds to make, and then a third of the time.
-        True makes it here, such as before a loop in real time; it needs Numba, the extra ``fast``. False leaves them to
-        NumPy. None is NumPy until a :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is
-        held up in its midst. The two agree to rounding. Batches of 128 rows or more take Numba wherever it is.
+        Whether single samples go through machine code, which takes some seconds to make, and then a third of the time,
+        or an eighth where the observer tracks. True makes it here, such as before a loop in real time; it needs Numba,
+        the extra ``fast``. False leaves them to NumPy. None is NumPy until a :meth:`reset` after 1,000 samples, and
+        then Numba if it is installed: no run is held up in its midst. The two agree to rounding. Batches of 128 rows or
+        more take Numba wherever it is.
 
     Raises
     ------
@@ -183,11 +185,12 @@ class KKLObserver:
             self._tracker.warm_up(z)
 
     def __copy__(self) -> "KKLObserver":
-        """Another that stands where this one does: it goes its own way, as everything but the tracker is replaced."""
+        """Another that stands where this one does, and goes its own way: what is changed in place is copied too."""
         other = object.__new__(type(self))
         vars(other).update(vars(self))
-        if self._z is not None and self._tracker is not None:
-            other._tracker = self._tracker.copied()
+        other._monitor = copy.deepcopy(self._monitor)
+        if self._tracker is not None:
+            other._tracker = other._new_tracker() if self._z is None else self._tracker.copied()
         return other
 
     def replace(self, artifact: Artifact) -> None:

@@ -14,7 +14,8 @@ from observers.flow import Flow
 from observers.sparse import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
-# A filter is lost where innovations are as large as that by chance once in 1e5: the normal distribution's quantile.
+# A filter is lost where innovations are as large as that by chance: the normal distribution's quantile for 1e-5. Their
+# running mean is more skewed than what that is taken of, so that it is up to 5e-5, most where windows are short.
 _BEYOND_CHANCE = 4.265
 KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scaled states
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample

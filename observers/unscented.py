@@ -1,8 +1,8 @@
 """Gaussians through functions that are not linear, by sigma points, for a batch of them.
 
 The points are van der Merwe's scaled ones with alpha = 1, beta = 2 and kappa = 3 - nx: the mean, and the mean +-
-sqrt(3) times each column of the covariance's Cholesky factor (Wan and van der Merwe, 2000). They are drawn anew between
-prediction and correction.
+sqrt(3) times each column of the covariance's Cholesky factor (Wan and van der Merwe, 2000). They are drawn anew for
+outputs that are not linear.
 """
 
 import math

@@ -13,7 +13,7 @@ from safetensors import safe_open
 from scipy.linalg import solve_discrete_are
 from tracking import DT, PROCESS, STD, KalmanFilter, exact_flow, exact_motion, plain_observer, tracking_observer
 
-from observers import MLP, Artifact, ArtifactError, Factors, KKLObserver, LinearFilter, unscented
+from observers import MLP, Artifact, ArtifactError, Factors, KKLObserver, LinearFilter, load, unscented
 
 LEVEL = 0.2
 CLOSE = {"rtol": 1e-5, "atol": 1e-6}
@@ -362,3 +362,23 @@ def test_sigma_points_have_mean_and_covariance(nx):
     np.testing.assert_allclose(left, (np.eye(nx) - K @ H) @ P, rtol=1e-6, atol=1e-9)
     apart = y - x @ H.T
     np.testing.assert_allclose(nis, np.einsum("ni,nij,nj->n", apart, np.linalg.inv(S), apart) / 2)
+
+
+def test_a_copy_made_before_reset_goes_its_own_way():
+    observer = KKLObserver(tracking_observer(), LEVEL)
+    other = copy.copy(observer)
+    x_hat = observer.reset(np.array([0.5]))
+    other.reset(np.full((3, 1), -0.5))
+    assert np.array_equal(observer.decode(), x_hat)
+
+
+def test_a_copy_has_a_monitor_of_its_own():
+    observer = load("van_der_pol-tracking", monitor=True)
+    observer.reset(np.array([1.0]))
+    for _ in range(300):
+        observer.step(np.array([1.0]))
+    score, other = observer.score, copy.copy(observer)
+    for _ in range(300):
+        other.step(np.array([5.0]))
+    assert other.score > score
+    assert observer.score == score
