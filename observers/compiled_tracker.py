@@ -51,13 +51,14 @@ class CompiledTracker:
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
         low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
-        states = low, high, flow.bias, flow.gain, q, flow.x_offset, flow.x_scale, flow.linear
-        outputs = C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale
-        model = _packed(states), _packed(outputs), 1.0 / np.array(flow.u_scale, dtype=float)
+        states = _packed(low, high, flow.bias, flow.gain, q, flow.x_offset, flow.x_scale, flow.linear)
+        outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
+        scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
-        one, *others = _tracking(network.activation, flow.nx, flow.nu, len(C))
-        self._one = functools.partial(one, *model, network.packed, network.widths, network.between)
-        self._enter, self._leave, self._take = (functools.partial(each, *model) for each in others)
+        one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C))
+        self._one = functools.partial(one, states, outputs, scale, network.packed, network.widths, network.between)
+        self._enter, self._leave = functools.partial(enter, states, scale), functools.partial(leave, states, outputs)
+        self._take = functools.partial(take, states)
 
     def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
         """Predict a sample, and take it in.
@@ -106,7 +107,7 @@ class CompiledTracker:
         self._take(*said, lost, where, state)
 
 
-def _packed(columns: tuple[np.ndarray, ...]) -> np.ndarray:
+def _packed(*columns: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(np.column_stack(columns))
 
 
@@ -238,7 +239,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
                     for j in range(i + 1):
                         row[nx + nx * i + j] = row[nx + nx * j + i] = found[nx + nx * i + j]
                 if seen > 0:
-                    row[nx + entries] += outputs[0, _SHARE] * (squared / seen - row[nx + entries])
+                    row[nx + entries] += outputs[0, _SHARE] * seen / ny * (squared / seen - row[nx + entries])
             else:
                 row[nx + entries] = np.inf
 
@@ -266,7 +267,6 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     @compiled
     def enter(
         states: np.ndarray,
-        outputs: np.ndarray,
         scale: np.ndarray,
         u: np.ndarray,
         state: np.ndarray,
@@ -281,7 +281,6 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     def leave(
         states: np.ndarray,
         outputs: np.ndarray,
-        scale: np.ndarray,
         h: np.ndarray,
         moved: np.ndarray,
         y: np.ndarray,
@@ -296,8 +295,6 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     @compiled
     def take(
         states: np.ndarray,
-        outputs: np.ndarray,
-        scale: np.ndarray,
         x: np.ndarray,
         P: np.ndarray,
         lost: np.ndarray,

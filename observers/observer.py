@@ -47,8 +47,9 @@ class KKLObserver:
         is usual, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
-        environments, for maps that ask for it. What lies beyond their training counts as its end. So does None: it is
-        the system's own level, which is also that of the environments and of the monitor's limits.
+        environments, for maps that ask for it. What lies beyond their training counts as its end for T_inv; where the
+        observer tracks, its filter takes any level. None is that end, the system's own level, which is also that of the
+        environments and of the monitor's limits.
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
@@ -496,9 +497,10 @@ class KKLObserver:
         """Covariance of the estimate's error x - x_hat as things stand, shape (..., nx, nx).
 
         It is that of the errors in the runs that the map was calibrated on, given all that the map is told: z, the
-        levels of noise and the age. Nine errors in ten there lie where (x - x_hat)^T P^-1 (x - x_hat) is below the
-        90 % quantile of the chi-square distribution with nx degrees of freedom. On another plant, under a faulty
-        sensor or far from the training it says too little. Nothing is computed until it is asked for.
+        levels of noise and the age. Nine errors in ten there, or a few more where some are far off, lie where (x -
+        x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square distribution with nx degrees of freedom.
+        On another plant, under a faulty sensor or far from the training it says too little. Nothing is computed until
+        it is asked for.
 
         Raises
         ------

@@ -43,7 +43,7 @@ class Tracker:
         Level in multiples of the system's scale per second.
     compiled : bool, default False
         Whether single samples go through machine code, as :class:`observers.KKLObserver` has it. Batches of many rows
-        do so wherever Numba is installed, if the output is linear.
+        do so wherever Numba is installed. Outputs that are not linear stay with NumPy in any case.
     """
 
     def __init__(
@@ -166,8 +166,9 @@ class Tracker:
             else:
                 expected, across = self._output(x), P @ self._C.T
                 S = self._C @ across
-            x, P, nis = conditioned(x, P, y - expected, S + self._R, across, R=self._R)
-            mean_square = self._mean_square + self._share * ~np.isnan(y).all(-1) * (nis - self._mean_square)
+            x, P, nis = conditioned(x, P, y - expected, S + self._R, across)
+            share = self._share * (1 - np.isnan(y).mean(-1))  # less of those that are known in part, which scatter more
+            mean_square = self._mean_square + share * (nis - self._mean_square)
             state = self._packed(self._within(x), P, mean_square)
             sound = np.isfinite(state[:, :-1].sum(-1))
         taken = sound if rows is None else sound & rows

@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-UNSEEN = 1e12  # variance of an output that is missing, in multiples of the largest of those measured
 LEAST_EIGENVALUE = 1e-13  # of a covariance, over its largest: below that its factor would be rounding
 
 Gaussian = tuple[np.ndarray, np.ndarray]
@@ -62,7 +61,7 @@ def corrected(
         Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
     """
     expected, S, across = transformed(x, P, function=output)
-    return conditioned(x, P, y - expected, S + R, across, R=R)
+    return conditioned(x, P, y - expected, S + R, across)
 
 
 def transformed(
@@ -88,7 +87,7 @@ def transformed(
 
 
 def conditioned(
-    x: np.ndarray, P: np.ndarray, innovation: np.ndarray, S: np.ndarray, across: np.ndarray, *, R: np.ndarray
+    x: np.ndarray, P: np.ndarray, innovation: np.ndarray, S: np.ndarray, across: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Condition a batch of Gaussians on what samples differ by from what was expected.
 
@@ -100,8 +99,6 @@ def conditioned(
         Samples less what was expected; NaN where they are missing, which corrects nothing.
     S, across : ndarray, shapes (n, ny, ny) and (n, nx, ny)
         Covariances of the innovations, and of the states with them.
-    R : ndarray, shape (ny, ny)
-        Covariance of the noise on the samples, the part of S that is theirs.
 
     Returns
     -------
@@ -111,10 +108,11 @@ def conditioned(
     missing, measured = np.isnan(innovation), innovation.shape[1]
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
-        S = S + missing[:, None, :] * (UNSEEN * R.max() * np.eye(len(R)))
+        across = np.where(missing[:, None, :], 0.0, across)
+        S = np.where(missing[:, None, :] | missing[..., None], np.eye(measured), S)  # apart from those measured
         measured = np.maximum(measured - missing.sum(-1), 1)
     told = np.concatenate([across.mT, innovation[..., None]], axis=-1)
-    solved = told / S if len(R) == 1 else np.linalg.solve(S, told)
+    solved = told / S if S.shape[-1] == 1 else np.linalg.solve(S, told)
     nis = (innovation * solved[..., -1]).sum(-1) / measured
     change = solved[..., :-1].mT @ told  # K S K^T, and K times the innovation
     return x + change[..., -1], P - change[..., :-1], nis

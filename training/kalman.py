@@ -11,6 +11,7 @@ from observers import unscented
 from observers.unscented import Gaussian
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
+UNSEEN = 1e12  # variance of an output that is missing, in multiples of the largest of those measured
 NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
@@ -190,7 +191,7 @@ class KalmanFilter(ABC):
         missing = np.isnan(y)
         if not missing.any():
             return y - expected, self._R
-        unseen = unscented.UNSEEN * self._R.max() * np.eye(y.shape[1])
+        unseen = UNSEEN * self._R.max() * np.eye(y.shape[1])
         return np.where(missing, 0.0, y - expected), self._R + missing[:, None, :] * unseen
 
     @abstractmethod

@@ -344,6 +344,23 @@ def test_covariances_that_are_none_have_no_factor():
     assert np.isnan(found[[1, 2]]).all()
 
 
+def test_what_is_missing_corrects_nothing():
+    """Also where the noise is small beside what is not known: one output of two says what it says alone."""
+    rng = np.random.default_rng(0)
+    x, P, H, R = rng.normal(size=(4, 3)), np.tile(np.eye(3), (4, 1, 1)), rng.normal(size=(2, 3)), 1e-14 * np.eye(2)
+
+    def found(y, H, R):
+        return unscented.conditioned(x, P, y - x @ H.T, H @ P @ H.T + R, P @ H.T)
+
+    y = rng.normal(size=(4, 2))
+    y[:, 0] = np.nan
+    for part, expected in zip(found(y, H, R), found(y[:, 1:], H[1:], R[1:, 1:]), strict=True):
+        np.testing.assert_allclose(part, expected, rtol=1e-12, atol=1e-12)
+    y[:] = np.nan
+    for part, expected in zip(found(y, H, R), (x, P, np.zeros(4)), strict=True):
+        np.testing.assert_array_equal(part, expected)
+
+
 @pytest.mark.parametrize("nx", [1, 2, 3, 4, 6])
 def test_sigma_points_have_mean_and_covariance(nx):
     rng = np.random.default_rng(nx)

@@ -49,7 +49,7 @@ def learn_tracking(
     T_inv and its error bars stay as they are. A small network learns how states change over a sample, on simulated
     ones about the system's motions. An unscented Kalman filter on that flow is what :class:`observers.KKLObserver`
     then runs beside z. Its covariances are calibrated on further motions, so that regions of 90 % hold 90 % of the
-    errors, and so are the limits of the monitor, if there are any.
+    errors, or up to 92 % where a few are far off, and so are the limits of the monitor, if there are any.
 
     Parameters
     ----------

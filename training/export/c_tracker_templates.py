@@ -166,7 +166,7 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
             observer->P[i][j] = P[i][j];
     }}
     if (seen)
-        observer->mean_square += {share} * (squared / seen - observer->mean_square);
+        observer->mean_square += {share} * (double)seen / {ny} * (squared / seen - observer->mean_square);
 }}
 
 /* Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost. */

@@ -11,7 +11,7 @@ PROFILE = Profile(
     eigenvalues=evenly_spaced(13, -0.4, -8.0),
     # Real modes hardly tell its three parameters apart under noise; slow pairs at frequencies of y do. The error that
     # `kkl-gym tune` predicts, with parameters as states and all of them 10 % off, falls from 2.3 to 1.9 % by the first
-    # two. On validation runs short trainings gained a little by the third, and by a wider network. A third more batches
+    # two. On validation runs short trainings gained a little by the third, and by a wider network. More batches
     # and twice the trajectories are worth 3 % on plants that are 10 % off.
     uncertain_settings={
         "pairs": ((-0.1, 1.05), (-0.1, 0.81), (-0.3, 1.05)),
