@@ -7,10 +7,10 @@ import numpy as np
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
-from training.identification.identifiability import PART, told_directions
+from training.identification.identifiability import NOTHING, PART, told_directions
 from training.trajectories.parameters import with_parameters
 
-STEP = 1e-6  # of a state's half-width, or of a parameter's unit, in numerical derivatives
+STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
 SETTLING, RESETTLING = 12, 3  # Levenberg-Marquardt steps of starts before parameters move, and after each step
 NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off from a linear one
 WORSE = 1.0  # times the mean square of before, from which on a window's start is looked for again
@@ -22,6 +22,10 @@ EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
+DOUBTED = 0.3  # standard deviations, that a change by what ordinary windows leave unknown may be off from a linear one
+CLAIM = 10.0  # times the information of ordinary windows, from which on a window's is looked at
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
+AGAIN = 3  # times at most that this happens
 COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
 OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
 MOST_ROWS = 60_000  # motions simulated at once
@@ -281,13 +285,60 @@ class _Problem:
             damping[rows] *= np.where(better, 0.1, 10.0)
             moved, rows = rows[going], rows[going | ~better]
 
+    def look_again(self, theta: np.ndarray, at: _Motions) -> bool:
+        """Find starts that fit better by way of the windows' beginnings, longer and longer; say whether there are any.
+
+        Squares of long chaotic windows have many minima, those of their beginnings few.
+        """
+        x0, deviations = at.x0, self.weight**-0.5
+        for part in BEGINNINGS:
+            length = max(round(part * len(self.windows.u)), 1)
+            beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
+            x0 = _Problem(self.shooting, beginnings, deviations).settled(theta).x0
+        found = self.follow(theta, x0, self.rows)
+        self.settle(theta, found, self.rows, SETTLING)
+        better = np.flatnonzero(found.each < (1.0 - CONVERGED) * at.each)
+        at.take(found, better, better)
+        return bool(len(better))
+
+    def believed(self, theta: np.ndarray, at: _Motions, used: np.ndarray) -> np.ndarray:
+        """Which windows (n,) tell of the parameters what they claim, if they are used.
+
+        Chaos lets some motions follow the parameters a thousand times as much as others do, but only along changes far
+        smaller than what the others leave unknown. Such windows have minima everywhere, and would outweigh all others.
+        Where nothing but such windows tells a parameter they are believed.
+        """
+        rows, believed = np.flatnonzero(used), np.ones(len(used), dtype=bool)
+        if len(rows) < CLUSTERS:
+            return believed
+        weight = self.weight / at.each[used].mean()
+        each, beyond, by_parameters = _beyond_starts(self.derivatives(theta, at, rows), weight, at.x0.shape[1])
+        sizes = np.einsum("naa->na", each)
+        ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
+        scaled = _whitened(each[ordinary].sum(0) / max(ordinary.sum(), 1))
+        ordinary &= np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0) <= CLAIM
+        unknown, rare = _whitened(each[ordinary].sum(0), least=1.0), np.flatnonzero(~ordinary)
+        if unknown.shape[1] < _whitened(each.sum(0), least=1.0).shape[1]:
+            return believed
+        for change in unknown.T:
+            x0 = at.x0[rows[rare]] + self.shooting.half * (by_parameters[rare] @ change)
+            changed = np.tile(theta + change * self.shooting.unit, (len(rare), 1))
+            y = self.shooting.outputs(changed, x0, self.windows.u[:, rows[rare]]) if len(rare) else at.y[:, :0]
+            off = y - at.y[:, rows[rare]] - beyond[:, rare] @ change
+            squares = (np.where(self.there[:, rows[rare]], off, 0.0) ** 2 * weight).sum((0, 2))
+            believed[rows[rare]] &= squares < DOUBTED**2
+        return believed
+
+    def settled(self, theta: np.ndarray) -> _Motions:
+        """Motions whose starts fit best with given parameters."""
+        at = self.follow(theta, self.windows.x0, self.rows)
+        self.settle(theta, at, self.rows, SETTLING)
+        return at
+
 
 def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
     """Starts (n, nx) of windows that fit best with given parameters."""
-    problem = _Problem(shooting, windows)
-    motions = problem.follow(theta, windows.x0, problem.rows)
-    problem.settle(theta, motions, problem.rows, SETTLING)
-    return motions.x0
+    return _Problem(shooting, windows).settled(theta).x0
 
 
 def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
@@ -376,13 +427,13 @@ def shoot(
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
         raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
     problem = _Problem(shooting, windows, deviations)
-    nx, damping, slow = shooting.system.nx, FIRST_DAMPING, 0
+    nx, damping, slow, again = shooting.system.nx, FIRST_DAMPING, 0, 0
     # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
     count = np.log1p if noise is not None else np.asarray
-    at = problem.follow(theta, windows.x0, problem.rows)
-    problem.settle(theta, at, problem.rows, SETTLING)
+    fits = explained if noise is None else np.isfinite
+    at, believed = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
     for _ in range(rounds):
-        used = explained(at.each) if noise is None else np.isfinite(at.each)
+        used = fits(at.each) & believed
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
             raise UnexplainedError(
@@ -391,13 +442,14 @@ def shoot(
                 f"{dict(zip(shooting.names, theta.round(6).tolist()))}; give other first guesses, or limits"
             )
         H, g = problem.normal(theta, at, problem.rows, parameters=True)
-        better, cost = False, at.each[used].mean()
+        cost = at.each[used].mean()
         if noise is not None:
             share = 1.0 / (1.0 + at.each)
             H, g, cost = H * share[:, None, None], g * share[:, None], 1.0
-        if cost < EXACT or _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision:
+        if cost < EXACT:
             break
-        while damping < MOST_DAMPING and not better:
+        better, done = False, _left(*_reduced(H, g, used=used, nx=nx)[:2], cost) < precision
+        while not done and not better and damping < MOST_DAMPING:
             S, s, along = _reduced(H, g, used=used, nx=nx, damping=damping)
             step = np.linalg.lstsq(S + damping * np.diag(S.diagonal()), s, rcond=1e-12)[0]
             new = np.clip(theta + step * shooting.unit, shooting.low, shooting.high)
@@ -410,14 +462,18 @@ def shoot(
             fall = count(at.each[used]).sum() - count(worst).sum()
             better = fall > 0
             damping = max(damping / 10.0, 1e-12) if better else damping * 10.0
-        if not better:
-            break
-        theta, at = new, tried
-        gained = fall * len(windows.y) / cost
-        slow = slow + 1 if gained < SLOW else 0
-        if gained < precision**2 or slow == PATIENCE:
-            break  # rounding, or chaos, leaves no more; the fit says how far off it is
-    return _fit(problem, theta, at)
+        if better:
+            theta, at = new, tried
+            gained = fall * len(windows.y) / cost
+            slow = slow + 1 if gained < SLOW else 0
+            done = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
+        if done or not better:
+            found = problem.look_again(theta, at)
+            before, believed = believed, problem.believed(theta, at, fits(at.each))
+            if again == AGAIN or not (found or (before & ~believed).any()):
+                break  # the fit says how far off it is
+            again, damping, slow = again + 1, FIRST_DAMPING, 0
+    return _fit(problem, theta, at, explained(at.each) & believed)
 
 
 def _reduced(
@@ -433,6 +489,13 @@ def _reduced(
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
 
 
+def _whitened(information: np.ndarray, *, least: float = 0.0) -> np.ndarray:
+    """Directions (p, k) that information tells, as long as what it leaves unknown; more than ``least`` of each."""
+    values, vectors = np.linalg.eigh(information)
+    told = values > max(NOTHING * values[-1], least)
+    return np.asarray(vectors[:, told] / np.sqrt(values[told]))
+
+
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
     """Length of the step that normal equations ask for, in standard errors that residuals of such a cost leave."""
     step = np.linalg.lstsq(S, s, rcond=1e-12)[0]
@@ -446,15 +509,15 @@ def _damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
     return H + more[:, :, None] * np.eye(H.shape[-1])
 
 
-def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
-    shooting, nx, used = problem.shooting, at.x0.shape[1], explained(at.each)
+def _fit(problem: _Problem, theta: np.ndarray, at: _Motions, used: np.ndarray) -> Fit:
+    shooting, nx = problem.shooting, at.x0.shape[1]
     J = problem.derivatives(theta, at, np.flatnonzero(used))
     there = problem.there[:, used] & (J != 0).any(-1)
     count = there.sum((0, 1))
     free = 1.0 - min(nx * used.sum() / max(count.sum(), 1), 0.9)  # degrees of freedom that starts leave
     squares = np.where(there, at.r[:, used] ** 2, 0.0).sum((0, 1)) / np.maximum(count, 1) / free
     noise = np.sqrt(np.maximum(squares, ROUNDING**2 / problem.weight))
-    information = _beyond_starts(J, 1.0 / noise**2, nx)[0]
+    information = _beyond_starts(J, 1.0 / noise**2, nx)[0].sum(0)
     curvature, beyond, by_parameters = _beyond_starts(J, problem.weight, nx)
     gradients = np.einsum("knyp,kny->np", beyond, at.r[:, used] * problem.weight)
     few = len(gradients) / max(len(gradients) - len(theta), 1)  # windows, whose gradients add up to zero
@@ -465,12 +528,12 @@ def _fit(problem: _Problem, theta: np.ndarray, at: _Motions) -> Fit:
         noise=noise,
         information=information,
         unit=shooting.unit,
-        curvature=curvature,
+        curvature=curvature.sum(0),
         white=np.einsum("knya,knyb,y->ab", beyond, beyond, (problem.weight * noise) ** 2, optimize=True),
         scattered=few * gradients.T @ gradients,
         used=used,
         cost=float(np.mean(at.each[used])),
-        left=_left(curvature, gradients.sum(0), np.mean(at.each[used])),
+        left=_left(curvature.sum(0), gradients.sum(0), np.mean(at.each[used])),
         starts_by_parameters=by_parameters,
     )
 
@@ -489,8 +552,8 @@ def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarr
 
     Returns
     -------
-    curvature : ndarray, shape (p, p)
-        Of half the sum of squares by the parameters, with the best starts for each.
+    curvature : ndarray, shape (n, p, p)
+        Of half the sum of squares of each window by the parameters, with the best start for each.
     beyond : ndarray, shape (steps + 1, n, ny, p)
         Derivatives of the outputs by the parameters, likewise.
     by_parameters : ndarray, shape (n, nx, p)
@@ -498,6 +561,6 @@ def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarr
     """
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
-    curvature = (H[:, nx:, nx:] + H[:, nx:, :nx] @ by_parameters).sum(0)
+    curvature = H[:, nx:, nx:] + H[:, nx:, :nx] @ by_parameters
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)
     return curvature, beyond, by_parameters

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.identification import windows as fitting
@@ -51,6 +52,24 @@ class Swing(System):
 
     def h(self, x):
         return (x[0],)
+
+
+@dataclass(frozen=True)
+class Ramp(System):
+    """A ramp, on which some motions have a wave that turns a thousand times as fast as anyone could know from ramps."""
+
+    slope: float = 1.0
+
+    name: ClassVar[str] = "ramp"
+    X: ClassVar = ((-0.1, 0.1), (-1.0, 1.0), (-1.0, 1.0))
+    bounds: ClassVar = ((-5.0, 5.0), (-50.0, 50.0), (-50.0, 50.0))
+    dt: ClassVar = 0.02
+
+    def f(self, x):
+        return x[0] * 0 + 1.0, x[0] * 0, x[0] * 0
+
+    def h(self, x):
+        return (x[1] + self.slope * x[0] ** 2 + x[2] ** 3 * np.sin(1e5 * self.slope * x[0]),)
 
 
 def windows(system, n, steps, *, noise, process_noise, seed):
@@ -165,3 +184,47 @@ def test_parameters_go_back_no_further_than_bounds_let_states():
 
 def test_what_outputs_say_nothing_of_stays_as_it_was_given():
     assert nearest(np.array([3.0, 7.0]), np.array([2.5, 2.0]), np.array([[0.0], [1.0]])).tolist() == [3.0, 2.0]
+
+
+def test_derivatives_are_those_of_closed_form():
+    """x = x0 exp(-a t) and y = b x, and their derivatives."""
+    system = Decay(1.3, 0.7)
+    shooting = Shooting(system, system.dt, {"rate_constant": (0.1, 9.0), "gain": (0.1, 9.0)}, np.array([1.3, 0.7]))
+    x0, u, t = np.array([[0.5], [1.2]]), np.zeros((100, 2, 0)), np.arange(101)[:, None] * system.dt
+    theta = np.array([1.3, 0.7])
+    y = shooting.outputs(np.tile(theta, (2, 1)), x0, u)
+    J = shooting.derivatives(theta, x0, u, y=y)[:, :, 0]
+    decayed = np.exp(-1.3 * t)
+    by_start, by_rate, by_gain = 0.7 * decayed + 0 * x0.T, -0.7 * t * x0.T * decayed, x0.T * decayed
+    np.testing.assert_allclose(J, np.stack([0.5 * by_start, 1.3 * by_rate, 0.7 * by_gain], -1), rtol=1e-5, atol=1e-6)
+
+
+def test_starts_far_from_right_are_found_by_way_of_the_beginnings():
+    """Squares of two seconds of a chaotic motion have minima that trap a start two units away."""
+    plant, rng = get_system("lorenz"), np.random.default_rng(0)
+    x0 = simulate(plant, plant.draw_starts(rng, 20), 500, plant.dt)[-1]
+    y = plant.output(simulate(plant, x0, 200, plant.dt))
+    measured = Windows(
+        y + 0.1 * rng.standard_normal(y.shape), np.zeros((200, 20, 0)), x0 + 2 * rng.standard_normal(x0.shape)
+    )
+    shooting = Shooting(plant, plant.dt, {"rho": (20.0, 40.0)}, np.array([28.0]))
+    fit = shoot(shooting, np.array([27.9]), measured)
+    assert fit.used.all()
+    assert fit.noise[0] == pytest.approx(0.1, rel=0.05)
+    assert fit.left < 0.2
+    assert abs(fit.parameters["rho"] - 28) < 4 * fit.standard_errors[0]
+
+
+@pytest.mark.parametrize("waves", [1, 3])
+def test_windows_that_claim_more_than_they_can_tell_count_nothing(waves):
+    """A wave tells the slope to a millionth if it is known to a millionth, and else nothing."""
+    system, rng = Ramp(), np.random.default_rng(0)
+    x0 = np.stack([np.full(40, 0.1), rng.uniform(-1, 1, 40), np.where(np.arange(40) < waves, 0.8, 0.0)], 1)
+    y = system.output(simulate(system, x0, 100, system.dt))
+    measured = Windows(y + 0.01 * rng.standard_normal(y.shape), np.zeros((100, 40, 0)), x0)
+    shooting = Shooting(system, system.dt, {"slope": (0.1, 9.0)}, np.ones(1))
+    fit = shoot(shooting, np.ones(1), measured)
+    assert not fit.used[:waves].any()
+    assert fit.used[waves:].all()
+    assert 1e-4 < fit.standard_errors[0] < 1e-2
+    assert abs(fit.parameters["slope"] - 1) < 4 * fit.standard_errors[0]
