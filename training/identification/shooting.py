@@ -22,8 +22,9 @@ EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
 FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
-DOUBTED = 0.3  # standard deviations, that a change by what ordinary windows leave unknown may be off from a linear one
-CLAIM = 10.0  # times the information of ordinary windows, from which on a window's is looked at
+CLAIM = 10.0  # times the median information, from which on a window is not an ordinary one
+# Rise of its squares, over the noise's, that it claims where parameters are as far off as ordinary ones leave unknown:
+CLAIMED, MOST_CLAIMED, SHOWN = 4.0, 100.0, 0.3  # from where on it has to show, up to where, and which part
 BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
 AGAIN = 3  # times at most that this happens
 COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
@@ -285,48 +286,59 @@ class _Problem:
             damping[rows] *= np.where(better, 0.1, 10.0)
             moved, rows = rows[going], rows[going | ~better]
 
-    def look_again(self, theta: np.ndarray, at: _Motions) -> bool:
-        """Find starts that fit better by way of the windows' beginnings, longer and longer; say whether there are any.
+    def look_again(self, theta: np.ndarray, at: _Motions, rows: np.ndarray) -> bool:
+        """Find starts of some windows that fit better by way of their beginnings; say whether there are any.
 
         Squares of long chaotic windows have many minima, those of their beginnings few.
         """
-        x0, deviations = at.x0, self.weight**-0.5
+        if not len(rows):
+            return False
+        found = self.part(rows, at.x0[rows]).found_from_beginnings(theta)
+        better = found.each < (1.0 - CONVERGED) * at.each[rows]
+        at.take(found, rows[better], np.flatnonzero(better))
+        return bool(better.any())
+
+    def part(self, rows: np.ndarray, x0: np.ndarray) -> "_Problem":
+        """The same for some of the windows, from other starts."""
+        windows = Windows(self.windows.y[:, rows], self.windows.u[:, rows], x0)
+        return _Problem(self.shooting, windows, self.weight**-0.5)
+
+    def found_from_beginnings(self, theta: np.ndarray) -> _Motions:
+        """Motions that fit the windows' beginnings, which get longer, and then the windows."""
+        x0 = self.windows.x0
         for part in BEGINNINGS:
             length = max(round(part * len(self.windows.u)), 1)
             beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
-            x0 = _Problem(self.shooting, beginnings, deviations).settled(theta).x0
-        found = self.follow(theta, x0, self.rows)
-        self.settle(theta, found, self.rows, SETTLING)
-        better = np.flatnonzero(found.each < (1.0 - CONVERGED) * at.each)
-        at.take(found, better, better)
-        return bool(len(better))
+            x0 = _Problem(self.shooting, beginnings, self.weight**-0.5).settled(theta).x0
+        return self.part(self.rows, x0).settled(theta)
 
-    def believed(self, theta: np.ndarray, at: _Motions, used: np.ndarray) -> np.ndarray:
+    def believed(self, theta: np.ndarray, at: _Motions, used: np.ndarray, cost: float) -> np.ndarray:
         """Which windows (n,) tell of the parameters what they claim, if they are used.
 
-        Chaos lets some motions follow the parameters a thousand times as much as others do, but only along changes far
-        smaller than what the others leave unknown. Such windows have minima everywhere, and would outweigh all others.
-        Where nothing but such windows tells a parameter they are believed.
+        Chaos lets some motions follow the parameters a thousand times as much as others do, as long as their starts
+        stay near: from starts a little further on they go with other parameters as well. Such a window claims much and
+        tells nothing. So what claims more than all ordinary windows together has to show it, where the parameters are
+        as far off as those leave unknown.
         """
         rows, believed = np.flatnonzero(used), np.ones(len(used), dtype=bool)
         if len(rows) < CLUSTERS:
             return believed
-        weight = self.weight / at.each[used].mean()
-        each, beyond, by_parameters = _beyond_starts(self.derivatives(theta, at, rows), weight, at.x0.shape[1])
+        J = self.derivatives(theta, at, rows)
+        each, _, by_parameters = _beyond_starts(J, self.weight / max(cost, EXACT), at.x0.shape[1])
         sizes = np.einsum("naa->na", each)
         ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
-        scaled = _whitened(each[ordinary].sum(0) / max(ordinary.sum(), 1))
-        ordinary &= np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0) <= CLAIM
-        unknown, rare = _whitened(each[ordinary].sum(0), least=1.0), np.flatnonzero(~ordinary)
-        if unknown.shape[1] < _whitened(each.sum(0), least=1.0).shape[1]:
-            return believed
-        for change in unknown.T:
-            x0 = at.x0[rows[rare]] + self.shooting.half * (by_parameters[rare] @ change)
-            changed = np.tile(theta + change * self.shooting.unit, (len(rare), 1))
-            y = self.shooting.outputs(changed, x0, self.windows.u[:, rows[rare]]) if len(rare) else at.y[:, :0]
-            off = y - at.y[:, rows[rare]] - beyond[:, rare] @ change
-            squares = (np.where(self.there[:, rows[rare]], off, 0.0) ** 2 * weight).sum((0, 2))
-            believed[rows[rare]] &= squares < DOUBTED**2
+        for change in _unknown(each[ordinary].sum(0)).T:
+            for sign in (1.0, -1.0):
+                other = np.clip(theta + sign * change * self.shooting.unit, self.shooting.low, self.shooting.high)
+                moved = (other - theta) / self.shooting.unit
+                claimed = np.einsum("a,nab,b->n", moved, each, moved)
+                suspects = np.flatnonzero(~ordinary & ~(claimed < CLAIMED))
+                if not len(suspects):
+                    continue
+                x0 = at.x0[rows[suspects]] + self.shooting.half * (by_parameters[suspects] @ moved)
+                found = self.part(rows[suspects], x0).found_from_beginnings(other).each - at.each[rows[suspects]]
+                shown = found * self.count[rows[suspects]] / max(cost, EXACT)
+                believed[rows[suspects]] &= shown > SHOWN * np.fmin(claimed[suspects], MOST_CLAIMED)
         return believed
 
     def settled(self, theta: np.ndarray) -> _Motions:
@@ -468,9 +480,11 @@ def shoot(
             slow = slow + 1 if gained < SLOW else 0
             done = gained < precision**2 or slow == PATIENCE  # rounding, or chaos, leaves no more
         if done or not better:
-            found = problem.look_again(theta, at)
-            before, believed = believed, problem.believed(theta, at, fits(at.each))
-            if again == AGAIN or not (found or (before & ~believed).any()):
+            if again == AGAIN:
+                break
+            found = problem.look_again(theta, at, np.flatnonzero(~explained(at.each)))
+            before, believed = believed, believed & problem.believed(theta, at, fits(at.each) & believed, cost)
+            if not found and (before == believed).all():
                 break  # the fit says how far off it is
             again, damping, slow = again + 1, FIRST_DAMPING, 0
     return _fit(problem, theta, at, explained(at.each) & believed)
@@ -489,11 +503,11 @@ def _reduced(
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
 
 
-def _whitened(information: np.ndarray, *, least: float = 0.0) -> np.ndarray:
-    """Directions (p, k) that information tells, as long as what it leaves unknown; more than ``least`` of each."""
+def _unknown(information: np.ndarray) -> np.ndarray:
+    """Changes (p, k) of parameters that information leaves unknown: a standard error, or the parameter's unit."""
     values, vectors = np.linalg.eigh(information)
-    told = values > max(NOTHING * values[-1], least)
-    return np.asarray(vectors[:, told] / np.sqrt(values[told]))
+    told = values > NOTHING * max(values[-1], 0.0)
+    return np.asarray(vectors[:, told] / np.sqrt(np.maximum(values[told], 1.0)))
 
 
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:

@@ -12,7 +12,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.identification import windows as fitting
 from training.identification.identify import _brought_back, nearest
-from training.identification.shooting import Shooting, UnexplainedError, Windows, shoot
+from training.identification.shooting import Shooting, UnexplainedError, Windows, _Problem, shoot
 from training.identification.windows import fit_windows
 from training.records import Record
 
@@ -52,24 +52,6 @@ class Swing(System):
 
     def h(self, x):
         return (x[0],)
-
-
-@dataclass(frozen=True)
-class Ramp(System):
-    """A ramp, on which some motions have a wave that turns a thousand times as fast as anyone could know from ramps."""
-
-    slope: float = 1.0
-
-    name: ClassVar[str] = "ramp"
-    X: ClassVar = ((-0.1, 0.1), (-1.0, 1.0), (-1.0, 1.0))
-    bounds: ClassVar = ((-5.0, 5.0), (-50.0, 50.0), (-50.0, 50.0))
-    dt: ClassVar = 0.02
-
-    def f(self, x):
-        return x[0] * 0 + 1.0, x[0] * 0, x[0] * 0
-
-    def h(self, x):
-        return (x[1] + self.slope * x[0] ** 2 + x[2] ** 3 * np.sin(1e5 * self.slope * x[0]),)
 
 
 def windows(system, n, steps, *, noise, process_noise, seed):
@@ -215,16 +197,38 @@ def test_starts_far_from_right_are_found_by_way_of_the_beginnings():
     assert abs(fit.parameters["rho"] - 28) < 4 * fit.standard_errors[0]
 
 
-@pytest.mark.parametrize("waves", [1, 3])
-def test_windows_that_claim_more_than_they_can_tell_count_nothing(waves):
-    """A wave tells the slope to a millionth if it is known to a millionth, and else nothing."""
-    system, rng = Ramp(), np.random.default_rng(0)
-    x0 = np.stack([np.full(40, 0.1), rng.uniform(-1, 1, 40), np.where(np.arange(40) < waves, 0.8, 0.0)], 1)
+def swings(n, moving, seed=0):
+    """Windows of a mass on a spring, of which only some move."""
+    system, rng = Swing(), np.random.default_rng(seed)
+    phase = rng.uniform(0, 2 * np.pi, n)
+    x0 = np.where(np.arange(n) < moving, 1.0, 0.0)[:, None] * np.stack([np.cos(phase), 2 * np.sin(phase)], 1)
     y = system.output(simulate(system, x0, 100, system.dt))
-    measured = Windows(y + 0.01 * rng.standard_normal(y.shape), np.zeros((100, 40, 0)), x0)
-    shooting = Shooting(system, system.dt, {"slope": (0.1, 9.0)}, np.ones(1))
-    fit = shoot(shooting, np.ones(1), measured)
-    assert not fit.used[:waves].any()
-    assert fit.used[waves:].all()
-    assert 1e-4 < fit.standard_errors[0] < 1e-2
-    assert abs(fit.parameters["slope"] - 1) < 4 * fit.standard_errors[0]
+    measured = Windows(y + 0.01 * rng.standard_normal(y.shape), np.zeros((100, n, 0)), x0)
+    return Shooting(system, system.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0])), measured
+
+
+@pytest.mark.parametrize("moving", [5, 12])
+def test_few_windows_may_tell_all_there_is(moving):
+    """Windows at rest tell no stiffness; those that move are believed, however much more they claim."""
+    shooting, measured = swings(30, moving)
+    fit = shoot(shooting, np.array([4.2]), measured)
+    assert fit.used[:moving].all()
+    assert fit.standard_errors[0] < 0.01
+    assert abs(fit.parameters["stiffness"] - 4) < 4 * fit.standard_errors[0]
+
+
+def test_a_window_that_claims_what_it_does_not_show_is_not_believed(monkeypatch):
+    """Its derivatives by the parameter are a hundred times too large."""
+    shooting, measured = swings(30, 30)
+    derivatives = _Problem.derivatives
+
+    def exaggerated(self, theta, at, rows, *, parameters=True):
+        J = derivatives(self, theta, at, rows, parameters=parameters).copy()
+        J[:, rows == 7, :, 2:] *= 100
+        return J
+
+    monkeypatch.setattr(_Problem, "derivatives", exaggerated)
+    problem, theta = _Problem(shooting, measured), np.array([4.0])
+    at = problem.settled(theta)
+    believed = problem.believed(theta, at, np.ones(30, dtype=bool), at.each.mean())
+    assert np.flatnonzero(~believed).tolist() == [7]
