@@ -41,7 +41,8 @@ from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.storage import write
 from training.figures import ALARM, ESTIMATE, RIVAL, TARGET, TRUTH, drawing
-from training.identification.shooting import Shooting, shoot
+from training.identification.motions import Shooting
+from training.identification.shooting import shoot
 from training.identification.windows import windows
 from training.kalman import ExtendedKalmanFilter
 from training.markdown import table

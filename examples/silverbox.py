@@ -20,7 +20,7 @@ import kkl_gym
 from kkl_gym.simulate import advance
 from training.figures import ALARM, RIVAL, drawing
 from training.identification import estimate_parameters
-from training.identification.shooting import Shooting, settled
+from training.identification.motions import Shooting, settled
 from training.identification.windows import windows
 from training.progress import LOG, progress_bars
 from training.records import Record

@@ -17,7 +17,8 @@ from observers import Artifact, KKLObserver, LinearFilter
 from observers.checks import is_finite, shown
 from training.identification.consistency import HORIZON, ConsistencyProblem, Filtered, filtered, noise_level, run_filter
 from training.identification.identifiability import combinations, hidden_directions, sign_symmetries, written
-from training.identification.shooting import CLUSTERS, Fit, Shooting, UnexplainedError, shoot
+from training.identification.motions import Shooting
+from training.identification.shooting import CLUSTERS, Fit, UnexplainedError, shoot
 from training.identification.windows import LEAST_USED, MORE_COST, Guess, Prediction, fit_windows, predict
 from training.jobs import describe
 from training.maps.optimise import Log, Stage, optimise

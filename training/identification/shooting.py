@@ -1,58 +1,33 @@
 """Parameters of a system, and starts, that explain measured outputs: multiple shooting by Gauss-Newton."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kkl_gym.simulate import simulate
-from kkl_gym.system import System
 from training.identification.identifiability import NOTHING, PART, told_directions
-from training.trajectories.parameters import with_parameters
+from training.identification.motions import FIRST_DAMPING, Motions, Problem, Shooting, Windows, damped, settled
 
-STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
-SETTLING, RESETTLING = 12, 3  # Levenberg-Marquardt steps of starts before parameters move, and after each step
+RESETTLING = 3  # steps of starts after each of the parameters
 NONLINEAR = 0.3  # of the noise, that a change by a standard error may be off from a linear one
 WORSE = 1.0  # times the mean square of before, from which on a window's start is looked for again
 ROUNDS = 40  # Gauss-Newton steps at one length of windows
-CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
 SLOW, PATIENCE = 0.1, 3  # fall of the squares, over the noise's, that is no headway, and for how many steps in a row
 SMALL_STEP = 0.05  # of the standard errors, below which the parameters are done with
 EXACT = 1e-16  # mean square of residuals, over the outputs' variances, of which less is no better
 ROUNDING = 1e-14  # of an output's standard deviation: the least noise
-FIRST_DAMPING, MOST_DAMPING = 1e-3, 1e9
+MOST_DAMPING = 1e9
 CLUSTERS = 20  # windows, of which the scatter says something
 CLAIM = 10.0  # times the median information, from which on a window is not an ordinary one
 # Rise of its squares, over the noise's, that it claims where parameters are as far off as ordinary ones leave unknown:
 CLAIMED, MOST_CLAIMED, SHOWN = 4.0, 100.0, 0.3  # from where on it has to show, up to where, and which part
-BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
 AGAIN = 3  # times at most that this happens
 COLOURED = 1.5  # standard errors as windows scatter, over those for white noise: more than chance in 20 windows
 OUTLIER = 9.0  # median deviations from the median that a window's mean square may have
-MOST_ROWS = 60_000  # motions simulated at once
 
 
 class UnexplainedError(ValueError):
     """No window of the records can be explained from the first guesses."""
-
-
-@dataclass(frozen=True)
-class Windows:
-    """Equally long stretches of records, each with a start of its own.
-
-    Parameters
-    ----------
-    y : ndarray, shape (steps + 1, n, ny)
-        Measured outputs; NaN where one is missing.
-    u : ndarray, shape (steps, n, nu)
-        Inputs that acted.
-    x0 : ndarray, shape (n, nx)
-        Estimates of the state at their starts.
-    """
-
-    y: np.ndarray
-    u: np.ndarray
-    x0: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -156,203 +131,6 @@ class Fit:
         return bool((self.errors(told, told) > COLOURED * self._errors(told, told, self.white)).any())
 
 
-class Shooting:
-    """The least squares of one set of windows.
-
-    Parameters
-    ----------
-    system : System
-        The model, whose other parameters are right.
-    dt : float
-        Sampling interval in seconds.
-    limits : mapping of str to (float, float)
-        Lowest and highest value of each unknown parameter.
-    unit : ndarray, shape (p,)
-        Size of a change of each parameter.
-    """
-
-    def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
-        self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
-        self.low, self.high = np.array(list(limits.values()), dtype=float).T
-        self.half = np.array([(high - low) / 2 for low, high in system.X])
-
-    def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
-        ranges = {
-            name: (value - unit, value + unit)
-            for name, value, unit in zip(self.names, theta.mean(0), self.unit, strict=True)
-        }
-        both = with_parameters(self.system.replace(dict(zip(self.names, theta.mean(0), strict=True))), ranges)
-        starts = np.concatenate([x0, theta], 1)
-        parts = []
-        for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
-            x = simulate(both, starts[rows], len(u), self.dt, u=u[:, rows] if u.shape[-1] else None)
-            parts.append(both.output(x))
-        return np.concatenate(parts, 1)
-
-    def derivatives(
-        self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
-    ) -> np.ndarray:
-        """Derivatives (steps + 1, n, ny, nx + p) by starts, over X's half-widths, and parameters, over their units."""
-        n, nx = x0.shape
-        size = np.concatenate([self.half, self.unit]) * STEP
-        moved = len(size) if parameters else nx
-        at = np.concatenate([x0, np.tile(theta, (n, 1))], 1)
-        flat = (at + np.diag(size)[:moved, None]).reshape(-1, len(size))
-        beside = self.outputs(flat[:, nx:], flat[:, :nx], np.tile(u, (1, moved, 1)))
-        return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
-
-
-@dataclass
-class _Motions:
-    """Starts of windows with what follows from them.
-
-    Parameters
-    ----------
-    x0 : ndarray, shape (n, nx)
-        The starts.
-    y, r : ndarray, shape (steps + 1, n, ny)
-        Predicted outputs, and residuals, which are zero where nothing was measured.
-    each : ndarray, shape (n,)
-        Mean squares of each window's residuals, over the outputs' variances; inf where it leaves the bounds.
-    """
-
-    x0: np.ndarray
-    y: np.ndarray
-    r: np.ndarray
-    each: np.ndarray
-
-    def take(self, others: "_Motions", rows: np.ndarray, of: np.ndarray) -> None:
-        """Replace some rows by rows of others."""
-        self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
-        self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
-
-
-class _Problem:
-    """The least squares of one set of windows."""
-
-    def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
-        self.shooting, self.windows = shooting, windows
-        spread = np.nanvar(windows.y.reshape(-1, windows.y.shape[-1]), axis=0) if noise is None else noise**2
-        self.weight = 1.0 / np.where(spread > 0, spread, 1.0)
-        low, high = np.array(shooting.system.bounds, dtype=float).T
-        self.low, self.high = low + 1e-6 * (high - low), high - 1e-6 * (high - low)
-        self.there = np.isfinite(windows.y)
-        self.count = np.maximum(self.there.sum((0, 2)), 1)
-        self.rows = np.arange(len(windows.x0))
-
-    def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> _Motions:
-        """Motions of some windows from starts, which are put within the bounds."""
-        x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
-        y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
-        r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
-        lost = (~np.isfinite(y) & there).any((0, 2))
-        return _Motions(x0, y, r, np.where(lost, np.inf, (r**2 * self.weight).sum((0, 2)) / self.count[rows]))
-
-    def normal(
-        self, theta: np.ndarray, at: _Motions, rows: np.ndarray, *, parameters: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """J'J (m, d, d) and J'r (m, d) of some windows, by starts and, if wanted, parameters."""
-        J = self.derivatives(theta, at, rows, parameters=parameters)
-        Jw = J * self.weight[:, None]
-        H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
-        return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
-
-    def derivatives(self, theta: np.ndarray, at: _Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
-        """J (steps + 1, m, ny, d) of some windows, zero where nothing was measured."""
-        u = self.windows.u[:, rows]
-        J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
-        there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
-        return np.where(there, J, 0.0)
-
-    def settle(self, theta: np.ndarray, at: _Motions, rows: np.ndarray, rounds: int) -> None:
-        """Move starts of some windows to where they fit best, each by itself (Levenberg-Marquardt)."""
-        nx, damping = at.x0.shape[1], np.full(len(at.x0), FIRST_DAMPING)
-        H, g = np.zeros((len(at.x0), nx, nx)), np.zeros((len(at.x0), nx))
-        moved = rows = rows[np.isfinite(at.each[rows])]
-        for _ in range(rounds):
-            if not len(rows):
-                return
-            if len(moved):
-                H[moved], g[moved] = self.normal(theta, at, moved, parameters=False)
-            x0 = (
-                at.x0[rows]
-                + self.shooting.half * np.linalg.solve(_damped(H[rows], damping[rows]), g[rows, :, None])[..., 0]
-            )
-            tried = self.follow(theta, x0, rows)
-            better = tried.each < at.each[rows]
-            going = tried.each < (1.0 - CONVERGED) * at.each[rows]
-            at.take(tried, rows[better], np.flatnonzero(better))
-            damping[rows] *= np.where(better, 0.1, 10.0)
-            moved, rows = rows[going], rows[going | ~better]
-
-    def look_again(self, theta: np.ndarray, at: _Motions, rows: np.ndarray) -> bool:
-        """Find starts of some windows that fit better by way of their beginnings; say whether there are any.
-
-        Squares of long chaotic windows have many minima, those of their beginnings few.
-        """
-        if not len(rows):
-            return False
-        found = self.part(rows, at.x0[rows]).found_from_beginnings(theta)
-        better = found.each < (1.0 - CONVERGED) * at.each[rows]
-        at.take(found, rows[better], np.flatnonzero(better))
-        return bool(better.any())
-
-    def part(self, rows: np.ndarray, x0: np.ndarray) -> "_Problem":
-        """The same for some of the windows, from other starts."""
-        windows = Windows(self.windows.y[:, rows], self.windows.u[:, rows], x0)
-        return _Problem(self.shooting, windows, self.weight**-0.5)
-
-    def found_from_beginnings(self, theta: np.ndarray) -> _Motions:
-        """Motions that fit the windows' beginnings, which get longer, and then the windows."""
-        x0 = self.windows.x0
-        for part in BEGINNINGS:
-            length = max(round(part * len(self.windows.u)), 1)
-            beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
-            x0 = _Problem(self.shooting, beginnings, self.weight**-0.5).settled(theta).x0
-        return self.part(self.rows, x0).settled(theta)
-
-    def believed(self, theta: np.ndarray, at: _Motions, used: np.ndarray, cost: float) -> np.ndarray:
-        """Which windows (n,) tell of the parameters what they claim, if they are used.
-
-        Chaos lets some motions follow the parameters a thousand times as much as others do, as long as their starts
-        stay near: from starts a little further on they go with other parameters as well. Such a window claims much and
-        tells nothing. So what claims more than all ordinary windows together has to show it, where the parameters are
-        as far off as those leave unknown.
-        """
-        rows, believed = np.flatnonzero(used), np.ones(len(used), dtype=bool)
-        if len(rows) < CLUSTERS:
-            return believed
-        J = self.derivatives(theta, at, rows)
-        each, _, by_parameters = _beyond_starts(J, self.weight / max(cost, EXACT), at.x0.shape[1])
-        sizes = np.einsum("naa->na", each)
-        ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
-        for change in _unknown(each[ordinary].sum(0)).T:
-            for sign in (1.0, -1.0):
-                other = np.clip(theta + sign * change * self.shooting.unit, self.shooting.low, self.shooting.high)
-                moved = (other - theta) / self.shooting.unit
-                claimed = np.einsum("a,nab,b->n", moved, each, moved)
-                suspects = np.flatnonzero(~ordinary & ~(claimed < CLAIMED))
-                if not len(suspects):
-                    continue
-                x0 = at.x0[rows[suspects]] + self.shooting.half * (by_parameters[suspects] @ moved)
-                found = self.part(rows[suspects], x0).found_from_beginnings(other).each - at.each[rows[suspects]]
-                shown = found * self.count[rows[suspects]] / max(cost, EXACT)
-                believed[rows[suspects]] &= shown > SHOWN * np.fmin(claimed[suspects], MOST_CLAIMED)
-        return believed
-
-    def settled(self, theta: np.ndarray) -> _Motions:
-        """Motions whose starts fit best with given parameters."""
-        at = self.follow(theta, self.windows.x0, self.rows)
-        self.settle(theta, at, self.rows, SETTLING)
-        return at
-
-
-def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
-    """Starts (n, nx) of windows that fit best with given parameters."""
-    return _Problem(shooting, windows).settled(theta).x0
-
-
 def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     """Which windows are so short that what is still unknown of the parameters changes their outputs linearly.
 
@@ -372,7 +150,7 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     ndarray of bool, shape (n,)
         False where a change by a standard error is off by more than a part of the noise.
     """
-    theta, problem = np.array(list(fit.parameters.values())), _Problem(shooting, windows)
+    theta, problem = np.array(list(fit.parameters.values())), Problem(shooting, windows)
     at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
     J = problem.derivatives(theta, at, problem.rows)
     _, beyond, by_parameters = _beyond_starts(J, problem.weight, at.x0.shape[1])
@@ -391,6 +169,37 @@ def explained(each: np.ndarray) -> np.ndarray:
     median = np.median(each)
     deviation = np.median(np.abs(each[np.isfinite(each)] - median)) if np.isfinite(median) else 0.0
     return np.isfinite(each) & (each <= median + OUTLIER * deviation)
+
+
+def believed(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray, cost: float) -> np.ndarray:
+    """Which windows (n,) tell of the parameters what they claim, if they are used.
+
+    Chaos lets some motions follow the parameters a thousand times as much as others do, as long as their starts
+    stay near: from starts a little further on they go with other parameters as well. Such a window claims much and
+    tells nothing. So what claims more than all ordinary windows together has to show it, where the parameters are
+    as far off as those leave unknown.
+    """
+    shooting = problem.shooting
+    rows, trusted = np.flatnonzero(used), np.ones(len(used), dtype=bool)
+    if len(rows) < CLUSTERS:
+        return trusted
+    J = problem.derivatives(theta, at, rows)
+    each, _, by_parameters = _beyond_starts(J, problem.weight / max(cost, EXACT), at.x0.shape[1])
+    sizes = np.einsum("naa->na", each)
+    ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
+    for change in _unknown(each[ordinary].sum(0)).T:
+        for sign in (1.0, -1.0):
+            other = np.clip(theta + sign * change * shooting.unit, shooting.low, shooting.high)
+            moved = (other - theta) / shooting.unit
+            claimed = np.einsum("a,nab,b->n", moved, each, moved)
+            suspects = np.flatnonzero(~ordinary & ~(claimed < CLAIMED))
+            if not len(suspects):
+                continue
+            x0 = at.x0[rows[suspects]] + shooting.half * (by_parameters[suspects] @ moved)
+            found = problem.part(rows[suspects], x0).found_from_beginnings(other).each - at.each[rows[suspects]]
+            shown = found * problem.count[rows[suspects]] / max(cost, EXACT)
+            trusted[rows[suspects]] &= shown > SHOWN * np.fmin(claimed[suspects], MOST_CLAIMED)
+    return trusted
 
 
 def shoot(
@@ -438,14 +247,14 @@ def shoot(
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
         raise ValueError(f"noise must be {windows.y.shape[-1]} positive numbers, one for each output, got {noise}")
-    problem = _Problem(shooting, windows, deviations)
+    problem = Problem(shooting, windows, deviations)
     nx, damping, slow, again = shooting.system.nx, FIRST_DAMPING, 0, 0
     # What a window's mean square counts: log(1 + it) grows with the share 1 / (1 + it).
     count = np.log1p if noise is not None else np.asarray
     fits = explained if noise is None else np.isfinite
-    at, believed = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
+    at, trusted = problem.settled(theta), np.ones(len(windows.x0), dtype=bool)
     for _ in range(rounds):
-        used = fits(at.each) & believed
+        used = fits(at.each) & trusted
         if not used.any():
             low, high = np.min(windows.x0, axis=0), np.max(windows.x0, axis=0)
             raise UnexplainedError(
@@ -483,11 +292,12 @@ def shoot(
             if again == AGAIN:
                 break
             found = problem.look_again(theta, at, np.flatnonzero(~explained(at.each)))
-            before, believed = believed, believed & problem.believed(theta, at, fits(at.each) & believed, cost)
-            if not found and (before == believed).all():
+            before = trusted
+            trusted = trusted & believed(problem, theta, at, fits(at.each) & trusted, cost)
+            if not found and (before == trusted).all():
                 break  # the fit says how far off it is
             again, damping, slow = again + 1, FIRST_DAMPING, 0
-    return _fit(problem, theta, at, explained(at.each) & believed)
+    return _fit(problem, theta, at, explained(at.each) & trusted)
 
 
 def _reduced(
@@ -497,7 +307,7 @@ def _reduced(
 
     The third is how all starts follow, (n, nx, p + 1): they move by its last column less the others times the change.
     """
-    D, cross = _damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
+    D, cross = damped(H[:, :nx, :nx], damping), H[:, nx:, :nx]
     along = np.linalg.solve(D, np.concatenate([H[:, :nx, nx:], g[:, :nx, None]], -1))
     S = (H[:, nx:, nx:] - cross @ along[..., :-1])[used].sum(0)
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
@@ -516,14 +326,7 @@ def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:
     return float(np.sqrt(max(step @ s, 0.0) / max(cost, 1e-300)))
 
 
-def _damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
-    """Matrices (n, d, d) with their diagonals made larger by a part, so that they can be solved for."""
-    diagonal = np.einsum("naa->na", H)
-    more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
-    return H + more[:, :, None] * np.eye(H.shape[-1])
-
-
-def _fit(problem: _Problem, theta: np.ndarray, at: _Motions, used: np.ndarray) -> Fit:
+def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> Fit:
     shooting, nx = problem.shooting, at.x0.shape[1]
     J = problem.derivatives(theta, at, np.flatnonzero(used))
     there = problem.there[:, used] & (J != 0).any(-1)

@@ -7,17 +7,8 @@ import numpy as np
 
 from training.identification.consistency import noise_level
 from training.identification.identifiability import told_directions
-from training.identification.shooting import (
-    CLUSTERS,
-    ROUNDS,
-    Fit,
-    Shooting,
-    UnexplainedError,
-    Windows,
-    predictable,
-    settled,
-    shoot,
-)
+from training.identification.motions import Shooting, Windows, settled
+from training.identification.shooting import CLUSTERS, ROUNDS, Fit, UnexplainedError, predictable, shoot
 from training.records import Record
 
 FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way

@@ -12,7 +12,8 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from training.identification import windows as fitting
 from training.identification.identify import _brought_back, nearest
-from training.identification.shooting import Shooting, UnexplainedError, Windows, _Problem, shoot
+from training.identification.motions import Problem, Shooting, Windows
+from training.identification.shooting import UnexplainedError, believed, shoot
 from training.identification.windows import fit_windows
 from training.records import Record
 
@@ -220,15 +221,15 @@ def test_few_windows_may_tell_all_there_is(moving):
 def test_a_window_that_claims_what_it_does_not_show_is_not_believed(monkeypatch):
     """Its derivatives by the parameter are a hundred times too large."""
     shooting, measured = swings(30, 30)
-    derivatives = _Problem.derivatives
+    derivatives = Problem.derivatives
 
     def exaggerated(self, theta, at, rows, *, parameters=True):
         J = derivatives(self, theta, at, rows, parameters=parameters).copy()
         J[:, rows == 7, :, 2:] *= 100
         return J
 
-    monkeypatch.setattr(_Problem, "derivatives", exaggerated)
-    problem, theta = _Problem(shooting, measured), np.array([4.0])
+    monkeypatch.setattr(Problem, "derivatives", exaggerated)
+    problem, theta = Problem(shooting, measured), np.array([4.0])
     at = problem.settled(theta)
-    believed = problem.believed(theta, at, np.ones(30, dtype=bool), at.each.mean())
-    assert np.flatnonzero(~believed).tolist() == [7]
+    trusted = believed(problem, theta, at, np.ones(30, dtype=bool), at.each.mean())
+    assert np.flatnonzero(~trusted).tolist() == [7]

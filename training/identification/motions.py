@@ -1,0 +1,211 @@
+"""Motions that explain windows of measured outputs, for given parameters, and how they follow these."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.trajectories.parameters import with_parameters
+
+STEP = 1e-8  # of a state's half-width, or of a parameter's unit, in numerical derivatives
+SETTLING = 12  # Levenberg-Marquardt steps of starts
+CONVERGED = 1e-3  # fall of a window's mean square, relative, below which its start is done with
+FIRST_DAMPING = 1e-3
+BEGINNINGS = (1 / 16, 1 / 8, 1 / 4, 1 / 2)  # of windows, on which their starts are looked for again
+MOST_ROWS = 60_000  # motions simulated at once
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Equally long stretches of records, each with a start of its own.
+
+    Parameters
+    ----------
+    y : ndarray, shape (steps + 1, n, ny)
+        Measured outputs; NaN where one is missing.
+    u : ndarray, shape (steps, n, nu)
+        Inputs that acted.
+    x0 : ndarray, shape (n, nx)
+        Estimates of the state at their starts.
+    """
+
+    y: np.ndarray
+    u: np.ndarray
+    x0: np.ndarray
+
+
+class Shooting:
+    """The least squares of one set of windows.
+
+    Parameters
+    ----------
+    system : System
+        The model, whose other parameters are right.
+    dt : float
+        Sampling interval in seconds.
+    limits : mapping of str to (float, float)
+        Lowest and highest value of each unknown parameter.
+    unit : ndarray, shape (p,)
+        Size of a change of each parameter.
+    """
+
+    def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
+        self.system, self.dt, self.unit, self.names = system, dt, unit, tuple(limits)
+        self.low, self.high = np.array(list(limits.values()), dtype=float).T
+        self.half = np.array([(high - low) / 2 for low, high in system.X])
+
+    def outputs(self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Predicted outputs (steps + 1, n, ny) of motions with parameters (n, p), starts (n, nx) and inputs."""
+        ranges = {
+            name: (value - unit, value + unit)
+            for name, value, unit in zip(self.names, theta.mean(0), self.unit, strict=True)
+        }
+        both = with_parameters(self.system.replace(dict(zip(self.names, theta.mean(0), strict=True))), ranges)
+        starts = np.concatenate([x0, theta], 1)
+        parts = []
+        for rows in np.array_split(np.arange(len(x0)), -(-len(x0) // MOST_ROWS)):
+            x = simulate(both, starts[rows], len(u), self.dt, u=u[:, rows] if u.shape[-1] else None)
+            parts.append(both.output(x))
+        return np.concatenate(parts, 1)
+
+    def derivatives(
+        self, theta: np.ndarray, x0: np.ndarray, u: np.ndarray, *, y: np.ndarray, parameters: bool = True
+    ) -> np.ndarray:
+        """Derivatives (steps + 1, n, ny, nx + p) by starts, over X's half-widths, and parameters, over their units."""
+        n, nx = x0.shape
+        size = np.concatenate([self.half, self.unit]) * STEP
+        moved = len(size) if parameters else nx
+        at = np.concatenate([x0, np.tile(theta, (n, 1))], 1)
+        flat = (at + np.diag(size)[:moved, None]).reshape(-1, len(size))
+        beside = self.outputs(flat[:, nx:], flat[:, :nx], np.tile(u, (1, moved, 1)))
+        return np.moveaxis((beside.reshape(len(y), moved, n, -1) - y[:, None]) / STEP, 1, -1)
+
+
+@dataclass
+class Motions:
+    """Starts of windows with what follows from them.
+
+    Parameters
+    ----------
+    x0 : ndarray, shape (n, nx)
+        The starts.
+    y, r : ndarray, shape (steps + 1, n, ny)
+        Predicted outputs, and residuals, which are zero where nothing was measured.
+    each : ndarray, shape (n,)
+        Mean squares of each window's residuals, over the outputs' variances; inf where it leaves the bounds.
+    """
+
+    x0: np.ndarray
+    y: np.ndarray
+    r: np.ndarray
+    each: np.ndarray
+
+    def take(self, others: "Motions", rows: np.ndarray, of: np.ndarray) -> None:
+        """Replace some rows by rows of others."""
+        self.x0[rows], self.each[rows] = others.x0[of], others.each[of]
+        self.y[:, rows], self.r[:, rows] = others.y[:, of], others.r[:, of]
+
+
+class Problem:
+    """The least squares of one set of windows."""
+
+    def __init__(self, shooting: Shooting, windows: Windows, noise: np.ndarray | None = None) -> None:
+        self.shooting, self.windows = shooting, windows
+        spread = np.nanvar(windows.y.reshape(-1, windows.y.shape[-1]), axis=0) if noise is None else noise**2
+        self.weight = 1.0 / np.where(spread > 0, spread, 1.0)
+        low, high = np.array(shooting.system.bounds, dtype=float).T
+        self.low, self.high = low + 1e-6 * (high - low), high - 1e-6 * (high - low)
+        self.there = np.isfinite(windows.y)
+        self.count = np.maximum(self.there.sum((0, 2)), 1)
+        self.rows = np.arange(len(windows.x0))
+
+    def follow(self, theta: np.ndarray, x0: np.ndarray, rows: np.ndarray) -> Motions:
+        """Motions of some windows from starts, which are put within the bounds."""
+        x0, there = np.clip(x0, self.low, self.high), self.there[:, rows]
+        y = self.shooting.outputs(np.tile(theta, (len(x0), 1)), x0, self.windows.u[:, rows])
+        r = np.where(there & np.isfinite(y), self.windows.y[:, rows] - y, 0.0)
+        lost = (~np.isfinite(y) & there).any((0, 2))
+        return Motions(x0, y, r, np.where(lost, np.inf, (r**2 * self.weight).sum((0, 2)) / self.count[rows]))
+
+    def normal(
+        self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """J'J (m, d, d) and J'r (m, d) of some windows, by starts and, if wanted, parameters."""
+        J = self.derivatives(theta, at, rows, parameters=parameters)
+        Jw = J * self.weight[:, None]
+        H = np.einsum("knya,knyb->nab", Jw, J, optimize=True)
+        return H, np.einsum("knya,kny->na", Jw, at.r[:, rows], optimize=True)
+
+    def derivatives(self, theta: np.ndarray, at: Motions, rows: np.ndarray, *, parameters: bool = True) -> np.ndarray:
+        """J (steps + 1, m, ny, d) of some windows, zero where nothing was measured."""
+        u = self.windows.u[:, rows]
+        J = self.shooting.derivatives(theta, at.x0[rows], u, y=at.y[:, rows], parameters=parameters)
+        there = self.there[:, rows][..., None] & np.isfinite(J).all(-1, keepdims=True)
+        return np.where(there, J, 0.0)
+
+    def settle(self, theta: np.ndarray, at: Motions, rows: np.ndarray, rounds: int) -> None:
+        """Move starts of some windows to where they fit best, each by itself (Levenberg-Marquardt)."""
+        nx, damping = at.x0.shape[1], np.full(len(at.x0), FIRST_DAMPING)
+        H, g = np.zeros((len(at.x0), nx, nx)), np.zeros((len(at.x0), nx))
+        moved = rows = rows[np.isfinite(at.each[rows])]
+        for _ in range(rounds):
+            if not len(rows):
+                return
+            if len(moved):
+                H[moved], g[moved] = self.normal(theta, at, moved, parameters=False)
+            x0 = (
+                at.x0[rows]
+                + self.shooting.half * np.linalg.solve(damped(H[rows], damping[rows]), g[rows, :, None])[..., 0]
+            )
+            tried = self.follow(theta, x0, rows)
+            better = tried.each < at.each[rows]
+            going = tried.each < (1.0 - CONVERGED) * at.each[rows]
+            at.take(tried, rows[better], np.flatnonzero(better))
+            damping[rows] *= np.where(better, 0.1, 10.0)
+            moved, rows = rows[going], rows[going | ~better]
+
+    def look_again(self, theta: np.ndarray, at: Motions, rows: np.ndarray) -> bool:
+        """Find starts of some windows that fit better by way of their beginnings; say whether there are any.
+
+        Squares of long chaotic windows have many minima, those of their beginnings few.
+        """
+        if not len(rows):
+            return False
+        found = self.part(rows, at.x0[rows]).found_from_beginnings(theta)
+        better = found.each < (1.0 - CONVERGED) * at.each[rows]
+        at.take(found, rows[better], np.flatnonzero(better))
+        return bool(better.any())
+
+    def part(self, rows: np.ndarray, x0: np.ndarray) -> "Problem":
+        """The same for some of the windows, from other starts."""
+        windows = Windows(self.windows.y[:, rows], self.windows.u[:, rows], x0)
+        return Problem(self.shooting, windows, self.weight**-0.5)
+
+    def found_from_beginnings(self, theta: np.ndarray) -> Motions:
+        """Motions that fit the windows' beginnings, which get longer, and then the windows."""
+        x0 = self.windows.x0
+        for part in BEGINNINGS:
+            length = max(round(part * len(self.windows.u)), 1)
+            beginnings = Windows(self.windows.y[: length + 1], self.windows.u[:length], x0)
+            x0 = Problem(self.shooting, beginnings, self.weight**-0.5).settled(theta).x0
+        return self.part(self.rows, x0).settled(theta)
+
+    def settled(self, theta: np.ndarray) -> Motions:
+        """Motions whose starts fit best with given parameters."""
+        at = self.follow(theta, self.windows.x0, self.rows)
+        self.settle(theta, at, self.rows, SETTLING)
+        return at
+
+
+def settled(shooting: Shooting, theta: np.ndarray, windows: Windows) -> np.ndarray:
+    """Starts (n, nx) of windows that fit best with given parameters."""
+    return Problem(shooting, windows).settled(theta).x0
+
+
+def damped(H: np.ndarray, damping: "float | np.ndarray") -> np.ndarray:
+    """Matrices (n, d, d) with their diagonals made larger by a part, so that they can be solved for."""
+    diagonal = np.einsum("naa->na", H)
+    more = np.reshape(damping, (-1, 1)) * diagonal + 1e-12 * diagonal.max(1, keepdims=True, initial=0.0) + 1e-30
+    return H + more[:, :, None] * np.eye(H.shape[-1])
