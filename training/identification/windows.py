@@ -20,7 +20,7 @@ GAIN = 0.7  # standard errors at twice the length, over those before, from which
 MORE_COST = 2.0  # mean square of the residuals at twice the length, over that before: the model does not last as long
 
 FIRST_LEFT = 1.0  # standard errors that a first fit may be from its least squares, and still be on the right way
-LEFT = 0.2  # the same of longer windows: where a fit is stuck, curvature promises more than it knows
+LEFT = 0.4  # the same of longer windows: where a fit is stuck, curvature promises more than it knows
 APART = 0.5  # standard errors that it may be from a fit that began elsewhere
 MOST_SAMPLES = 6400  # of a window
 
