@@ -60,6 +60,8 @@ class Fit:
         and what rounding makes of it, may stand in its way.
     starts_by_parameters : ndarray, shape (number used, nx, p)
         How the starts that fit best, over X's half-widths, follow the parameters, over their units.
+    claims : int
+        Windows used that tell more of a parameter than all ordinary ones together, or seem to.
     """
 
     parameters: dict[str, float]
@@ -75,6 +77,7 @@ class Fit:
     cost: float
     left: float
     starts_by_parameters: np.ndarray
+    claims: int
 
     def errors(self, directions: np.ndarray, told: np.ndarray) -> np.ndarray:
         """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
@@ -185,8 +188,7 @@ def believed(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray,
         return trusted
     J = problem.derivatives(theta, at, rows)
     each, _, by_parameters = _beyond_starts(J, problem.weight / max(cost, EXACT), at.x0.shape[1])
-    sizes = np.einsum("naa->na", each)
-    ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
+    ordinary = _ordinary(each)
     for change in _unknown(each[ordinary].sum(0)).T:
         for sign in (1.0, -1.0):
             other = np.clip(theta + sign * change * shooting.unit, shooting.low, shooting.high)
@@ -313,6 +315,25 @@ def _reduced(
     return S, (g[:, nx:] - (cross @ along[..., -1:])[..., 0])[used].sum(0), along
 
 
+def _ordinary(each: np.ndarray) -> np.ndarray:
+    """Which windows (n,) have not much more information (n, p, p) of any change of the parameters than others have."""
+    sizes = np.einsum("naa->na", each)
+    ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
+    values, vectors = np.linalg.eigh(each[ordinary].sum(0))
+    told = values > NOTHING * max(values[-1], 0.0)
+    scaled = vectors[:, told] / np.sqrt(values[told])
+    share = np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0)
+    return np.asarray(ordinary & (share <= CLAIM * told.sum() / max(ordinary.sum(), 1)))
+
+
+def _claims(each: np.ndarray) -> int:
+    """How many windows have more information (n, p, p) than all ordinary ones together."""
+    ordinary = _ordinary(each)
+    unknown = _unknown(each[ordinary].sum(0))
+    claimed = np.einsum("pk,npq,qk->nk", unknown, each, unknown).max(1, initial=0.0)
+    return int((~ordinary & ~(claimed < CLAIMED)).sum())
+
+
 def _unknown(information: np.ndarray) -> np.ndarray:
     """Changes (p, k) of parameters that information leaves unknown: a standard error, or the parameter's unit."""
     values, vectors = np.linalg.eigh(information)
@@ -352,6 +373,7 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
         cost=float(np.mean(at.each[used])),
         left=_left(curvature.sum(0), gradients.sum(0), np.mean(at.each[used])),
         starts_by_parameters=by_parameters,
+        claims=_claims(curvature / max(float(np.mean(at.each[used])), EXACT)),
     )
 
 
@@ -378,6 +400,6 @@ def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarr
     """
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]
-    curvature = H[:, nx:, nx:] + H[:, nx:, :nx] @ by_parameters
     beyond = J[..., nx:] + np.einsum("knyx,nxp->knyp", J[..., :nx], by_parameters)
+    curvature = np.einsum("knya,knyb,y->nab", beyond, beyond, weight, optimize=True)  # never negative
     return curvature, beyond, by_parameters

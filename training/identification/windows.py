@@ -96,11 +96,11 @@ def fit_windows(
         fit = _longer_fit(shooting, theta + aside, records, starts, length)
         if fit.used.mean() < LEAST_USED or fit.cost > MORE_COST * best.cost or (fit.coloured and not best.coloured):
             break
-        if fit.left > LEFT:
+        if fit.left > LEFT or fit.claims > best.claims:
             break
         now = fit.errors(told, told)
         other = _longer_fit(shooting, theta - aside, records, starts, length)
-        if other.left > LEFT or (_apart(fit, other, told) > APART * now).any():
+        if other.left > LEFT or other.claims > best.claims or (_apart(fit, other, told) > APART * now).any():
             break  # so long windows have many minima, and their curvature says nothing of where the others are
         report(described(fit, length))
         gain = now / before
