@@ -133,11 +133,15 @@ def _first_fit(
     first: int,
     longest: int,
 ) -> tuple[Fit, Starts, int]:
-    """A fit on the longest of the first windows that the model explains, their starts, and their length."""
+    """A fit on the longest of the first windows that the model explains, their starts, and their length.
+
+    Where chaos keeps all fits from their least squares, it is the one that is nearest, in its own standard errors.
+    """
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
     lengths = sorted({min(length, longest) for length in FIRST_LENGTHS}, reverse=True)
     problem: Exception = UnexplainedError("no guess of the parameters")
+    under_way = list[tuple[Fit, Starts, int]]()  # explain their windows, but are not at their least squares
     for length in lengths:
         last = length == lengths[-1]
         starts: Starts = {}
@@ -152,8 +156,12 @@ def _first_fit(
                 problem = error
                 continue
             fits.append(fit)
-            if fit.used.mean() >= LEAST_USED and fit.left <= FIRST_LEFT and (fit.noise <= expected).all():
-                return fit, starts, length
+            if fit.used.mean() >= LEAST_USED and (fit.noise <= expected).all():
+                if fit.left <= FIRST_LEFT:
+                    return fit, starts, length
+                under_way.append((fit, starts, length))
+        if last and under_way:
+            return min(under_way, key=lambda each: each[0].left)
         if last and fits:
             return min(fits, key=lambda fit: fit.cost), starts, length
     raise problem

@@ -112,16 +112,32 @@ def test_standard_errors_cover_the_truth_under_process_noise(process_noise, colo
     assert (np.mean(white) < 0.5) == coloured
 
 
-@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 160), (0.1, 40)])
-def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
-    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (20,))
-    rng, steps, n = np.random.default_rng(1), 160, 45
+def recorded_swings(process_noise, n, steps):
+    """Records of the swing, its shooting, and the true state as a guess."""
+    rng = np.random.default_rng(1)
     w = process_noise * rng.standard_normal((steps, n, 2))
     x = simulate(Swing(), Swing().draw_starts(rng, n), steps, Swing.dt, w=w)
     y = x[..., :1] + 0.02 * rng.standard_normal((steps + 1, n, 1))
     records = [Record(str(i), Swing.dt * np.arange(steps + 1), y[:, i]) for i in range(n)]
     shooting = Shooting(Swing(), Swing.dt, {"stiffness": (0.4, 40.0)}, np.array([4.0]))
-    fit = fit_windows(shooting, [np.array([4.1])], records, lambda record, at: x[at, int(record.name)], first=0)
+    return shooting, records, lambda record, at: x[at, int(record.name)]
+
+
+def test_where_no_first_fit_comes_to_rest_the_nearest_one_counts(monkeypatch):
+    """Not that of the shortest windows, which may not have moved from a wrong guess."""
+    left = {80: 1.5, 40: 1.2, 20: 5.0}
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", tuple(left))
+    monkeypatch.setattr(fitting, "shoot", lambda *a, **k: replace(fit := shoot(*a, **k), left=left[len(fit.windows.u)]))
+    shooting, records, guess = recorded_swings(0.0, 10, 80)
+    fit, _, length = fitting._first_fit(shooting, [np.array([4.1])], records, guess, first=0, longest=80)
+    assert (length, len(fit.windows.u), fit.left) == (40, 40, 1.2)
+
+
+@pytest.mark.parametrize(("process_noise", "length"), [(0.0, 160), (0.1, 40)])
+def test_windows_grow_while_residuals_are_white(process_noise, length, monkeypatch):
+    monkeypatch.setattr(fitting, "FIRST_LENGTHS", (20,))
+    shooting, records, guess = recorded_swings(process_noise, 45, 160)
+    fit = fit_windows(shooting, [np.array([4.1])], records, guess, first=0)
     assert len(fit.windows.u) == length
     assert abs(fit.parameters["stiffness"] - 4.0) < 3 * fit.standard_errors[0] < 0.3
 
