@@ -33,7 +33,7 @@ def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
 
 
 def write_report(path: Path, found: Identified) -> None:
-    """Draw the course of the parameters, predictions of records left out, and how white the residuals are.
+    """Draw the course of the parameters, if a network found them first, predictions of records left out, and residuals.
 
     Parameters
     ----------
@@ -45,8 +45,9 @@ def write_report(path: Path, found: Identified) -> None:
     shown = found.predictions[:SHOWN]
     with drawing(path, 12, 3.2 + 2.2 * len(shown)) as figure:
         grid = figure.add_gridspec(1 + len(shown), 2)
-        _draw_course(figure.add_subplot(grid[0, 0]), found)
-        _draw_residuals(figure.add_subplot(grid[0, 1]), found)
+        if found.history:
+            _draw_course(figure.add_subplot(grid[0, 0]), found)
+        _draw_residuals(figure.add_subplot(grid[0, 1:] if found.history else grid[0, :]), found)
         for row, prediction in enumerate(shown, 1):
             ax = figure.add_subplot(grid[row, :])
             record, samples = prediction.record, slice(prediction.first, prediction.first + len(prediction.y))
@@ -63,22 +64,21 @@ def _draw_course(ax: Any, found: Identified) -> None:
     """Parameters while the network was trained, over the values that shooting found."""
     for name in found.standard_errors:
         final = found.system.parameters[name]
-        if found.history and final:
+        if final:
             batches, values = zip(*((batch, values[name] / final) for batch, values in found.history), strict=True)
             ax.plot(batches, values, label=name)
     ax.axhline(1.0, color=TRUTH, lw=0.8, ls=":")
-    ax.set(xlabel="batch of the network", ylabel="parameter over its final value", title=found.system.name)
-    if found.history:
-        ax.legend()
+    ax.set(xlabel="batch of the network", ylabel="parameter over its final value", title="first guesses")
+    ax.legend()
 
 
 def _draw_residuals(ax: Any, found: Identified) -> None:
-    """Autocorrelation of the residuals of each output; white ones stay between the lines."""
+    """Autocorrelation of the residuals of each output; white ones stay in the band."""
     fit = found.fit
     for j, noise in enumerate(fit.noise):
         values = autocorrelation(fit.residuals[:, fit.used, j], LAGS)
         ax.plot(range(1, len(values) + 1), values, ".-", label=f"output {j + 1}, residuals of {noise:.3g}")
     limit = 1.96 / np.sqrt(max(np.isfinite(fit.residuals[:, fit.used, 0]).sum(), 1))
     ax.axhspan(-limit, limit, color=MEASURED, alpha=0.3, lw=0, zorder=0)
-    ax.set(xlabel="lag in samples", ylabel="autocorrelation", title="residuals of the windows")
+    ax.set(xlabel="lag in samples", ylabel="autocorrelation", title=f"{found.system.name}, residuals of the windows")
     ax.legend()
