@@ -26,6 +26,7 @@ from training.progress import LOG, progress_bars
 from training.records import Record
 
 DT = 2**14 / 1e7  # s
+FILE = "SNLS80mV.csv"
 SAMPLES = 131_072
 FREE = 50  # first samples of each test, from which its start may be found, and which do not count
 TRAINING, MULTISINE = (40_650, 105_712), (105_712, 127_400)  # three quarters and one of the multisine records
@@ -89,8 +90,8 @@ class Silverbox(kkl_gym.System):
 
 
 def read(path: Path) -> np.ndarray:
-    """Input and output in V, (131072, 2)."""
-    data = pd.read_csv(path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
+    """Input and output in V, (131072, 2), from the file or the folder that holds it."""
+    data = pd.read_csv(path / FILE if path.is_dir() else path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
     if data.shape != (SAMPLES, 2):
         raise ValueError(f"{path} has {len(data)} samples, but the Silverbox has {SAMPLES}")
     return data
@@ -124,7 +125,7 @@ def main(
     Returns the errors in mV rms on the multisine's test quarter, the arrow, and the arrow without extrapolation.
 
     Args:
-        path: SNLS80mV.csv.
+        path: SNLS80mV.csv, or the folder that holds it.
         steps: batches of the network that finds first guesses.
         out: the run's folder.
         seed: of the network, the only thing that is random.
