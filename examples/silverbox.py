@@ -91,7 +91,8 @@ class Silverbox(kkl_gym.System):
 
 def read(path: Path) -> np.ndarray:
     """Input and output in V, (131072, 2), from the file or the folder that holds it."""
-    data = pd.read_csv(path / FILE if path.is_dir() else path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
+    path = path / FILE if path.is_dir() else path
+    data = pd.read_csv(path, usecols=["V1", "V2"])[["V1", "V2"]].to_numpy(float)
     if data.shape != (SAMPLES, 2):
         raise ValueError(f"{path} has {len(data)} samples, but the Silverbox has {SAMPLES}")
     return data

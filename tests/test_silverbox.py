@@ -36,9 +36,11 @@ def test_three_samples_act_as_a_smooth_input():
 
 
 def test_a_file_of_another_length_is_refused(tmp_path):
-    (tmp_path / "short.csv").write_text("V1,V2,\n0.1,0.2,\n")
-    with pytest.raises(ValueError, match=r"short\.csv has 1 samples, but the Silverbox has 131072"):
-        MODULE["read"](tmp_path / "short.csv")
+    file = tmp_path / "SNLS80mV.csv"
+    file.write_text("V1,V2,\n0.1,0.2,\n")
+    for path in (file, tmp_path):
+        with pytest.raises(ValueError, match=r"SNLS80mV\.csv has 1 samples, but the Silverbox has 131072"):
+            MODULE["read"](path)
 
 
 @pytest.mark.skipif(DATA not in os.environ, reason=f"{DATA} does not say where SNLS80mV.csv lies")

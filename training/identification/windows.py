@@ -8,7 +8,7 @@ import numpy as np
 from training.identification.consistency import noise_level
 from training.identification.identifiability import told_directions
 from training.identification.motions import Shooting, Windows, settled
-from training.identification.shooting import CLUSTERS, ROUNDS, Fit, UnexplainedError, predictable, shoot
+from training.identification.shooting import CLUSTERS, EXACT, ROUNDS, Fit, UnexplainedError, predictable, shoot
 from training.records import Record
 
 FIRST_LENGTHS = (400, 200, 100)  # samples of the first windows: long ones say more, short ones find their way
@@ -143,7 +143,6 @@ def _first_fit(
     problem: Exception = UnexplainedError("no guess of the parameters")
     under_way = list[tuple[Fit, Starts, int]]()  # explain their windows, but are not at their least squares
     for length in lengths:
-        last = length == lengths[-1]
         starts: Starts = {}
         for index, record in enumerate(records):
             at = np.arange(first, len(record.y) - length, length)
@@ -151,7 +150,7 @@ def _first_fit(
         cut, fits = windows(records, starts, length), list[Fit]()
         for theta in guesses:
             try:
-                fit = shoot(shooting, theta, cut, rounds=ROUNDS if last else FIRST_ROUNDS)
+                fit = shoot(shooting, theta, cut, rounds=ROUNDS if length == lengths[-1] else FIRST_ROUNDS)
             except UnexplainedError as error:
                 problem = error
                 continue
@@ -160,10 +159,10 @@ def _first_fit(
                 if fit.left <= FIRST_LEFT:
                     return fit, starts, length
                 under_way.append((fit, starts, length))
-        if last and under_way:
-            return min(under_way, key=lambda each: each[0].left)
-        if last and fits:
-            return min(fits, key=lambda fit: fit.cost), starts, length
+    if under_way:  # where all is explained to rounding, what is left says nothing
+        return min(under_way, key=lambda each: (each[0].cost >= EXACT, each[0].left))
+    if fits:
+        return min(fits, key=lambda fit: fit.cost), starts, length
     raise problem
 
 

@@ -123,14 +123,20 @@ def recorded_swings(process_noise, n, steps):
     return shooting, records, lambda record, at: x[at, int(record.name)]
 
 
-def test_where_no_first_fit_comes_to_rest_the_nearest_one_counts(monkeypatch):
-    """Not that of the shortest windows, which may not have moved from a wrong guess."""
-    left = {80: 1.5, 40: 1.2, 20: 5.0}
+@pytest.mark.parametrize(("exact", "taken"), [(False, 40), (True, 20)])
+def test_where_no_first_fit_comes_to_rest_the_nearest_one_counts(exact, taken, monkeypatch):
+    """Not that of the shortest windows, which may not have moved, unless it alone explains them to rounding."""
+    left, cost = {80: 1.5, 40: 1.2, 20: 5.0}, {80: 1.0, 40: 1.0, 20: 1e-20 if exact else 1.0}
+
+    def stuck(*arguments, **options):
+        fit = shoot(*arguments, **options)
+        return replace(fit, left=left[len(fit.windows.u)], cost=cost[len(fit.windows.u)])
+
     monkeypatch.setattr(fitting, "FIRST_LENGTHS", tuple(left))
-    monkeypatch.setattr(fitting, "shoot", lambda *a, **k: replace(fit := shoot(*a, **k), left=left[len(fit.windows.u)]))
+    monkeypatch.setattr(fitting, "shoot", stuck)
     shooting, records, guess = recorded_swings(0.0, 10, 80)
     fit, _, length = fitting._first_fit(shooting, [np.array([4.1])], records, guess, first=0, longest=80)
-    assert (length, len(fit.windows.u), fit.left) == (40, 40, 1.2)
+    assert (length, len(fit.windows.u), fit.left) == (taken, taken, left[taken])
 
 
 @pytest.mark.parametrize(("process_noise", "length"), [(0.0, 160), (0.1, 40)])
