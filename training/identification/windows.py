@@ -159,11 +159,17 @@ def _first_fit(
                 if fit.left <= FIRST_LEFT:
                     return fit, starts, length
                 under_way.append((fit, starts, length))
-    if under_way:  # where all is explained to rounding, what is left says nothing
-        return min(under_way, key=lambda each: (each[0].cost >= EXACT, each[0].left))
+    if under_way:
+        return min(under_way, key=lambda each: _unsettled(each[0]))
     if fits:
         return min(fits, key=lambda fit: fit.cost), starts, length
     raise problem
+
+
+def _unsettled(fit: Fit) -> tuple[bool, float]:
+    """How far a fit is from being done, to compare; where all is explained to rounding, what is left is rounding."""
+    exact = fit.cost < EXACT
+    return not exact, fit.cost if exact else fit.left
 
 
 def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
