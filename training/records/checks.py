@@ -164,22 +164,26 @@ def check_against_system(records: Sequence[Record], system: System, warn: Warn) 
         What was recorded.
     warn : callable
         Told of outputs and states that are a hundred times smaller than expected, of steps of time that are a hundred
-        times longer or shorter, and of inputs that were not recorded.
+        times shorter, and of inputs that were not recorded.
 
     Raises
     ------
     ValueError
-        If a signal is a hundred times larger than the system's declarations allow.
+        If a signal is a hundred times larger than the system's declarations allow, or a step of time a hundred times
+        as long as its dt.
     """
     if system.nu and not records[0].signals.inputs:
         warn(f"{records[0].name}: no column of inputs, which are taken for zero")
     for record in records:
         ratio = median_step(record) / system.dt
-        if not 1 / OTHER_UNITS < ratio < OTHER_UNITS:
-            warn(
-                f"{record.name}: column {record.signals.time}: steps of {median_step(record):.3g} s are {ratio:.3g} "
-                f"times the dt of {system.name} ({system.dt:g} s); is the time in seconds?"
-            )
+        told = (
+            f"{record.name}: column {record.signals.time}: steps of {median_step(record):.3g} s are {ratio:.3g} "
+            f"times the dt of {system.name} ({system.dt:g} s); is the time in seconds?"
+        )
+        if ratio > OTHER_UNITS:  # nothing is left of the motion between such samples
+            raise ValueError(f"{told} If so, give the system a dt as long")
+        if ratio < 1 / OTHER_UNITS:
+            warn(told)
     low, high = system.box()
     sizes = {"y": np.array(system.output_range), "u": np.array(system.u_max), "x": high - low}
     for record in records:
