@@ -124,6 +124,9 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 --information state x_hat z stacked recurrent \
 		--aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
+	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --aggregate 4 --seeds 10 \
+		--out runs/agents/double-pendulum
+	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
 	$(MAKE) figures
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread

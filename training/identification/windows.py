@@ -135,7 +135,8 @@ def _first_fit(
 ) -> tuple[Fit, Starts, int]:
     """A fit on the longest of the first windows that the model explains, their starts, and their length.
 
-    Where chaos keeps all fits from their least squares, it is the one that is nearest, in its own standard errors.
+    Where chaos keeps all fits from their least squares, it is the one that is nearest, in its own standard errors, or
+    before it the one that explains its windows best to rounding.
     """
     spread = np.nanstd(np.concatenate([record.y for record in records]), 0)
     expected = np.maximum(MORE_NOISE * noise_level(records), SMALL * spread)
