@@ -3,8 +3,10 @@
 The policies are simple ones. An agent of yours does as well: ``kkl-gym record ENV_ID --policy ppo:agent.zip``.
 """
 
+import itertools
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,6 +15,8 @@ import tyro
 
 import training
 from kkl_gym import KKLObservation
+from observers import Artifact
+from training.agents.any_environment.task import MeasurementNoise
 from training.recorded.errors import recorded_errors
 from training.rollouts import make, roll_out
 
@@ -71,12 +75,43 @@ def exploring(policy: Callable, env: gym.Env, seed: int) -> Callable:
     return act
 
 
+def under_noise(env_id: str, artifact: Artifact | None, noise: float, seed: int, episodes: int = 20) -> float:
+    """Let the controller act on estimates, or on the truth without an observer; returns the mean return."""
+    measured, _, policy = CASES[env_id]
+    returns, apart, truth = [], list[np.ndarray](), list[np.ndarray]()
+    env: gym.Env = MeasurementNoise(make(env_id), measured, noise)
+    if artifact is not None:
+        with tempfile.TemporaryDirectory() as folder:
+            artifact.save(path := Path(folder) / "observer.safetensors")
+            env = KKLObservation(env, path, measurement_noise=noise)
+    for episode in range(episodes):
+        _, info = env.reset(seed=seed + 20_000 + episode)
+        total = 0.0
+        for step in itertools.count(1):
+            known = info["clean"] if artifact is None else info["x_hat"]
+            _, reward, terminated, truncated, info = env.step(policy(known))
+            total += float(reward)
+            if artifact is not None and step >= AFTER:
+                apart.append(info["x_hat"] - info["clean"])
+                truth.append(info["clean"])
+            if terminated or truncated:
+                break
+        returns.append(total)
+    shown = "truth:" if artifact is None else "estimates:" if artifact.flow else "estimates of T_inv alone:"
+    print(f"  {shown} {np.mean(returns):.1f}")
+    if apart:
+        errors = np.sqrt(np.mean(np.square(apart), 0)) / np.std(truth, 0)
+        print("    rms error over standard deviation", ", ".join(f"{error:.1%}" for error in errors))
+    return float(np.mean(returns))
+
+
 def main(
     env_id: str = "Pendulum-v1",
     steps: int = 40_000,
     held_out: int = 6_000,
     batches: int = 2_000,
     members: int = 1,
+    noise: float = 0.0,
     seed: int = 0,
 ) -> dict[str, float]:
     """Learn an observer for an environment; returns errors of held-out rollouts.
@@ -87,9 +122,13 @@ def main(
         held_out: steps of other episodes, in which the policy does not explore.
         batches: of the training, for each network.
         members: networks that are trained and averaged.
+        noise: standard deviation of the noise on what is measured. With noise the observer estimates all signals, and
+            tracks. The controller then acts on its estimates, on those of T_inv alone, and on the truth.
         seed: of everything random.
     """
     measured, hidden, policy = CASES[env_id]
+    if noise:
+        hidden = sorted(measured + hidden)
     with tempfile.TemporaryDirectory() as folder:
         artifact = training.learn(
             env_id,
@@ -101,6 +140,8 @@ def main(
             out=folder,
             inverse_steps=batches,
             members=members,
+            tracking=noise > 0,
+            measurement_noise_max=2 * noise or None,
         )
         env = KKLObservation(gym.make(env_id), Path(folder) / f"{env_id}.safetensors")
     obs, _ = env.reset(seed=seed)
@@ -115,6 +156,10 @@ def main(
         shown = ", ".join(f"{name} {error:.2%}" for name, error in errors.relative.items())
         print(f"held-out rollouts, {label}: rms error over standard deviation, after {AFTER} steps: {shown}")
         found[label] = max(errors.relative.values())
+    if noise:
+        print(f"noise {noise:g}: mean return where the controller acts on")
+        for label, observer in (("tracked", artifact), ("T_inv alone", replace(artifact, flow=None)), ("truth", None)):
+            found[label] = under_noise(env_id, observer, noise, seed)
     return found
 
 

@@ -374,10 +374,10 @@ class Artifact:
             If none were learned; the message says how to.
         """
         if self.inverse.spread is None:
-            way = "kkl-gym errorbars NAME_OR_FILE learns them, and writes a map that has them"
+            data = "" if self.signals is None else " --data FILE"
             raise ArtifactError(
-                f"this map for {self.system!r} holds no error bars; "
-                + (way if self.signals is None else "there are none yet for observers from recorded states")
+                f"this map for {self.system!r} holds no error bars; kkl-gym errorbars NAME_OR_FILE{data} learns them, "
+                "and writes a map that has them"
             )
         return self.inverse.spread
 
@@ -395,9 +395,10 @@ class Artifact:
             If none was learned; the message says how to.
         """
         if self.flow is None:
+            data = "" if self.signals is None else " --data FILE"
             raise ArtifactError(
-                f"this map for {self.system!r} holds no flow; kkl-gym tracking NAME_OR_FILE learns one, and writes a "
-                "map that has it"
+                f"this map for {self.system!r} holds no flow; kkl-gym tracking NAME_OR_FILE{data} learns one, and "
+                "writes a map that has it"
             )
         return self.flow
 

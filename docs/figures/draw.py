@@ -36,8 +36,9 @@ from training.commands.portraits import animate
 from training.evaluation.certificates.settled import record_settled
 from training.evaluation.errors import estimates as estimates_of
 from training.evaluation.errors import kalman_estimates, unseen_trajectories
-from training.evaluation.metrics import chi_square, percentage_error
+from training.evaluation.metrics import percentage_error
 from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
+from training.maps.regions import chi_square
 from training.seeds import agent_evaluation_seed
 from training.systems import ControlTask
 

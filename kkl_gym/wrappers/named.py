@@ -95,13 +95,21 @@ class NamedEstimator(KKLEstimator):
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples; see :class:`KKLEstimator`."""
+        self._check_start(x0)
         super().reset(y0, x0)
         self._y = y0.copy()
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows; see :class:`KKLEstimator`."""
+        self._check_start(x0)
         super().restart(y0, rows, x0)
         self._y[rows] = y0
+
+    def _check_start(self, x0: np.ndarray) -> None:
+        known = x0.shape[-1] == self.observer.artifact.nx and np.isfinite(x0).all()
+        if self._known_start and not known:
+            hidden = ", ".join((self.observer.artifact.signals or {})["hidden"])
+            raise ValueError(f"known_start: the environment does not show {hidden} at its reset; leave known_start out")
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
         """Take in samples and the inputs that led to them; see :class:`KKLEstimator`."""
@@ -158,12 +166,12 @@ class Samples:
         self.count = 0
 
     def first(self, observation: Any, info: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs after a reset, and states, which no such observer is told; ``info`` gains what ours says."""
+        """The outputs after a reset, and what is hidden, NaN if that is not shown; ``info`` gains what ours says."""
         self.count = 0
         y, x = self.outputs(observation, info), self.states(observation, info)
         info.pop("x", None)  # whatever else the environment calls so
         info |= x | {"sample": np.array(0)}
-        return y, self._nothing
+        return y, x.get("x", self._nothing)
 
     def next(self, observation: Any, info: dict[str, Any], action: Any) -> tuple[np.ndarray, np.ndarray]:
         """The outputs after a step, and the inputs that led to them; ``info`` gains what ours says."""

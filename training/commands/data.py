@@ -1,12 +1,13 @@
 """Recorded data as options of a command: the files, and which of their columns are what."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from kkl_gym.system import System
+from observers import Artifact
 from training.progress import ProgressBars
 from training.records import Record, Signals, read_records
 
@@ -58,7 +59,58 @@ class DataOptions:
         ValueError
             As :func:`training.records.read_records`.
         """
+        return self._read(self.signals, progress, system)
+
+    def read_for(self, artifact: Artifact, progress: ProgressBars) -> list[Record]:
+        """Read the files for an observer from recorded states: columns that are not named are its own.
+
+        Parameters
+        ----------
+        artifact : Artifact
+            The observer.
+        progress : ProgressBars
+            Where it is said what is odd.
+
+        Returns
+        -------
+        list of Record
+            One of each file or episode.
+
+        Raises
+        ------
+        ValueError
+            If no file is named, or as :meth:`read`.
+        """
+        signals = artifact.signals or {}
+        if not self.data:
+            raise ValueError(
+                f"the observer {artifact.system!r} was learned from recorded states, and nothing can be simulated: "
+                "name these records (--data)"
+            )
+        given = self.signals
+        own: dict[str, Any] = {
+            role: getattr(given, role) or tuple(signals[role]) for role in ("measured", "inputs", "hidden")
+        }
+        return self._read(replace(given, **own), progress)
+
+    def refuse_for(self, artifact: Artifact) -> None:
+        """See that no data are given for an observer of a system.
+
+        Parameters
+        ----------
+        artifact : Artifact
+            The observer.
+
+        Raises
+        ------
+        ValueError
+            If there are any.
+        """
+        if self != DataOptions():
+            raise ValueError(f"the motions of {artifact.system} are simulated: leave --data and its columns out")
+
+    def _read(self, signals: Signals, progress: ProgressBars, system: System | None = None) -> list[Record]:
         with progress.phase("reading the records"):
             return read_records(
-                self.data, signals=self.signals, system=system, warn=lambda text: progress.say(f"warning: {text}")
+                self.data, signals=signals, system=system, warn=lambda text: progress.say(f"warning: {text}")
             )

@@ -10,7 +10,7 @@ from observers import Artifact, KKLObserver
 from observers.spread import deviations
 from training.evaluation.errors import UnseenTrajectories, kalman_filter, measured
 from training.evaluation.levels import Level
-from training.evaluation.metrics import chi_square, squared_distance
+from training.maps.regions import chi_square, squared_distance
 
 REGIONS = (0.5, 0.9, 0.99)  # parts of the errors that regions should hold
 CHUNK = 200  # trajectories at once: each sample has a matrix

@@ -1,24 +1,20 @@
 """Error bars for an observer that is there already: the covariance of its errors, learned and then calibrated."""
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
 from rich.console import Console
 
 from kkl_gym.system import System
-from observers import Artifact, InverseMap, Spread
+from observers import Artifact, InverseMap
 from observers.decoder import Decoders
 from training.config import Config, settings_of
 from training.evaluation.calibration import sound_trajectories
-from training.evaluation.metrics import squared_distance
-from training.evaluation.regions import LEVELS, Regions, level_of
-from training.maps.optimise import Stage, optimise
+from training.maps.regions import LEVELS, Regions, level_of, squared_distance
 from training.maps.samplers import TrajectorySampler
-from training.maps.spread import SpreadProblem
+from training.maps.spread import with_spread
 from training.pipeline import LEAD_IN_SHARE
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -26,9 +22,6 @@ from training.trajectories.controllers import Controller
 from training.trajectories.parameters import blind, uncertain_plant
 from training.trajectories.record import Motions, record, recording_ages
 from training.trajectories.signals import DRIVEN, KINDS
-
-WIDTH, DEPTH = 32, 1
-LEARNING_RATE = 3e-3
 
 
 def learn_error_bars(
@@ -128,7 +121,7 @@ class _Run:
         largest = self.artifact.process_noise_max
         self.tables = (0.0,) if largest is None else (0.0, largest)  # levels of process noise
         self.duration = self.config.duration
-        self.regions = Regions.of(self.artifact, self.plant, self.duration)
+        self.regions = Regions.of(self.artifact, self.duration, pace=self.plant.pace)
 
     def learned(self, name: str, inverse: InverseMap) -> InverseMap:
         """The map with a network of its errors, fitted on motions as in its training."""
@@ -170,21 +163,18 @@ class _Run:
             parameters=inverse.mlp.outputs - nx,
             like=inverse,
         )
-        problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=self.device)
-        with tempfile.TemporaryDirectory() as folder:
-            stage = Stage(
-                name=f"error bars, {name}",
-                steps=self.steps,
-                learning_rate=LEARNING_RATE,
-                folder=Path(folder),
-                fingerprint="",
-                seed=self.seed,
-                optimiser="soap",
-            )
-            optimise(stage, problem.network, problem.loss, self.progress, resume=False)
-        ones = np.ones((*(() if len(self.tables) == 1 else (2,)), *self.regions.tables))
-        spread = Spread(problem.network.export(), np.array(LEVELS), self.regions.knots * linear.dt, ones)
-        return dataclasses.replace(inverse, spread=spread)
+        return with_spread(
+            inverse,
+            sampler,
+            nx,
+            ages=self.regions.knots * linear.dt,
+            tables=len(self.tables),
+            name=f"error bars, {name}",
+            steps=self.steps,
+            seed=self.seed,
+            progress=self.progress,
+            device=self.device,
+        )
 
     def calibrated(self, artifact: Artifact, report: Callable[[float], object]) -> Artifact:
         """The observer with factors by which its regions hold as many errors as they should."""

@@ -3,10 +3,7 @@
 An estimate that is not finite counts as one infinitely far away.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
-from scipy.special import gammaincinv
 
 SETTLED = 0.1  # of a trajectory's root mean square size
 STILL = 1e-12  # of a state's size: a standard deviation below it is rounding
@@ -60,45 +57,6 @@ def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndar
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
     return np.asarray(_percentage(np.linalg.norm(x - x_hat, axis=-1), size))
-
-
-def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Squared Mahalanobis distance e^T P^-1 e: of Gaussian errors it has the chi-square distribution with nx degrees.
-
-    Parameters
-    ----------
-    error : ndarray, shape (..., nx)
-        What estimates are off by.
-    covariance : ndarray, shape (..., nx, nx)
-        What is said of it.
-
-    Returns
-    -------
-    ndarray, shape (...,)
-        The distance.
-    """
-    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
-    scaled = error / scale
-    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
-    return np.asarray((scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0]).sum(-1))
-
-
-def chi_square(shares: float | Sequence[float], degrees: int) -> np.ndarray:
-    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import.
-
-    Parameters
-    ----------
-    shares : float or sequence of float
-        Probabilities of lying below.
-    degrees : int
-        Degrees of freedom.
-
-    Returns
-    -------
-    ndarray
-        A quantile for each.
-    """
-    return np.asarray(2 * gammaincinv(degrees / 2, shares))
 
 
 def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:

@@ -1,36 +1,29 @@
 """Teaching an observer that is there already to track: a learned flow, and covariances that are calibrated."""
 
 import dataclasses
-import tempfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
 from rich.console import Console
 
 from kkl_gym.system import System
-from observers import Artifact, Factors, Flow, KKLObserver
+from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
-from training.evaluation.metrics import squared_distance
-from training.evaluation.regions import LEVELS, Regions, level_of
-from training.maps.flow import FlowProblem, draw_increments
-from training.maps.optimise import Stage, optimise
+from training.maps.flow import draw_increments, fit_flow, usual_error
+from training.maps.regions import LEVELS, Regions, distances_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
-WIDTH, DEPTH, BATCH = 32, 2, 1024
-LEARNING_RATE = 3e-3
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
 OF_OUTPUT = 1e-4  # the same in multiples of each output's standard deviation: below, covariances would be rounding
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
-OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 
 
 def learn_tracking(
@@ -97,7 +90,7 @@ def learn_tracking(
     if not artifact.knows_output:
         artifact = dataclasses.replace(artifact, h=output_expression(system))
     duration, largest = settings_of(artifact.training).duration, artifact.process_noise_max
-    regions = Regions.of(artifact, system, duration)
+    regions = Regions.of(artifact, duration, pace=system.pace)
     levels = (0.0,) if largest is None else (0.0, largest)
     torch.manual_seed(seed)
     with progress_bars(console) as progress:
@@ -160,48 +153,32 @@ def _learned(
     device: torch.device | None,
 ) -> Flow:
     """The flow, with factors that are none yet."""
-    dt, nu, device = artifact.filter.dt, artifact.nu, device or torch.device("cpu")
+    dt, nu = artifact.filter.dt, artifact.nu
     rng = generator(Stream.CALIBRATION, seed, 5)
     with progress.phase("simulating motions"):
         drawn = draw_increments(system, dt, duration=duration, nu=nu, rng=rng, policy=policy)
     held_out = round(JUDGED * len(drawn.x))
     judged, increments = drawn.part(slice(held_out)), drawn.part(slice(held_out, None))
     u_scale = np.array(system.u_max[:nu], dtype=float)
-    problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(
-            name="flow",
-            steps=steps,
-            learning_rate=LEARNING_RATE,
-            folder=Path(folder),
-            fingerprint="",
-            seed=seed,
-            optimiser="soap",
-        )
-        optimise(stage, problem.network, problem.loss, progress, resume=False)
     low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
     usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
     outputs = np.nanstd(system.output(increments.x), axis=0)
     least = np.maximum(LEAST_MEASUREMENT_NOISE * usual, OF_OUTPUT * outputs)
-    flow = Flow(
-        problem.network.export(),
-        x_offset=increments.x_offset,
-        x_scale=increments.x_scale,
-        u_scale=u_scale,
-        bias=problem.bias,
-        gain=problem.gain,
-        linear=problem.linear,
+    flow = fit_flow(
+        increments,
+        u_scale,
+        steps=steps,
+        seed=seed,
+        progress=progress,
+        device=device,
         low=low,
         high=high,
-        error=np.zeros(system.nx),
         process_noise=np.array(system.scale) / increments.x_scale * dt / np.sqrt(3),
         least_process_noise=LEAST_PROCESS_NOISE / system.pace,
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
-        factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
     )
-    apart = (flow(judged.x, judged.u) - judged.x - judged.change) / flow.x_scale
-    return dataclasses.replace(flow, error=OF_MEDIAN * np.median(np.abs(apart), axis=0))  # not of the farthest states
+    return dataclasses.replace(flow, error=usual_error(flow, judged))
 
 
 def _factors(
@@ -224,15 +201,9 @@ def _factors(
     for done, share in enumerate(LEVELS, 1):
         level = level_of(artifact, share)
         y = clean + np.asarray(level) * rng.standard_normal(clean.shape)
-        observer = KKLObserver(artifact, level, process_noise=process_noise)
-        observer.reset(y[0])
-        found = []
-        for k in range(regions.ages[-1] + 1):
-            if k:
-                observer.advance(y[k], u[k - 1] if artifact.nu else None)
-            if k in regions.ages:
-                found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
-        distances.append(np.array(found))
+        distances.append(
+            distances_along(artifact, x, y, u, level=level, process_noise=process_noise, ages=regions.ages)
+        )
         report(done)
     acted = np.maximum.accumulate((u != 0).any(-1), axis=0)
     driven = np.concatenate([np.zeros_like(acted[:1]), acted])[regions.ages]

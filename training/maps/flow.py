@@ -1,6 +1,9 @@
 """The system's motion over one sample as a network: its data, and what its training minimises."""
 
+import tempfile
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,7 +11,10 @@ from torch import nn
 
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
+from observers import Factors, Flow
 from training.maps.networks import Network, tensor
+from training.maps.optimise import Stage, optimise
+from training.progress import ProgressBars
 from training.trajectories.controllers import Controller
 from training.trajectories.record import Motions, trajectories
 from training.trajectories.signals import DRIVEN
@@ -21,6 +27,8 @@ PAIRS = 400_000
 # most of them near and some far. That a tracker does not leave the motions it is the near ones that decide.
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
+WIDTH, DEPTH, BATCH, LEARNING_RATE = 32, 2, 1024, 3e-3
+OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
 
@@ -171,3 +179,85 @@ def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
     """What a flow's network is given, (n, nx + nu)."""
     s = (increments.x - increments.x_offset) / increments.x_scale
     return np.column_stack([s, increments.u / u_scale])
+
+
+def fit_flow(
+    increments: Increments,
+    u_scale: np.ndarray,
+    *,
+    steps: int,
+    seed: int,
+    progress: ProgressBars,
+    device: torch.device | None = None,
+    **of_plant: Any,
+) -> Flow:
+    """Fit a flow.
+
+    Parameters
+    ----------
+    increments : Increments
+        What it is fitted to.
+    u_scale : ndarray, shape (nu,)
+        Of the inputs.
+    steps : int
+        Batches.
+    seed : int
+        Of the batches; the network begins with torch's own random numbers.
+    progress : ProgressBars
+        Where a bar is shown.
+    device : torch.device, optional
+        Where the network is trained; by default on the CPU.
+    **of_plant : object
+        Of :class:`observers.Flow`, what no fit says: bounds, noise and window.
+
+    Returns
+    -------
+    Flow
+        One that has no error, and no factors yet.
+    """
+    device = device or torch.device("cpu")
+    problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Stage(
+            name="flow",
+            steps=steps,
+            learning_rate=LEARNING_RATE,
+            folder=Path(folder),
+            fingerprint="",
+            seed=seed,
+            optimiser="soap",
+        )
+        optimise(stage, problem.network, problem.loss, progress, resume=False)
+    return Flow(
+        problem.network.export(),
+        x_offset=increments.x_offset,
+        x_scale=increments.x_scale,
+        u_scale=u_scale,
+        bias=problem.bias,
+        gain=problem.gain,
+        linear=problem.linear,
+        error=np.zeros(len(increments.x_scale)),
+        factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
+        **of_plant,
+    )
+
+
+def usual_error(flow: Flow, increments: Increments) -> np.ndarray:
+    """Find what a flow is usually off by after a sample.
+
+    Parameters
+    ----------
+    flow : Flow
+        The flow.
+    increments : Increments
+        That it was not fitted to.
+
+    Returns
+    -------
+    ndarray, shape (nx,)
+        Standard deviations in scaled states, from medians: a few states that are far off, or jumps that a plant makes
+        now and then, do not count. For a tracker that trusts the flow less everywhere would be worse than to be lost
+        there.
+    """
+    apart = (flow(increments.x, increments.u) - increments.x - increments.change) / flow.x_scale
+    return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))

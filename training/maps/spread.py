@@ -1,12 +1,21 @@
 """The covariance of T_inv's error as a network: what its training minimises."""
 
+import dataclasses
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import torch
 from torch import nn
 
-from observers import InverseMap
+from observers import InverseMap, Spread
 from training.maps.networks import Network, from_mlp
+from training.maps.optimise import Stage, optimise
+from training.maps.regions import LEVELS
 from training.maps.samplers import TrajectorySampler
+from training.progress import ProgressBars
+
+WIDTH, DEPTH, LEARNING_RATE = 32, 1, 3e-3
 
 
 class SpreadProblem(nn.Module):
@@ -71,3 +80,56 @@ class SpreadProblem(nn.Module):
                 mine = mine - lower[:, k] * white[self._column[k]]
             white.append(mine)
         return {"loss": (log.sum(-1) + torch.stack(white, -1).square().sum(-1) / 2).mean()}
+
+
+def with_spread(
+    inverse: InverseMap,
+    sampler: TrajectorySampler,
+    nx: int,
+    *,
+    ages: np.ndarray,
+    tables: int = 1,
+    name: str = "error bars",
+    steps: int,
+    seed: int,
+    progress: ProgressBars,
+    device: torch.device,
+) -> InverseMap:
+    """Give a map a network of its errors.
+
+    Parameters
+    ----------
+    inverse, sampler, nx, device
+        As :class:`SpreadProblem` takes them.
+    ages : ndarray, shape (m,)
+        Seconds since reset at which there are to be factors.
+    tables : int
+        Of factors: 2 where there is one for the highest level of process noise as well.
+    name : str
+        On the bar.
+    steps : int
+        Batches.
+    seed : int
+        Of the batches; the network begins with torch's own random numbers.
+    progress : ProgressBars
+        Where a bar is shown.
+
+    Returns
+    -------
+    InverseMap
+        The same with error bars, whose factors are ones.
+    """
+    problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=device)
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Stage(
+            name=name,
+            steps=steps,
+            learning_rate=LEARNING_RATE,
+            folder=Path(folder),
+            fingerprint="",
+            seed=seed,
+            optimiser="soap",
+        )
+        optimise(stage, problem.network, problem.loss, progress, resume=False)
+    ones = np.ones((*(() if tables == 1 else (tables,)), len(LEVELS), len(ages)))
+    return dataclasses.replace(inverse, spread=Spread(problem.network.export(), np.array(LEVELS), ages, ones))

@@ -1,12 +1,14 @@
 """What fitting an observer to recorded states is made of."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from observers import Artifact
 from observers.checks import check_dt
 from training.config import STRICT, Activation, Count, Levels, NotNegative, Optimiser, Positive, Share
 from training.records import Record, median_step, sampling_interval
@@ -136,6 +138,42 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
             raise ValueError(f"{', '.join(still)} never changes and tells nothing: leave it out of what is measured")
         chosen["measurement_noise_max"] = levels[0] if len(levels) == 1 else levels
     return RecordedConfig(**chosen)
+
+
+OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings that stay for good
+OF_THE_MAPS = tuple(field.name for field in fields(RecordedConfig) if field.name not in OF_THE_FILTER)
+
+
+def config_of(artifact: Artifact, changes: Mapping[str, Any] | None = None) -> RecordedConfig:
+    """Read how an observer was learned.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        From recorded states.
+    changes : mapping of str to object, optional
+        Settings that are to differ.
+
+    Returns
+    -------
+    RecordedConfig
+        For another training.
+
+    Raises
+    ------
+    ValueError
+        If it was not learned from recorded states, or a setting makes no sense.
+    """
+    if artifact.training.get("pipeline") != "recorded":
+        raise ValueError(f"the observer {artifact.system!r} was not learned from recorded states")
+    names = (*OF_THE_MAPS, *OF_THE_FILTER)
+    made = {name: _tuples(artifact.training[name]) for name in names if name in artifact.training}
+    return RecordedConfig(**{**made, **(changes or {})})
+
+
+def _tuples(value: Any) -> Any:
+    """A setting as it was before a file made lists of tuples."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def signal_rate(records: Sequence[Record]) -> float:

@@ -1,7 +1,7 @@
 """How good an observer is on recorded states that it was not trained on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,7 +34,13 @@ class RecordedErrors:
         return f"{each} ({self.seconds:.4g} s, after {self.after:.2g} s of transient)"
 
 
-def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float | None = None) -> RecordedErrors:
+def recorded_errors(
+    artifact: Artifact,
+    records: Sequence[Record],
+    after: float | None = None,
+    *,
+    measurement_noise: float | tuple[float, ...] = 0.0,
+) -> RecordedErrors:
     """Run an observer along records and compare its estimates with the recorded states.
 
     Parameters
@@ -46,6 +52,9 @@ def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float 
     after : float, optional
         Seconds for which each transient is left out; by default until the filter has forgotten its start to one part
         in a thousand.
+    measurement_noise : float or tuple of float, length ny
+        Standard deviation of noise that is added to the records' outputs, of all or each; the observer is told of it.
+        It is the same at each call.
 
     Returns
     -------
@@ -55,9 +64,11 @@ def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float 
     after = settling_time(artifact.filter) if after is None else after
     first = int(np.ceil(after / artifact.filter.dt - 1e-6))  # times are rounded
     apart, x = [np.zeros((0, artifact.nx))], [np.zeros((0, artifact.nx))]
+    rng = np.random.default_rng(0)
     for record in pieces(records):
         if record.x is not None:
-            apart.append((estimates(artifact, record) - record.x)[first:])
+            y = record.y + np.asarray(measurement_noise) * rng.standard_normal(record.y.shape)
+            apart.append((estimates(artifact, replace(record, y=y), measurement_noise) - record.x)[first:])
             x.append(record.x[first:])
     error, truth = np.concatenate(apart), np.concatenate(x)
     known = ~np.isnan(error).any(-1)
@@ -70,6 +81,6 @@ def recorded_errors(artifact: Artifact, records: Sequence[Record], after: float 
     return RecordedErrors(dict(zip(names, relative.tolist())), after, len(error) * artifact.filter.dt)
 
 
-def estimates(artifact: Artifact, record: Record) -> np.ndarray:
-    """An observer's estimates along a record without gaps on its grid, (n, nx)."""
-    return KKLObserver(artifact).estimate(record.y, record.u if artifact.nu else None)
+def estimates(artifact: Artifact, record: Record, measurement_noise: float | tuple[float, ...] = 0.0) -> np.ndarray:
+    """An observer's estimates along a record without gaps on its grid, (n, nx), told a level of noise."""
+    return KKLObserver(artifact, measurement_noise).estimate(record.y, record.u if artifact.nu else None)

@@ -16,7 +16,7 @@ import torch
 from rich.console import Console
 
 import kkl_gym
-from observers import Artifact, LinearFilter
+from observers import Artifact, InverseMap, LinearFilter
 from training.filter_noise import stationary_covariance
 from training.jobs import claimed_run
 from training.maps.coordinates import settling_time
@@ -118,7 +118,7 @@ def train_recorded(
         check_memory(records, settling_time(linear), lambda text: progress.say(f"warning: {text}"))
         with progress.phase("preparing batches"):
             kept, held_out = split([resampled(record, config.dt) for record in records], config.held_out, config.seed)
-            sampler = _sampler(config, kept, linear, device)
+            sampler = sampler_of(config, kept, linear, device)
         run = _Run(config, sampler, folder, resume, device, progress, log, identity)
         networks = [run.member(i, len(signals.hidden)) for i in range(config.members)]
         inverse = sampler.inverse_map(networks[0], linear)
@@ -168,10 +168,33 @@ def _fingerprints(records: Sequence[Record]) -> dict[str, str]:
     }
 
 
-def _sampler(
-    config: RecordedConfig, records: Sequence[Record], linear: LinearFilter, device: torch.device
+def sampler_of(
+    config: RecordedConfig,
+    records: Sequence[Record],
+    linear: LinearFilter,
+    device: torch.device,
+    like: InverseMap | None = None,
 ) -> TrajectorySampler:
-    """Batches of recorded states and filter states, with noise added to that of the records."""
+    """Make what draws batches of recorded states and filter states, with noise added to that of the records.
+
+    Parameters
+    ----------
+    config : RecordedConfig
+        Of a training.
+    records : sequence of Record
+        That are trained on, on the grid.
+    linear : LinearFilter
+        The filter.
+    device : torch.device
+        Where batches are made.
+    like : InverseMap, optional
+        A map to whose network they are to be given.
+
+    Returns
+    -------
+    TrajectorySampler
+        What draws them.
+    """
     ages = recording_ages(math.ceil(settling_time(linear) / config.dt), config.samples)
     measured = records[0].signals.measured
     untold = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])
@@ -187,6 +210,7 @@ def _sampler(
         error=np.einsum("j,jab->ab", untold**2, stationary_covariance(linear)) if config.untold_noise else None,
         scaling="range",  # errors count by their own size, not the state's
         silent=linear.equilibrium[:, [measured.index(name) for name in config.arbitrary_zero]],
+        like=like,
     )
 
 

@@ -4,9 +4,9 @@ import math
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,17 @@ from observers import Artifact, KKLObserver
 from observers.checks import integer, shown
 from observers.replacement import check_replacement
 from training.maps.coordinates import settling_time
-from training.recorded.config import RecordedConfig
+from training.recorded.config import OF_THE_FILTER, OF_THE_MAPS, RecordedConfig, config_of
+from training.recorded.errorbars import learn_recorded_error_bars
 from training.recorded.errors import RecordedErrors, recorded_errors
 from training.recorded.fit import train_recorded
+from training.recorded.tracking import learn_recorded_tracking
 from training.records import Record
 from training.rollouts.gathering import Gathering
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
-OF_THE_FILTER = ("eigenvalues", "pairs", "dt", "inputs", "arbitrary_zero")  # settings that stay
+QUICK_ERROR_BARS, QUICK_FLOW = 1000, 5000  # batches
+CALIBRATED_ON = 100  # samples at least that are held out, where there are error bars
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,7 @@ class KKLTrainingCallback(BaseCallback):
 
     artifact: Artifact
     _config: RecordedConfig
+    _level: float | tuple[float, ...]
     _gathering: Gathering
 
     def __init__(
@@ -162,14 +166,19 @@ class KKLTrainingCallback(BaseCallback):
             raise ValueError(
                 f"{', '.join(fixed)} cannot change: the filter in use stays; learn another observer instead"
             )
-        if unknown := [name for name in settings if name not in _SETTINGS]:
-            raise ValueError(f"there is no setting {', '.join(unknown)}; there are {', '.join(_SETTINGS)}")
+        if unknown := [name for name in settings if name not in OF_THE_MAPS]:
+            raise ValueError(f"there is no setting {', '.join(unknown)}; there are {', '.join(OF_THE_MAPS)}")
         self._settings = settings
 
     def _init_callback(self) -> None:
         used = _observers(self.training_env)
         artifact = used[0].artifact
-        config = _config(artifact, self._settings)
+        if artifact.environment is None or artifact.training.get("pipeline") != "recorded":
+            raise ValueError(
+                f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; "
+                "learn one by training.learn, or by kkl-gym record and kkl-gym train"
+            )
+        config = config_of(artifact, {**QUICK, **self._settings})
         for observer in used:
             check_replacement(artifact, observer.artifact)
             level = observer.measurement_noise
@@ -183,6 +192,8 @@ class KKLTrainingCallback(BaseCallback):
         else:
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config
+        # Where outputs are recorded without the noise that the observer sees, it is judged with that noise.
+        self._level = 0.0 if self._outputs == "y" else used[0].measurement_noise
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
@@ -208,7 +219,8 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         train, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        if any(record.duration >= memory for record in train):
+        enough = self.artifact.inverse.spread is None or sum(len(record.t) for record in held_out) >= CALIBRATED_ON
+        if enough and any(record.duration >= memory for record in train):
             self._refit(train, held_out)
 
     def _rehearse(self) -> None:
@@ -243,8 +255,13 @@ class KKLTrainingCallback(BaseCallback):
         ):  # the agent's random numbers stay its own
             config = replace(self._config, held_out=0.0)
             new = train_recorded(train, config, Path(folder) / "refit", name=old.system).artifact
-        errors = recorded_errors(new, held_out)
-        before, after = _together(recorded_errors(old, held_out)), _together(errors)
+            if old.inverse.spread is not None:
+                new = learn_recorded_error_bars(new, train, held_out, steps=QUICK_ERROR_BARS)
+            if old.flow is not None:
+                new = learn_recorded_tracking(new, train, held_out, steps=QUICK_FLOW)
+        errors = recorded_errors(new, held_out, measurement_noise=self._level)
+        before = _together(recorded_errors(old, held_out, measurement_noise=self._level))
+        after = _together(errors)
         taken = not after > before
         if taken:
             known = {name: error for name, error in errors.relative.items() if math.isfinite(error)}
@@ -272,9 +289,6 @@ class KKLTrainingCallback(BaseCallback):
             vector.replace_observer(self.artifact)
 
 
-_SETTINGS = [field.name for field in fields(RecordedConfig) if field.name not in OF_THE_FILTER]
-
-
 @contextmanager
 def _as_it_is(scaling: VecNormalize | None) -> Iterator[None]:
     """What scales observations learns nothing inside."""
@@ -286,24 +300,6 @@ def _as_it_is(scaling: VecNormalize | None) -> Iterator[None]:
         yield
     finally:
         scaling.training = before
-
-
-def _config(artifact: Artifact, changes: Mapping[str, Any]) -> RecordedConfig:
-    """How an observer is refitted: as it was learned, but for a few settings."""
-    if artifact.environment is None or artifact.training.get("pipeline") != "recorded":
-        raise ValueError(
-            f"the observer {artifact.system!r} in use was not learned from rollouts, and is not refitted to any; learn "
-            "one by training.learn, or by kkl-gym record and kkl-gym train"
-        )
-    made = {
-        name: _tuples(artifact.training[name]) for name in (*_SETTINGS, *OF_THE_FILTER) if name in artifact.training
-    }
-    return RecordedConfig(**{**made, **QUICK, **changes})
-
-
-def _tuples(value: Any) -> Any:
-    """A setting as it was before a file made lists of tuples."""
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _observers(env: VecEnv) -> list[KKLObserver]:

@@ -26,6 +26,7 @@ def learn(
     steps: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     seed: int = 0,
+    tracking: bool = False,
     out: str | Path | None = None,
     console: Console | ProgressBars | None = None,
     **settings: Any,
@@ -47,6 +48,9 @@ def learn(
         Arguments of the environment.
     seed : int
         Of the rollouts and of the training.
+    tracking : bool
+        Whether the observer learns error bars too, and to track, which lowers its errors under noise, see
+        :func:`training.recorded.tracking.learn_recorded_tracking`. What is measured has to be among the hidden signals.
     out : str or Path, optional
         A folder, which then receives checkpoints and ENV_ID.safetensors; by default nothing is written.
     console : rich.console.Console or ProgressBars, optional
@@ -62,9 +66,12 @@ def learn(
     Raises
     ------
     ValueError
-        If an argument makes no sense, or as :func:`training.recorded.fit.train_recorded`.
+        If an argument makes no sense, or as :func:`training.recorded.fit.train_recorded` and, with ``tracking``,
+        :func:`training.recorded.tracking.learn_recorded_tracking`.
     """
-    from training.recorded.fit import train_recorded  # torch takes seconds to import
+    from training.recorded.errorbars import learn_recorded_error_bars  # torch takes seconds to import
+    from training.recorded.fit import train_recorded
+    from training.recorded.tracking import learn_recorded_tracking, linear_output
 
     if episodes is None and steps is None:
         steps = 100_000
@@ -85,9 +92,14 @@ def learn(
                 report=report,
             )
         records = rollouts.records()
+        if tracking:
+            linear_output(records)  # an error now, not after minutes
         config = recorded_config(records, settings)
         name = (rollouts.environment or {})["id"].replace("/", "-")
         artifact = train_recorded(records, config, folder, name=name, console=progress).artifact
+        if tracking:
+            artifact = learn_recorded_error_bars(artifact, records, seed=seed, console=progress)
+            artifact = learn_recorded_tracking(artifact, records, seed=seed, console=progress)
         if out is not None:
             artifact.save(folder / f"{name}.safetensors")
     return artifact

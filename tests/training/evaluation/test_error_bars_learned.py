@@ -11,8 +11,8 @@ from observers import MLP, KKLObserver
 from training.evaluation.coverage import REGIONS, coverage, kalman_coverage
 from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import unseen_trajectories
-from training.evaluation.metrics import chi_square, squared_distance
 from training.filter_noise import stationary_covariance
+from training.maps.regions import chi_square, squared_distance
 
 
 class Noiseless(Oscillator):

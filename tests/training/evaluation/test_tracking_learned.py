@@ -11,7 +11,7 @@ from tracking import DT, exact_motion, plain_observer, tracking_observer
 from kkl_gym import get_system
 from observers import Artifact, KKLObserver, Limits, load
 from training.commands.tracking import Tracking
-from training.evaluation import regions, tracking
+from training.evaluation import tracking
 from training.evaluation.certificates.certificate import certify
 from training.evaluation.coverage import coverage
 from training.evaluation.errorbars import learn_error_bars
@@ -21,7 +21,7 @@ from training.export.exported import Exported
 from training.export.onnx_graph import onnx_model
 from training.export.step_file import write_step
 from training.guided import GuidedKalmanFilter
-from training.maps import flow
+from training.maps import flow, regions
 from training.trajectories.controllers import linear_quadratic
 from training.trajectories.noise import draw_process_noise
 

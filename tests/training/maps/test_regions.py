@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from training.evaluation import regions
-from training.evaluation.regions import Regions
+from training.maps import regions
+from training.maps.regions import Regions
 
 
 @pytest.fixture

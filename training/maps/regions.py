@@ -1,13 +1,13 @@
 """Factors by which regions of 90 % hold 90 % of an observer's errors, at each age and level of noise."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import gammaincinv
 
-from kkl_gym.system import System
-from observers import Artifact
+from observers import Artifact, KKLObserver
 from observers.factors import COVERAGE
-from training.evaluation.metrics import chi_square
 
 # Of measurement noise, in multiples of the largest that the map is told; dense near 0, where errors of the map end.
 LEVELS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -37,10 +37,10 @@ class Regions:
     nx: int
 
     @classmethod
-    def of(cls, artifact: Artifact, system: System, duration: float) -> "Regions":
-        """Those of an observer of a system, on runs of so many seconds."""
+    def of(cls, artifact: Artifact, duration: float, *, pace: float) -> "Regions":
+        """Those of an observer on runs of so many seconds, of a plant that takes ``pace`` times as long as ours."""
         dt, settled = artifact.filter.dt, min(artifact.inverse.age_max, duration / 2)
-        later = [round(age * system.pace / dt) for age in AGES]
+        later = [round(age * pace / dt) for age in AGES]
         last = max(1, round(settled / dt))
         knots = np.array(sorted({*(k for k in (*FIRST, *later) if k < last), last}))
         return cls(knots, round(duration / dt), artifact.nx)
@@ -107,3 +107,85 @@ def level_of(artifact: Artifact, share: float) -> float | tuple[float, ...]:
     """A level of measurement noise, in multiples of the largest that the map is told, as observers take it."""
     level = share * np.asarray(artifact.inverse.measurement_noise_max)
     return tuple(level.tolist()) if level.ndim else float(level)
+
+
+def distances_along(
+    artifact: Artifact,
+    x: np.ndarray,
+    y: np.ndarray,
+    u: np.ndarray,
+    *,
+    level: float | tuple[float, ...],
+    process_noise: float | None = None,
+    ages: np.ndarray,
+) -> np.ndarray:
+    """Run an observer from its reset on, and compare its errors with its own covariances.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, with error bars.
+    x, y : ndarray, shapes (steps + 1, n, nx) and (steps + 1, n, ny)
+        States, NaN where they are not known, and samples.
+    u : ndarray, shape (steps, n, nu)
+        Inputs.
+    level : float or tuple of float, length ny
+        Of the noise on the samples, as the observer is told it.
+    process_noise : float, optional
+        The same of the motion; by default what the observer assumes.
+    ages : ndarray of int, shape (m,)
+        Samples since the reset at which they are compared, sorted.
+
+    Returns
+    -------
+    ndarray, shape (m, n)
+        Squared distances of the errors in units of the covariance.
+    """
+    observer = KKLObserver(artifact, level, process_noise=process_noise)
+    observer.reset(y[0])
+    found = []
+    for k in range(int(ages[-1]) + 1):
+        if k:
+            observer.advance(y[k], u[k - 1] if artifact.nu else None)
+        if k in ages:
+            found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
+    return np.array(found)
+
+
+def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distance e^T P^-1 e: of Gaussian errors it has the chi-square distribution with nx degrees.
+
+    Parameters
+    ----------
+    error : ndarray, shape (..., nx)
+        What estimates are off by.
+    covariance : ndarray, shape (..., nx, nx)
+        What is said of it.
+
+    Returns
+    -------
+    ndarray, shape (...,)
+        The distance.
+    """
+    scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
+    scaled = error / scale
+    correlation = covariance / (scale[..., :, None] * scale[..., None, :])
+    return np.asarray((scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0]).sum(-1))
+
+
+def chi_square(shares: float | Sequence[float], degrees: int) -> np.ndarray:
+    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import.
+
+    Parameters
+    ----------
+    shares : float or sequence of float
+        Probabilities of lying below.
+    degrees : int
+        Degrees of freedom.
+
+    Returns
+    -------
+    ndarray
+        A quantile for each.
+    """
+    return np.asarray(2 * gammaincinv(degrees / 2, shares))
