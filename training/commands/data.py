@@ -93,22 +93,6 @@ class DataOptions:
         }
         return self._read(replace(given, **own), progress)
 
-    def refuse_for(self, artifact: Artifact) -> None:
-        """See that no data are given for an observer of a system.
-
-        Parameters
-        ----------
-        artifact : Artifact
-            The observer.
-
-        Raises
-        ------
-        ValueError
-            If there are any.
-        """
-        if self != DataOptions():
-            raise ValueError(f"the motions of {artifact.system} are simulated: leave --data and its columns out")
-
     def _read(self, signals: Signals, progress: ProgressBars, system: System | None = None) -> list[Record]:
         with progress.phase("reading the records"):
             return read_records(

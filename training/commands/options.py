@@ -251,29 +251,6 @@ def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[s
     return [(name, artifact, system_of(artifact, own_system)) for name, artifact in artifacts]
 
 
-def refuse_simulated(options: Any, artifact: Artifact) -> None:
-    """See that no option of a command is about simulated motions.
-
-    Parameters
-    ----------
-    options : object
-        The command.
-    artifact : Artifact
-        Its observer, from recorded states.
-
-    Raises
-    ------
-    ValueError
-        If one is given.
-    """
-    for name in ("system", "policy", "trajectories"):
-        if getattr(options, name) != type(options).__dataclass_fields__[name].default:
-            raise ValueError(
-                f"--{name}: of no use for the observer {artifact.system!r} from recorded states, where nothing is "
-                "simulated"
-            )
-
-
 @dataclass(frozen=True)
 class Shown:
     """An environment that a command shows.

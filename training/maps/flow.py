@@ -1,8 +1,6 @@
 """The system's motion over one sample as a network: its data, and what its training minimises."""
 
-import tempfile
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Factors, Flow
 from training.maps.networks import Network, tensor
-from training.maps.optimise import Stage, optimise
+from training.maps.optimise import optimise_at_once
 from training.progress import ProgressBars
 from training.trajectories.controllers import Controller
 from training.trajectories.record import Motions, trajectories
@@ -217,17 +215,9 @@ def fit_flow(
     """
     device = device or torch.device("cpu")
     problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(
-            name="flow",
-            steps=steps,
-            learning_rate=LEARNING_RATE,
-            folder=Path(folder),
-            fingerprint="",
-            seed=seed,
-            optimiser="soap",
-        )
-        optimise(stage, problem.network, problem.loss, progress, resume=False)
+    optimise_at_once(
+        "flow", problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed
+    )
     return Flow(
         problem.network.export(),
         x_offset=increments.x_offset,

@@ -2,6 +2,7 @@
 
 import math
 import operator
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -157,6 +158,38 @@ def optimise(
         if last:
             break
     return course.history
+
+
+def optimise_at_once(
+    name: str, module: nn.Module, loss: Loss, progress: Progress, *, steps: int, learning_rate: float, seed: int
+) -> None:
+    """Minimise a loss by SOAP in a minute or so, of which no checkpoint is kept.
+
+    Parameters
+    ----------
+    name : str
+        On the bar.
+    module, loss, progress
+        As :func:`optimise` takes them.
+    steps, learning_rate, seed
+        As of :class:`Stage`.
+
+    Raises
+    ------
+    FloatingPointError
+        If the loss stops being a number.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        stage = Stage(
+            name=name,
+            steps=steps,
+            learning_rate=learning_rate,
+            folder=Path(folder),
+            fingerprint="",
+            seed=seed,
+            optimiser="soap",
+        )
+        optimise(stage, module, loss, progress, resume=False)
 
 
 def _optimiser(stage: Stage, module: nn.Module) -> torch.optim.Optimizer:

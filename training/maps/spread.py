@@ -1,8 +1,6 @@
 """The covariance of T_inv's error as a network: what its training minimises."""
 
 import dataclasses
-import tempfile
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,7 +8,7 @@ from torch import nn
 
 from observers import InverseMap, Spread
 from training.maps.networks import Network, from_mlp
-from training.maps.optimise import Stage, optimise
+from training.maps.optimise import optimise_at_once
 from training.maps.regions import LEVELS
 from training.maps.samplers import TrajectorySampler
 from training.progress import ProgressBars
@@ -120,16 +118,6 @@ def with_spread(
         The same with error bars, whose factors are ones.
     """
     problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=device)
-    with tempfile.TemporaryDirectory() as folder:
-        stage = Stage(
-            name=name,
-            steps=steps,
-            learning_rate=LEARNING_RATE,
-            folder=Path(folder),
-            fingerprint="",
-            seed=seed,
-            optimiser="soap",
-        )
-        optimise(stage, problem.network, problem.loss, progress, resume=False)
+    optimise_at_once(name, problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
     ones = np.ones((*(() if tables == 1 else (tables,)), len(LEVELS), len(ages)))
     return dataclasses.replace(inverse, spread=Spread(problem.network.export(), np.array(LEVELS), ages, ones))

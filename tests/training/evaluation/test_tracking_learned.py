@@ -191,7 +191,7 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
     console, source = Console(width=200, record=True), tmp_path / "map-v3.safetensors"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        "training.commands.tracking.read_observers", lambda *_: [("map", plain_observer(), Noiseless())]
+        "training.commands.teaching.read_observers", lambda *_: [("map", plain_observer(), Noiseless())]
     )
     plain_observer().save(source)
     found = Tracking(str(source), steps=2, trajectories=50).run(console)

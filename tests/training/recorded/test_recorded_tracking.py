@@ -160,7 +160,7 @@ def test_commands(plain, tmp_path, monkeypatch):
         ErrorBars("spring.safetensors").run(quiet)
     with pytest.raises(ValueError, match=r"--trajectories: of no use for the observer 'spring' from recorded states"):
         ErrorBars("spring.safetensors", trajectories=500, records=data).run(quiet)
-    with pytest.raises(ValueError, match=r"motions of van_der_pol are simulated: leave --data and its columns out"):
+    with pytest.raises(ValueError, match=r"van_der_pol is simulated: leave --data and its columns out"):
         Tracking("van_der_pol", records=data).run(quiet)
     ErrorBars("spring.safetensors", steps=20, records=data).run(quiet)
     found = Tracking("runs/errorbars/spring.safetensors", steps=20, records=data).run(quiet)
