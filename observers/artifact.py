@@ -357,7 +357,9 @@ class Artifact:
         ArtifactError
             If there is neither; the message says which maps have T.
         """
-        if self.flow is None:
+        if self.flow is None and self.signals is not None:
+            self.require_flow()
+        elif self.flow is None:
             self.require_forward()
 
     def require_spread(self) -> Spread:

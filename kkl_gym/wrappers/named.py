@@ -32,7 +32,7 @@ class NamedEstimator(KKLEstimator):
     monitor : bool
         Whether to keep the score.
     known_start : bool
-        Refused where it is True, as no map from rollouts has T.
+        Whether an observer that tracks is told the hidden signals at the reset, which have to be shown there.
     uncertainty : bool
         Whether standard deviations are shown behind the estimates.
 

@@ -113,7 +113,7 @@ def test_other_environments_are_refused(saved):
         KKLObservation(gym.make("CartPole-v1"))
     with pytest.raises(ValueError, match=r"needs a gymnasium\.Env"):
         KKLObservation("CartPole-v1")
-    with pytest.raises(ArtifactError, match="holds no forward map"):
+    with pytest.raises(ArtifactError, match="holds no flow; kkl-gym tracking"):
         KKLObservation(gym.make("Pendulum-v1"), path, known_start=True)
 
 

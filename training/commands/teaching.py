@@ -67,6 +67,8 @@ class Teaching:
         """
         if out.suffix != ".safetensors":
             raise ValueError(f"out = {out} must end in .safetensors")
+        if out.is_dir():
+            raise ValueError(f"out = {out} is a folder")
         artifact = Artifact.read(resolve(self.observer))
         with progress_bars(console) as progress:
             settings |= {"seed": self.seed, "console": progress}

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from observers import Artifact
+from observers.checks import shown
 from training.maps.regions import FEWEST, LEVELS, Regions, distances_along, level_of
 from training.recorded.config import config_of
-from training.recorded.preparing import split
+from training.recorded.preparing import file_of, fingerprints, split
 from training.recorded.windows import samples_as_old
-from training.records import Record, check_signals, pieces, resampled
+from training.records import Record, check_dt, check_signals, pieces, resampled
 
-STRETCHES = 600
+STRETCHES, SAMPLES = 600, 2_000_000  # at most, of stretches and of their samples together
 MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
 
 
@@ -26,19 +27,21 @@ def parted(
     artifact : Artifact
         From recorded states.
     records : sequence of Record
-        All of them; those that were trained on, and on the grid, if others are given.
+        All that it was trained on or that were held out, in any order; those that it was trained on, and on its grid,
+        if the others are given.
     held_out : sequence of Record or None
         Those that were not trained on, if that is known.
 
     Returns
     -------
     train, held_out : list of Record
-        None of them is empty.
+        Both have states.
 
     Raises
     ------
     ValueError
-        If the records are of other signals or without states, or nothing is held out.
+        If the records are others than those of the training, of other signals or without states, or nothing is held
+        out.
     """
     config = config_of(artifact)
     check_signals([*records, *(held_out or ())])
@@ -48,15 +51,37 @@ def parted(
     for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
         if (here := getattr(signals, role)) != (there := tuple(names[role])):
             raise ValueError(f"{records[0].name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")
+    if records[0].environment != artifact.environment:
+        raise ValueError(
+            f"{records[0].name} is of {shown(records[0].environment)}, the observer of {shown(artifact.environment)}"
+        )
     if held_out is None:
-        parts = split([resampled(record, config.dt) for record in records], config.held_out, config.seed)
-        records, held_out = parts
-    if not any(record.x is not None for record in held_out):
+        check_dt(records, config.dt)
+        ordered = _as_trained(artifact, records)
+        records, held_out = split([resampled(record, config.dt) for record in ordered], config.held_out, config.seed)
+    if not held_out:
         raise ValueError(
             "no record was held out from the training, and errors on those that were trained on are too small: train "
-            "with --held-out 0.2"
+            "with a share held out (held_out, --held-out 0.2)"
         )
     return list(records), list(held_out)
+
+
+def _as_trained(artifact: Artifact, records: Sequence[Record]) -> list[Record]:
+    """Records in the order of the training, on which hangs what was held out; ValueError if they are others."""
+    there, here = dict(artifact.training.get("records", {})), fingerprints(records)
+    for what, names in (
+        ("has changed since the training", [name for name in there if here.get(name, there[name]) != there[name]]),
+        ("is missing", [name for name in there if name not in here]),
+        ("was not there in the training", [name for name in here if name not in there]),
+    ):
+        if names:
+            raise ValueError(
+                f"{', '.join(names)} {what}: what was held out from the training of {artifact.system!r}, and only "
+                "that, says how large errors are; name the records of the training, all of them and as they were"
+            )
+    order = list(there)
+    return sorted(records, key=lambda record: order.index(file_of(record)))
 
 
 @dataclass(frozen=True)
@@ -99,18 +124,14 @@ def stretches(artifact: Artifact, records: Sequence[Record]) -> Stretches:
     ValueError
         If there are too few samples to begin at.
     """
-    whole = [piece for piece in pieces(records) if piece.x is not None and len(piece.t) > 2]
-    owner, first = samples_as_old([piece.part(slice(None, -1)) for piece in whole], 0) if whole else ((), ())
-    if len(owner) < FEWEST:
-        raise ValueError(
-            f"what was held out has {len(owner)} samples to begin at, too few to calibrate error bars on ({FEWEST}): "
-            "record more, or hold more out"
-        )
-    if len(owner) > STRETCHES:
-        chosen = np.linspace(0, len(owner) - 1, STRETCHES).round().astype(int)
-        owner, first = owner[chosen], first[chosen]
+    require_enough(records)
+    whole, owner, first = _begins(records)
     memory = artifact.inverse.age_max / artifact.filter.dt
     steps = max(2, min(round(MEMORIES * memory), max(len(piece.t) for piece in whole) - 1))
+    most = min(STRETCHES, max(2 * FEWEST, SAMPLES // steps))
+    if len(owner) > most:
+        chosen = np.linspace(0, len(owner) - 1, most).round().astype(int)
+        owner, first = owner[chosen], first[chosen]
     rows = first + np.arange(steps + 1)[:, None]
     lengths = np.array([len(piece.t) for piece in whole])[owner]
     begins = np.concatenate([[0], np.cumsum([len(piece.t) for piece in whole])])[owner]
@@ -121,6 +142,35 @@ def stretches(artifact: Artifact, records: Sequence[Record]) -> Stretches:
     if artifact.nu:
         u = np.concatenate([np.asarray(piece.u) for piece in whole])[where[:-1]]
     return Stretches(x, np.concatenate([piece.y for piece in whole])[where], u)
+
+
+def require_enough(records: Sequence[Record]) -> None:
+    """See that error bars can be calibrated on records.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        That were held out, on an observer's grid.
+
+    Raises
+    ------
+    ValueError
+        If there are too few samples to begin at.
+    """
+    count = len(_begins(records)[1])
+    if count < FEWEST:
+        raise ValueError(
+            f"what was held out has {count} samples with states to begin at, too few to calibrate error bars on "
+            f"({FEWEST}): record more, or hold more out"
+        )
+
+
+def _begins(records: Sequence[Record]) -> tuple[list[Record], np.ndarray, np.ndarray]:
+    """Records without gaps, and the samples that stretches may begin at: of which of them, and which."""
+    whole = [piece for piece in pieces(records) if piece.x is not None and len(piece.t) > 2]
+    if not whole:
+        return [], np.zeros(0, int), np.zeros(0, int)
+    return whole, *samples_as_old([piece.part(slice(None, -1)) for piece in whole], 0)
 
 
 def regions_of(artifact: Artifact, runs: Stretches, rate: float) -> Regions:
@@ -174,4 +224,4 @@ def told_apart(
     return regions.factors(distances, np.isfinite(runs.x[regions.ages]).all(-1), lenient=lenient)
 
 
-__all__ = ["Stretches", "parted", "regions_of", "stretches", "told_apart"]
+__all__ = ["Stretches", "parted", "regions_of", "require_enough", "stretches", "told_apart"]

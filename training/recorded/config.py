@@ -200,7 +200,8 @@ def signal_rate(records: Sequence[Record]) -> float:
         if columns:
             steps = [np.diff(values, axis=0) / np.diff(record.t)[:, None] for values, record in zip(columns, records)]
             change = np.sqrt(np.nanmean(np.concatenate(steps) ** 2, 0))
-            rates += (change / np.nanstd(np.concatenate(columns), 0)).tolist()
+            size = np.nanstd(np.concatenate(columns), 0)
+            rates += (change[size > 0] / size[size > 0]).tolist()
     moving = [rate for rate in rates if rate > 0]
     if not moving:
         raise ValueError(f"{records[0].name}: no signal moves, nor in any other record; there is nothing to learn from")

@@ -7,6 +7,7 @@ import torch
 from rich.console import Console
 
 from observers import Artifact
+from observers.checks import integer
 from training.maps.spread import with_spread
 from training.progress import ProgressBars, progress_bars
 from training.recorded.calibrating import parted, regions_of, stretches, told_apart
@@ -58,14 +59,16 @@ def learn_recorded_error_bars(
     Raises
     ------
     ValueError
-        If the observer was not learned from recorded states or tracks, the records are of other signals or without
-        states, nothing was held out, or too little to calibrate on.
+        If the observer was not learned from recorded states or tracks, the records are not those of the training or
+        without states, nothing was held out, or too little to calibrate on.
     """
     if artifact.flow is not None:
         raise ValueError(
             "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
             "it was made from, then teach that to track"
         )
+    integer("steps", steps, 1)
+    integer("seed", seed, 0)
     config, device = config_of(artifact), device or torch.device("cpu")
     train, others = parted(artifact, records, held_out)
     torch.manual_seed(seed)

@@ -27,7 +27,7 @@ from training.maps.samplers import TrajectorySampler
 from training.progress import LOG, ProgressBars, progress_bars
 from training.recorded.config import RecordedConfig
 from training.recorded.errors import RecordedErrors, recorded_errors
-from training.recorded.preparing import filter_of, split
+from training.recorded.preparing import filter_of, fingerprints, split
 from training.recorded.windows import windows
 from training.records import Record, check_memory, pieces, resampled
 from training.trajectories.record import recording_ages
@@ -131,7 +131,7 @@ def train_recorded(
             training={
                 "pipeline": "recorded",
                 **dataclasses.asdict(config),
-                "records": _fingerprints(records),
+                "records": fingerprints(records),
                 "seconds": round(time.monotonic() - began),
                 "device": device.type,
                 "threads": torch.get_num_threads(),
@@ -155,17 +155,6 @@ def train_recorded(
     training = {**artifact.training, "held_out_errors": known, "held_out_after": found.after}
     artifact = dataclasses.replace(artifact, training=training)
     return Recorded(artifact, run.losses, held_out, found)
-
-
-def _fingerprints(records: Sequence[Record]) -> dict[str, str]:
-    """What identifies each file, or all episodes of a data set together, by its name."""
-    found = dict[str, list[str]]()
-    for record in records:
-        found.setdefault(record.source or Path(record.name).name, []).append(record.fingerprint)
-    return {
-        name: each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()[:16]
-        for name, each in found.items()
-    }
 
 
 def sampler_of(

@@ -1,6 +1,8 @@
 """What is made of records and a configuration before anything is fitted."""
 
+import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -47,6 +49,33 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         [record.part(slice(None, end)) for record, end in zip(records, ends)],
         [record.part(slice(end, None)) for record, end in zip(records, ends)],
     )
+
+
+def fingerprints(records: Sequence[Record]) -> dict[str, str]:
+    """What identifies each file, or all episodes of a data set together, by its name.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        As they were read.
+
+    Returns
+    -------
+    dict of str to str
+        In the order in which they come.
+    """
+    found = dict[str, list[str]]()
+    for record in records:
+        found.setdefault(file_of(record), []).append(record.fingerprint)
+    return {
+        name: each[0] if len(each) == 1 else hashlib.sha256("".join(each).encode()).hexdigest()[:16]
+        for name, each in found.items()
+    }
+
+
+def file_of(record: Record) -> str:
+    """The name of the file, or of the data set, that a record is of."""
+    return record.source or Path(record.name).name
 
 
 def described(records: Sequence[Record], config: RecordedConfig, name: str) -> list[str]:

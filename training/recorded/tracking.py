@@ -8,20 +8,24 @@ import torch
 from rich.console import Console
 
 from observers import Artifact, Factors
-from training.maps.flow import PAIRS, Increments, fit_flow, usual_error
+from observers.checks import integer
+from training.maps.flow import OF_MEDIAN, PAIRS, Increments, fit_flow, usual_error
 from training.maps.regions import LEVELS
 from training.progress import ProgressBars, progress_bars
 from training.recorded.calibrating import parted, regions_of, stretches, told_apart
-from training.recorded.config import signal_rate
+from training.recorded.config import RecordedConfig, config_of, signal_rate
 from training.records import Record, pieces
 from training.seeds import Stream, generator
 
 BEYOND = 0.5  # of the states' range, by which estimates may leave it
-OF_OUTPUT = 0.1  # of an output's standard deviation: what C x may leave of it
-ROUNDING = 1e-6  # the same, below which an entry of C is none
-# What is assumed at least: of the flow's error in standard deviations of the states, and of measurement noise in those
-# of the outputs. A filter that trusts its model wholly stops listening.
-LEAST_ERROR, LEAST_NOISE = 1e-3, 1e-4
+# What C x leaves of an output is noise, unless it is nearly all, or squares of states explain a part of it.
+UNTOLD, SQUARES = 0.7, 0.8  # of the output's standard deviation, and of what is left
+LITTLE = 0.1  # of that standard deviation: less is taken for noise in any case
+ROUNDING = 1e-6  # of an output's size: below it an entry of C, or what is left, is rounding
+OUTLIER = 6.0  # standard deviations of what is left, by its median
+# What is assumed at least: of the flow's error in parts of what states change by over a sample, and of measurement
+# noise in standard deviations of the outputs. A filter that trusts its model wholly stops listening.
+LEAST_ERROR, LEAST_NOISE = 0.01, 1e-4
 WINDOW = 10  # samples at least over which innovations are averaged
 
 
@@ -42,7 +46,7 @@ def learn_recorded_tracking(
     :func:`training.evaluation.tracking.learn_tracking` has it.
 
     A tracker compares each sample with what it expects. So the measured signals have to be among the hidden ones, or
-    be sums of them.
+    be sums of them; an artifact that says so already, by its C, is taken at its word.
 
     Parameters
     ----------
@@ -71,14 +75,18 @@ def learn_recorded_tracking(
     ------
     ValueError
         If the observer was not learned from recorded states or has no error bars, a measured signal is no sum of hidden
-        ones, the records are of other signals or without states, nothing was held out, or too little to calibrate on.
+        ones or its zero is arbitrary, the records are not those of the training or without states, nothing was held
+        out, or too little to calibrate on.
     """
-    artifact = dataclasses.replace(artifact, flow=None, C=None, h=None)
+    integer("steps", steps, 1)
+    integer("seed", seed, 0)
+    artifact = dataclasses.replace(artifact, flow=None)
     artifact.require_spread()
     train, others = parted(artifact, records, held_out)
+    check_trackable(config_of(artifact))
     rng = generator(Stream.CALIBRATION, seed, 11)
     torch.manual_seed(seed)
-    C, least_measurement_noise = linear_output(train)
+    C, least_measurement_noise = linear_output(train, artifact.C)
     with progress_bars(console) as progress:
         learned, judged = (increments_of(artifact, part, rng) for part in (train, others))
         low, high = learned.x.min(0), learned.x.max(0)
@@ -102,7 +110,8 @@ def learn_recorded_tracking(
         runs = stretches(artifact, others)
         regions = regions_of(artifact, runs, rate)
         ones = Factors(np.array(LEVELS), regions.knots * artifact.filter.dt, np.ones(regions.tables))
-        flow = dataclasses.replace(flow, error=np.maximum(usual_error(flow, judged), LEAST_ERROR), factors=ones)
+        least = LEAST_ERROR * np.sqrt(np.mean((learned.change / learned.x_scale) ** 2, axis=0))
+        flow = dataclasses.replace(flow, error=np.maximum(usual_error(flow, judged), least), factors=ones)
         tracking = dataclasses.replace(artifact, C=C, flow=flow)
         with progress.phase("calibrating the error bars") as report:
             factors = told_apart(tracking, runs, regions, rng=rng, lenient=True, report=report)
@@ -141,7 +150,9 @@ def increments_of(artifact: Artifact, records: Sequence[Record], rng: np.random.
     x, u, change = (np.concatenate(each) for each in zip(*found)) if found else (np.zeros((0, 1)),) * 3
     known = np.flatnonzero(np.isfinite(x + change).all(-1))
     if not len(known):
-        raise ValueError("no two samples in a row have all hidden signals; record more")
+        raise ValueError(
+            "no two samples in a row have all hidden signals: record these at each sample, or train with a larger dt"
+        )
     if len(known) > PAIRS:
         known = rng.choice(known, PAIRS, replace=False)
     x, u, change = x[known], u[known], change[known]
@@ -149,41 +160,90 @@ def increments_of(artifact: Artifact, records: Sequence[Record], rng: np.random.
     return Increments(x, u, change, x.mean(0), np.where(scale > 0, scale, 1.0))
 
 
-def linear_output(records: Sequence[Record]) -> tuple[np.ndarray, np.ndarray]:
+def check_trackable(config: RecordedConfig) -> None:
+    """See that an observer that is learned so can be taught to track.
+
+    Parameters
+    ----------
+    config : RecordedConfig
+        Of its training.
+
+    Raises
+    ------
+    ValueError
+        If it cannot.
+    """
+    if config.arbitrary_zero:
+        raise ValueError(
+            f"an observer that tracks compares {', '.join(config.arbitrary_zero)} with what it expects, and cannot do "
+            "without its zero: learn one without arbitrary_zero"
+        )
+
+
+def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find C with y = C x.
 
     Parameters
     ----------
     records : sequence of Record
         With states.
+    known : ndarray, shape (ny, nx), optional
+        C, where it is known already.
 
     Returns
     -------
     C : ndarray, shape (ny, nx)
         Entries that are rounding are 0.
     left : ndarray, shape (ny,)
-        What is assumed of the noise of outputs at least: the root mean square of y - C x, which is noise of the
+        What is assumed of the noise of outputs at least: what is usually left of y - C x, which is noise of the
         records, or a ten-thousandth of the output's standard deviation.
 
     Raises
     ------
     ValueError
-        If more is left of an output than noise would be.
+        If what is left of an output is not noise, or states and outputs are never known together.
     """
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
-    known = np.isfinite(np.column_stack([x, y])).all(-1)
-    x, y = x[known], y[known]
-    size, scale = np.sqrt(np.mean(x**2, 0)), np.sqrt(np.mean(y**2, 0))
+    both = np.isfinite(np.column_stack([x, y])).all(-1)
+    if not both.any():
+        raise ValueError("no sample has all measured and all hidden signals; record them together")
+    x, y = x[both], y[both]
+    scale = np.sqrt(np.mean(y**2, 0))
+    C, left = _fitted(x, y, scale) if known is None else (known, _usual(y - x @ known.T))
+    moves = y.std(0)
+    least = np.maximum(left, LEAST_NOISE * np.where(moves > ROUNDING * scale, moves, np.where(scale > 0, scale, 1.0)))
+    if known is None:
+        i, j = np.triu_indices(x.shape[1])
+        _, unexplained = _fitted(np.column_stack([x, x[:, i] * x[:, j], np.ones(len(x))]), y, scale)
+        much = left > np.maximum(LITTLE * moves, ROUNDING * scale)
+        wrong = much & ((left > UNTOLD * moves) | (unexplained < SQUARES * left))
+        signals = records[0].signals
+        if other := [name for name, bad in zip(signals.measured, wrong) if bad]:
+            raise ValueError(
+                f"{', '.join(other)} cannot be told as a sum of {', '.join(signals.hidden)} without an offset, and an "
+                "observer that tracks compares its samples with that: train one with what is measured, in the same "
+                "units, among the hidden signals"
+            )
+    return C, least
+
+
+def _fitted(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """C of a fit that leaves outliers out, and what is usually left, (ny,)."""
+    size = np.sqrt(np.mean(x**2, 0))
     size, scale = np.where(size > 0, size, 1.0), np.where(scale > 0, scale, 1.0)
-    C = np.linalg.lstsq(x / size, y / scale, rcond=1e-9)[0].T
-    C = np.where(np.abs(C) > ROUNDING, C, 0.0) * scale[:, None] / size
-    left, moves, signals = np.sqrt(np.mean((y - x @ C.T) ** 2, 0)), y.std(0), records[0].signals
-    if other := [name for name, rest, of in zip(signals.measured, left, moves) if rest > OF_OUTPUT * of]:
-        raise ValueError(
-            f"{', '.join(other)} cannot be told from {', '.join(signals.hidden)}, and an observer that tracks compares "
-            "its samples with that: train one that estimates what is measured too, with it among the hidden signals"
-        )
-    return C, np.maximum(left, LEAST_NOISE * moves)
+    kept = np.ones(len(x), dtype=bool)
+    for _ in range(4):
+        C = np.linalg.lstsq(x[kept] / size, y[kept] / scale, rcond=1e-9)[0].T
+        C = np.where(np.abs(C) > ROUNDING, C, 0.0) * scale[:, None] / size
+        apart = y - x @ C.T
+        usual = _usual(apart)
+        kept = (np.abs(apart) <= np.maximum(OUTLIER * usual, ROUNDING * scale)).all(-1)
+    return C, usual
 
 
-__all__ = ["increments_of", "learn_recorded_tracking", "linear_output"]
+def _usual(apart: np.ndarray) -> np.ndarray:
+    """Standard deviations of noise (n, ny), from medians: outliers do not count."""
+    return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))
+
+
+__all__ = ["check_trackable", "increments_of", "learn_recorded_tracking", "linear_output"]

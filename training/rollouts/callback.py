@@ -4,6 +4,7 @@ import math
 import os
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -31,7 +32,6 @@ from training.rollouts.gathering import Gathering
 
 QUICK = {"members": 1, "inverse_steps": 1000}  # a refit comes again and again
 QUICK_ERROR_BARS, QUICK_FLOW = 1000, 5000  # batches
-CALIBRATED_ON = 100  # samples at least that are held out, where there are error bars
 
 
 @dataclass(frozen=True)
@@ -179,6 +179,10 @@ class KKLTrainingCallback(BaseCallback):
                 "learn one by training.learn, or by kkl-gym record and kkl-gym train"
             )
         config = config_of(artifact, {**QUICK, **self._settings})
+        if artifact.inverse.spread is not None and not config.held_out:
+            raise ValueError(
+                "error bars are calibrated on episodes that are held out: held_out must be positive, got 0"
+            )
         for observer in used:
             check_replacement(artifact, observer.artifact)
             level = observer.measurement_noise
@@ -192,8 +196,9 @@ class KKLTrainingCallback(BaseCallback):
         else:
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config
-        # Where outputs are recorded without the noise that the observer sees, it is judged with that noise.
-        self._level = 0.0 if self._outputs == "y" else used[0].measurement_noise
+        # An observer that tracks is judged under the noise that it sees, where outputs are recorded without.
+        seen = self._outputs != "y" and artifact.flow is not None
+        self._level = used[0].measurement_noise if seen else 0.0
 
     def _on_training_start(self) -> None:
         for row in range(self.training_env.num_envs):
@@ -219,8 +224,7 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         train, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        enough = self.artifact.inverse.spread is None or sum(len(record.t) for record in held_out) >= CALIBRATED_ON
-        if enough and any(record.duration >= memory for record in train):
+        if any(record.duration >= memory for record in train):
             self._refit(train, held_out)
 
     def _rehearse(self) -> None:
@@ -255,10 +259,14 @@ class KKLTrainingCallback(BaseCallback):
         ):  # the agent's random numbers stay its own
             config = replace(self._config, held_out=0.0)
             new = train_recorded(train, config, Path(folder) / "refit", name=old.system).artifact
-            if old.inverse.spread is not None:
-                new = learn_recorded_error_bars(new, train, held_out, steps=QUICK_ERROR_BARS)
-            if old.flow is not None:
-                new = learn_recorded_tracking(new, train, held_out, steps=QUICK_FLOW)
+            try:
+                if old.inverse.spread is not None:
+                    new = learn_recorded_error_bars(new, train, held_out, steps=QUICK_ERROR_BARS)
+                if old.flow is not None:
+                    new = learn_recorded_tracking(replace(new, C=old.C), train, held_out, steps=QUICK_FLOW)
+            except ValueError as error:  # as of too little that is held out so far
+                warnings.warn(f"the observer in use stays: {error}", stacklevel=2)
+                return
         errors = recorded_errors(new, held_out, measurement_noise=self._level)
         before = _together(recorded_errors(old, held_out, measurement_noise=self._level))
         after = _together(errors)

@@ -9,9 +9,11 @@ import numpy as np
 from rich.console import Console
 
 from observers import Artifact
+from observers.checks import flag
 from training.jobs import refuse_checkpoints
 from training.progress import ProgressBars, progress_bars
 from training.recorded.config import RecordedConfig, recorded_config
+from training.recorded.preparing import split
 from training.rollouts.playing import make, roll_out
 from training.rollouts.policies import RANDOM, Policy, policy_of
 
@@ -69,14 +71,19 @@ def learn(
         If an argument makes no sense, or as :func:`training.recorded.fit.train_recorded` and, with ``tracking``,
         :func:`training.recorded.tracking.learn_recorded_tracking`.
     """
-    from training.recorded.errorbars import learn_recorded_error_bars  # torch takes seconds to import
+    from training.recorded.calibrating import require_enough  # torch takes seconds to import
+    from training.recorded.errorbars import learn_recorded_error_bars
     from training.recorded.fit import train_recorded
-    from training.recorded.tracking import learn_recorded_tracking, linear_output
+    from training.recorded.tracking import check_trackable, learn_recorded_tracking, linear_output
 
     if episodes is None and steps is None:
         steps = 100_000
     settings = {"seed": seed} | settings
-    _check(hidden, settings, None if out is None else Path(out))
+    checked = _check(hidden, settings, None if out is None else Path(out))
+    if flag("tracking", tracking):
+        check_trackable(checked)
+        if not checked.held_out:
+            raise ValueError("error bars are calibrated on what is held out: held_out must be positive, got 0")
     with tempfile.TemporaryDirectory() as scratch, progress_bars(console) as progress:
         folder = Path(scratch) / "run" if out is None else Path(out)
         playing = progress.phase(f"playing {env_id}", steps or episodes or 1)
@@ -92,11 +99,14 @@ def learn(
                 report=report,
             )
         records = rollouts.records()
-        if tracking:
-            linear_output(records)  # an error now, not after minutes
+        if tracking:  # an error now, not after minutes
+            linear_output(records)
+            require_enough(split(records, checked.held_out, checked.seed)[1])
         config = recorded_config(records, settings)
         name = (rollouts.environment or {})["id"].replace("/", "-")
         artifact = train_recorded(records, config, folder, name=name, console=progress).artifact
+        if out is not None:
+            artifact.save(folder / f"{name}.safetensors")  # before anything else may fail
         if tracking:
             artifact = learn_recorded_error_bars(artifact, records, seed=seed, console=progress)
             artifact = learn_recorded_tracking(artifact, records, seed=seed, console=progress)
@@ -105,14 +115,15 @@ def learn(
     return artifact
 
 
-def _check(hidden: Sequence[str | int], settings: Mapping[str, Any], out: Path | None) -> None:
-    """What would be an error after all was played is one before."""
+def _check(hidden: Sequence[str | int], settings: Mapping[str, Any], out: Path | None) -> RecordedConfig:
+    """What would be an error after all was played is one before; settings that rollouts decide are not right yet."""
     if not np.size(hidden):
         raise ValueError("say which signals are hidden, which the observer is to estimate, as in hidden=[2]")
     chosen_later: dict[str, Any] = {"eigenvalues": (-1.0,), "dt": 1.0, "measurement_noise_max": 1.0}
-    RecordedConfig(**chosen_later | {name: value for name, value in settings.items() if value is not None})
+    config = RecordedConfig(**chosen_later | {name: value for name, value in settings.items() if value is not None})
     if out is not None:
         refuse_checkpoints(out)
+    return config
 
 
 __all__ = ["learn"]

@@ -15,6 +15,7 @@ from training.commands.data import DataOptions
 from training.commands.errorbars import ErrorBars
 from training.commands.tracking import Tracking
 from training.maps.regions import chi_square, squared_distance
+from training.recorded.calibrating import parted
 from training.recorded.config import recorded_config
 from training.recorded.errorbars import learn_recorded_error_bars
 from training.recorded.fit import train_recorded
@@ -116,9 +117,45 @@ def test_outputs_are_sums_of_states_or_an_error(records):
     C, least = linear_output([noisy])
     np.testing.assert_allclose(C, [[1.0, 0.0]], atol=2e-3)
     assert least == pytest.approx(0.01, rel=0.1)
-    for other in (run.y**2, run.y + 3.0):
-        with pytest.raises(ValueError, match=r"position cannot be told from position, speed.*among the hidden"):
+    loud = replace(run, y=run.y + 0.3 * rng.standard_normal(run.y.shape))
+    loud.y[5] = 1e3  # and one sample is wrong
+    C, least = linear_output([loud])
+    np.testing.assert_allclose(C, [[1.0, 0.0]], atol=0.05)
+    assert least == pytest.approx(0.3, rel=0.1)
+    for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
+        with pytest.raises(ValueError, match=r"position cannot be told as a sum of position, speed"):
             linear_output([replace(run, y=other)])
+    early = np.arange(600)[:, None] < 300
+    apart = replace(run, x=np.where(early, run.x, np.nan), y=np.where(early, np.nan, run.y))
+    with pytest.raises(ValueError, match=r"no sample has all measured and all hidden signals"):
+        linear_output([apart])
+
+
+def test_an_output_that_stands_still(records):
+    for size in (0.0, 2.0):
+        still = replace(
+            records[0], y=np.full((600, 1), size), x=np.hstack([records[0].x[:, :1], np.full((600, 1), size)])
+        )
+        C, least = linear_output([still])
+        assert least[0] > 0
+        np.testing.assert_allclose(still.x @ C.T, still.y, atol=1e-9)
+
+
+def test_records_are_those_of_the_training(plain, records):
+    """What was held out hangs on the order, and only that says how large errors are."""
+    expected, found = (parted(plain, order, None) for order in (records, records[::-1]))
+    for one, other in zip(expected, found, strict=True):
+        assert [record.name for record in one] == [record.name for record in other]
+    with pytest.raises(ValueError, match=r"run7.csv, run8.csv, run9.csv is missing.*name the records of the training"):
+        parted(plain, records[:7], None)
+    with pytest.raises(ValueError, match=r"run11.csv was not there"):
+        parted(plain, [*records, both(11)], None)
+    with pytest.raises(ValueError, match=r"run0.csv has changed"):
+        parted(plain, [replace(records[0], y=2 * records[0].y), *records[1:]], None)
+    with pytest.raises(ValueError, match=r"run0.csv is of \{'id': 'Osc-v0'.*, the observer of None"):
+        parted(plain, [replace(record, environment={"id": "Osc-v0", "kwargs": {}}) for record in records], None)
+    with pytest.raises(ValueError, match=r"steps of 50 s do not fit dt = 0.05 s; is the time in seconds"):
+        parted(plain, [replace(record, t=1000 * record.t) for record in records], None)
 
 
 def test_what_is_refused(plain, barred, tracking, records, tmp_path):
@@ -135,10 +172,17 @@ def test_what_is_refused(plain, barred, tracking, records, tmp_path):
     with pytest.raises(ValueError, match=r"there is no record"):
         learn_recorded_tracking(barred, [])
     greedy = replace(plain, training={**plain.training, "held_out": 0.0})
-    with pytest.raises(ValueError, match=r"no record was held out.*--held-out 0.2"):
+    with pytest.raises(ValueError, match=r"no record was held out.*held-out 0.2"):
         learn_recorded_error_bars(greedy, records)
-    with pytest.raises(ValueError, match=r"19 samples to begin at, too few"):
+    with pytest.raises(ValueError, match=r"19 samples with states to begin at, too few"):
         learn_recorded_error_bars(plain, records[:1], [both(7, n=20)], steps=1)
+    for teach, start in ((learn_recorded_error_bars, plain), (learn_recorded_tracking, barred)):
+        for wrong, said in (({"steps": 0}, "steps must be"), ({"seed": -1}, "seed must be"), ({"steps": 2.5}, "steps")):
+            with pytest.raises(ValueError, match=said):
+                teach(start, records, **wrong)
+    zeroed = replace(barred, training={**barred.training, "arbitrary_zero": ("position",)})
+    with pytest.raises(ValueError, match=r"compares position with what it expects.*without arbitrary_zero"):
+        learn_recorded_tracking(zeroed, records)
     with pytest.raises(ValueError, match="was not learned from recorded states"):
         learn_recorded_error_bars(replace(plain, training={}), records)
 

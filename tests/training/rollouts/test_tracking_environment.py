@@ -47,7 +47,7 @@ def test_one_call_makes_it(path):
 
 
 def test_a_signal_that_says_nothing_of_what_is_measured():
-    with pytest.raises(ValueError, match=r"obs\[1\] cannot be told from obs\[0\], obs\[2\]"):
+    with pytest.raises(ValueError, match=r"obs\[1\] cannot be told as a sum of obs\[0\], obs\[2\]"):
         training.learn("Pendulum-v1", measured=[0, 1], hidden=[0, 2], steps=600, tracking=True, **FIT)
 
 
@@ -63,6 +63,28 @@ def test_a_start_that_is_known(path):
     )
     with pytest.raises(ValueError, match=r"does not show obs\[0\], obs\[1\], obs\[2\] at its reset"):
         KKLObservation(blanked, path, known_start=True).reset()
+
+
+def test_what_is_refused_before_anything_is_played():
+    asked = {"measured": [0, 1], "hidden": [0, 1, 2], **FIT}
+    for wrong, said in (
+        ({"tracking": "no"}, "tracking must be"),
+        ({"tracking": True, "held_out": 0.0}, "held_out must be positive"),
+        ({"tracking": True, "arbitrary_zero": ("obs[0]",)}, "cannot do without its zero"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            training.learn("NoSuch-v0", **asked, **wrong)
+    with pytest.raises(ValueError, match="too few to calibrate error bars on"):
+        training.learn("Pendulum-v1", steps=150, tracking=True, **asked)
+
+
+def test_a_refit_without_enough_held_out_is_left_out(path):
+    env = make_vec_env(lambda: KKLObservation(gym.make("Pendulum-v1"), path), 1, seed=0)
+    model = PPO("MlpPolicy", env, seed=0, n_steps=220, batch_size=220, n_epochs=1, device="cpu")
+    with pytest.warns(UserWarning, match=r"the observer in use stays: what was held out has \d+ samples"):
+        model.learn(440, KKLTrainingCallback(220))
+    with pytest.raises(ValueError, match="held_out must be positive"):
+        model.learn(10, KKLTrainingCallback(220, held_out=0.0))
 
 
 def test_an_observer_is_taught_again(path):
