@@ -44,6 +44,14 @@ def test_any_environment(capsys):
 
 
 @pytest.mark.slow
+def test_any_environment_under_noise(capsys):
+    found = example("any_environment")("CartPole-v1", steps=10_000, held_out=500, batches=500, noise=0.05)
+    assert found["truth"] == 500
+    assert found["tracked"] > found["T_inv alone"] + 20
+    assert "rms errors" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 def test_any_environment_agent(capsys):
     small = {"random_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
     found = example("any_environment_agent")(**small)
