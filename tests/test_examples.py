@@ -125,6 +125,7 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
         assert [make.close() for make in (env, envs)] == [None, None]
 
 
+@pytest.mark.slow
 def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)

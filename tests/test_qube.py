@@ -155,6 +155,7 @@ def test_released_motions_are_recorded_as_the_device_records():
     assert np.ptp([record.y[0, 0] for record in records]) > QUBE["TURNED"]
 
 
+@pytest.mark.slow
 def test_on_runs_of_its_own_model(tmp_path, capsys, monkeypatch):
     for setting, small in {"windows": 500, "samples": 10, "members": 1, "width": 16}.items():
         monkeypatch.setitem(QUBE["SETTINGS"], setting, small)

@@ -145,6 +145,7 @@ def test_the_noise_of_records():
     assert noise_level(records(VanDerPol(), 4, seconds=10, noise=0.2)) == pytest.approx(0.2, rel=0.1)
 
 
+@pytest.mark.slow
 def test_identified_and_adapted_observers(tmp_path):
     plant = VanDerPol(3.3)
     measured = records(plant, 6, seconds=12, noise=0.05)

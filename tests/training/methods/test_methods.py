@@ -96,6 +96,7 @@ def test_node_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     assert rate == pytest.approx(slowest, rel=0.1)
 
 
+@pytest.mark.slow
 def test_dmf_converges_at_the_rate_of_its_slowest_eigenvalue(tmp_path):
     method, system, arrays, dt = trained_on_oscillator("dmf", tmp_path, configuration=1, steps=400)
     for stage in ("transient", "asymptotic"):
@@ -158,6 +159,7 @@ def test_node_filter_is_the_one_it_was_trained_with(tmp_path):
     np.testing.assert_allclose(seen["late"], linear.late_y, rtol=1e-2)
 
 
+@pytest.mark.slow
 def test_gru_learns_and_steps_as_it_was_trained(tmp_path):
     method, system, arrays, dt = trained_on_oscillator("gru", tmp_path, steps=200)
     x = oscillations(dt)

@@ -14,7 +14,10 @@ from observers import Artifact, ArtifactError, KKLObserver
 from training.commands.data import DataOptions
 from training.commands.errorbars import ErrorBars
 from training.commands.tracking import Tracking
+from training.maps import regions, spread
 from training.maps.regions import chi_square, squared_distance
+from training.recorded import calibrating
+from training.recorded import tracking as tracking_module
 from training.recorded.calibrating import parted
 from training.recorded.config import recorded_config
 from training.recorded.errorbars import learn_recorded_error_bars
@@ -33,6 +36,15 @@ def both(seed, n=600):
     return replace(
         run, x=np.hstack([run.y, run.x]), signals=replace(run.signals, hidden=("position", "speed")), t=run.t
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_levels():
+    """At which factors are found."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (calibrating, tracking_module, regions, spread):
+            patch.setattr(module, "LEVELS", (0.0, 0.5, 1.0))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -82,7 +82,7 @@ def test_a_refit_without_enough_held_out_is_left_out(path):
     env = make_vec_env(lambda: KKLObservation(gym.make("Pendulum-v1"), path), 1, seed=0)
     model = PPO("MlpPolicy", env, seed=0, n_steps=220, batch_size=220, n_epochs=1, device="cpu")
     with pytest.warns(UserWarning, match=r"the observer in use stays: what was held out has \d+ samples"):
-        model.learn(440, KKLTrainingCallback(220))
+        model.learn(440, KKLTrainingCallback(220, inverse_steps=20))
     with pytest.raises(ValueError, match="held_out must be positive"):
         model.learn(10, KKLTrainingCallback(220, held_out=0.0))
 
@@ -91,7 +91,7 @@ def test_an_observer_is_taught_again(path):
     first, told = Artifact.read(path), []
     env = make_vec_env(lambda: KKLObservation(gym.make("Pendulum-v1"), path), 4, seed=0)
     model = PPO("MlpPolicy", env, seed=0, n_steps=64, batch_size=256, n_epochs=1, device="cpu")
-    model.learn(1300, KKLTrainingCallback(1200, on_refit=told.append))
+    model.learn(1300, KKLTrainingCallback(1200, on_refit=told.append, inverse_steps=50))
     (refit,) = told
     assert refit.artifact.flow is not None
     assert refit.artifact.inverse.spread is not None
