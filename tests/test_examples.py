@@ -88,6 +88,7 @@ def test_the_system_on_the_page_is_that_of_the_example():
         assert getattr(own, attribute) == getattr(known, attribute), attribute
 
 
+@pytest.mark.slow
 def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
@@ -139,6 +140,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
     assert "wrote runs/balance/cart_pole.safetensors" in capsys.readouterr().out.replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_cart_pole(tmp_path, capsys):
     errors = example("cart_pole")(inverse_steps=1000, trajectories=200, out=tmp_path)
     assert (errors < 0.15).all()

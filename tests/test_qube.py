@@ -97,6 +97,7 @@ def test_parameters_are_found_again(tmp_path):
 STICKS = QUBE["Sticking"](**{name: getattr(MODEL, name) for name in QUBE["GUESSES"]})
 
 
+@pytest.mark.slow
 def test_parameters_of_an_arm_that_sticks_are_found_again(tmp_path):
     write_runs(tmp_path, STICKS)
     found = QUBE["fitted"](QUBE["read"](tmp_path, (1, 2, 4, 5)), QUBE["Sticking"]()).parameters

@@ -635,6 +635,7 @@ def test_drawing_leaves_the_users_matplotlib_alone(monkeypatch):
     assert len(heatmap(few, methods, note="").axes) == 7
 
 
+@pytest.mark.slow
 def test_a_report_says_which_observers_are_missing(tmp_path):
     one = pd.read_csv(RESULTS / "benchmark" / "methods.csv").iloc[:1]
     every = [one.assign(system=system, method=method) for system in SYSTEMS for method in METHODS]

@@ -106,6 +106,7 @@ def test_standard_errors_cover_the_truth(tmp_path):
     assert 0.4 < np.std(off) < 1.8
 
 
+@pytest.mark.slow
 def test_what_duffings_output_does_not_tell(tmp_path):
     got = found(ReverseDuffing(), {"a": 1.4, "b": 1.3}, records(ReverseDuffing(), 8, seconds=12), tmp_path, steps=150)
     assert got.to_json() == {name: {"value": None, "standard_error": None} for name in "ab"}
