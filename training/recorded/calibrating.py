@@ -124,7 +124,6 @@ def stretches(artifact: Artifact, records: Sequence[Record]) -> Stretches:
     ValueError
         If there are too few samples to begin at.
     """
-    require_enough(records)
     whole, owner, first = _begins(records)
     memory = artifact.inverse.age_max / artifact.filter.dt
     steps = max(2, min(round(MEMORIES * memory), max(len(piece.t) for piece in whole) - 1))
@@ -157,20 +156,21 @@ def require_enough(records: Sequence[Record]) -> None:
     ValueError
         If there are too few samples to begin at.
     """
-    count = len(_begins(records)[1])
-    if count < FEWEST:
-        raise ValueError(
-            f"what was held out has {count} samples with states to begin at, too few to calibrate error bars on "
-            f"({FEWEST}): record more, or hold more out"
-        )
+    _begins(records)
 
 
 def _begins(records: Sequence[Record]) -> tuple[list[Record], np.ndarray, np.ndarray]:
-    """Records without gaps, and the samples that stretches may begin at: of which of them, and which."""
+    """Records without gaps, and the samples that stretches may begin at, of which of them; ValueError if too few."""
     whole = [piece for piece in pieces(records) if piece.x is not None and len(piece.t) > 2]
-    if not whole:
-        return [], np.zeros(0, int), np.zeros(0, int)
-    return whole, *samples_as_old([piece.part(slice(None, -1)) for piece in whole], 0)
+    owner = first = np.zeros(0, int)
+    if whole:
+        owner, first = samples_as_old([piece.part(slice(None, -1)) for piece in whole], 0)
+    if len(owner) < FEWEST:
+        raise ValueError(
+            f"what was held out has {len(owner)} samples with states to begin at, too few to calibrate error bars on "
+            f"({FEWEST}): record more, or hold more out"
+        )
+    return whole, owner, first
 
 
 def regions_of(artifact: Artifact, runs: Stretches, rate: float) -> Regions:
@@ -178,7 +178,7 @@ def regions_of(artifact: Artifact, runs: Stretches, rate: float) -> Regions:
     return Regions.of(artifact, runs.steps * artifact.filter.dt, pace=1 / rate)
 
 
-def told_apart(
+def factors_along(
     artifact: Artifact,
     runs: Stretches,
     regions: Regions,
@@ -224,4 +224,4 @@ def told_apart(
     return regions.factors(distances, np.isfinite(runs.x[regions.ages]).all(-1), lenient=lenient)
 
 
-__all__ = ["Stretches", "parted", "regions_of", "require_enough", "stretches", "told_apart"]
+__all__ = ["Stretches", "factors_along", "parted", "regions_of", "require_enough", "stretches"]

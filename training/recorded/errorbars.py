@@ -10,7 +10,7 @@ from observers import Artifact
 from observers.checks import integer
 from training.maps.spread import with_spread
 from training.progress import ProgressBars, progress_bars
-from training.recorded.calibrating import parted, regions_of, stretches, told_apart
+from training.recorded.calibrating import factors_along, parted, regions_of, stretches
 from training.recorded.config import config_of, signal_rate
 from training.recorded.fit import sampler_of
 from training.records import Record
@@ -84,7 +84,7 @@ def learn_recorded_error_bars(
         learned = dataclasses.replace(artifact, inverse=inverse)
         with progress.phase("calibrating the error bars") as report:
             rng = generator(Stream.CALIBRATION, seed, 10)
-            factors = told_apart(learned, runs, regions, rng=rng, report=report)
+            factors = factors_along(learned, runs, regions, rng=rng, report=report)
     assert inverse.spread is not None
     spread = dataclasses.replace(inverse.spread, factors=factors)
     return dataclasses.replace(learned, inverse=dataclasses.replace(inverse, spread=spread))
