@@ -121,13 +121,13 @@ HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 LunarLander-v3 Invert
 	InvertedDoublePendulum-v5 Reacher-v5 Hopper-v5 HalfCheetah-v5
 
 environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
-	$(BIN)/kkl-gym agent compare $(HIDDEN) --aggregate 4
+	$(BIN)/kkl-gym agent compare $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
 	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 --information state x_hat z stacked recurrent \
 		--aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
-	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --aggregate 4 --seeds 10 \
+	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
 	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
 	$(MAKE) figures

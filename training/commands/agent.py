@@ -74,7 +74,9 @@ class Train:
     """Go on from the checkpoint in the run's folder, if there is one. The agent is another than without a stop."""
     threads: int = 1
     """CPU threads of the networks."""
-    observer_steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: a tenth of all)")] = None
+    observer_steps: Annotated[
+        int | None, tyro.conf.arg(help_behavior_hint="(default: nine tenths of all, under noise one tenth)")
+    ] = None
     """First steps of an agent in an environment from which its observer is learned, where none is named. Without noise
     the agent learns from them too: it is told the truth where estimates will be. Under noise actions are random."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from observers import Artifact
-from observers.checks import shown
 from training.maps.regions import FEWEST, LEVELS, Regions, distances_along, level_of
 from training.recorded.config import config_of
-from training.recorded.preparing import file_of, fingerprints, split
+from training.recorded.preparing import check_plant, file_of, fingerprints, split
 from training.recorded.windows import samples_as_old
 from training.records import Record, check_dt, check_signals, pieces, resampled
 
@@ -45,16 +44,7 @@ def parted(
     """
     config = config_of(artifact)
     check_signals([*records, *(held_out or ())])
-    signals, names = records[0].signals, artifact.signals or {}
-    if records[0].x is None:
-        raise ValueError("no hidden states were recorded; name their columns (--hidden)")
-    for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
-        if (here := getattr(signals, role)) != (there := tuple(names[role])):
-            raise ValueError(f"{records[0].name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")
-    if records[0].environment != artifact.environment:
-        raise ValueError(
-            f"{records[0].name} is of {shown(records[0].environment)}, the observer of {shown(artifact.environment)}"
-        )
+    check_plant(artifact, records[0])
     if held_out is None:
         check_dt(records, config.dt)
         ordered = _as_trained(artifact, records)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from observers import LinearFilter
+from observers import Artifact, LinearFilter
+from observers.checks import shown
 from training.recorded.config import RecordedConfig
 from training.records import Record, Signals, jitter, median_step
 from training.seeds import Stream, generator
@@ -49,6 +50,33 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
         [record.part(slice(None, end)) for record, end in zip(records, ends)],
         [record.part(slice(end, None)) for record, end in zip(records, ends)],
     )
+
+
+def check_plant(artifact: Artifact, record: Record) -> None:
+    """Raise ValueError unless a record is of an observer's environment and signals, states among them.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer, from recorded states.
+    record : Record
+        Of the plant, perhaps.
+
+    Raises
+    ------
+    ValueError
+        If it is not.
+    """
+    signals, names = record.signals, artifact.signals or {}
+    if record.x is None:
+        raise ValueError(f"{record.name}: no hidden states were recorded; name their columns (--hidden)")
+    for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
+        if (here := getattr(signals, role)) != (there := tuple(names[role])):
+            raise ValueError(f"{record.name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")
+    if record.environment != artifact.environment:
+        raise ValueError(
+            f"{record.name} is of {shown(record.environment)}, the observer of {shown(artifact.environment)}"
+        )
 
 
 def fingerprints(records: Sequence[Record]) -> dict[str, str]:

@@ -5,7 +5,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,6 +89,10 @@ class KKLTrainingCallback(BaseCallback):
         Steps before the first one; by default ``every``.
     keep : int, default 100_000
         Steps that are kept; older ones are forgotten.
+    records : sequence of training.records.Record, optional
+        Episodes from before, the oldest first, such as those that the observer was learned from
+        (``training.records.read_records(["minari:pendulum/agent-v0"])``). They are kept beside the agent's own, and
+        none of them is held out.
     rehearsal : int, default 0
         Further steps at the end of each call of ``learn``, in which the agent acts without exploration, as it will when
         it is used, and which end in a last refit. An agent that explores goes elsewhere.
@@ -144,6 +148,7 @@ class KKLTrainingCallback(BaseCallback):
         *,
         first: int | None = None,
         keep: int = 100_000,
+        records: Sequence[Record] = (),
         rehearsal: int = 0,
         outputs: str = "y",
         path: str | os.PathLike[str] | None = None,
@@ -155,6 +160,7 @@ class KKLTrainingCallback(BaseCallback):
         self._every = integer("every", every, 1)
         self._next = self._every if first is None else integer("first", first, 1)
         self._keep, self._outputs = integer("keep", keep, 1), outputs
+        self._before = tuple(records)
         self._rehearsal = integer("rehearsal", rehearsal, 0)
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
             raise ValueError(f"path must end in .safetensors, got {shown(path)}")
@@ -192,7 +198,9 @@ class KKLTrainingCallback(BaseCallback):
                     "observer in use assumes"
                 )
         if not hasattr(self, "_gathering"):
-            self._gathering = Gathering(artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs)
+            self._gathering = Gathering(
+                artifact, keep=self._keep, held_out=config.held_out, outputs=self._outputs, before=self._before
+            )
         else:
             check_replacement(self.artifact, artifact)
         self.artifact, self._config = artifact, config

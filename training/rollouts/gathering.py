@@ -1,13 +1,14 @@
 """Episodes of several environments as they happen, kept as records."""
 
 from collections import defaultdict, deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from observers import Artifact
+from training.recorded.preparing import check_plant
 from training.records import Record, Signals
 
 LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
@@ -37,14 +38,23 @@ class Gathering:
         Share of the pieces that is held out. Each has its role for good.
     outputs : str
         What of ``info`` is recorded as outputs.
+    before : sequence of Record
+        Episodes from before, the oldest first. None of them is held out: the observer may know them.
 
     Attributes
     ----------
     steps : int
-        Steps that were taken in so far, forgotten ones included.
+        Steps that were taken in so far, forgotten ones included, without those from before.
+
+    Raises
+    ------
+    ValueError
+        If an episode from before is of other signals or another environment than the observer.
     """
 
-    def __init__(self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y") -> None:
+    def __init__(
+        self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y", before: Sequence[Record] = ()
+    ) -> None:
         signals, self._environment = artifact.signals or {}, artifact.environment or {}
         names = (tuple(signals[role]) for role in ("measured", "inputs", "hidden"))
         self._outputs = outputs
@@ -53,6 +63,9 @@ class Gathering:
         self._open = defaultdict[int, _Piece](_Piece)  # by row
         self._kept: deque[tuple[bool, Record]] = deque()
         self._total = self._made = self.steps = 0
+        for record in before:
+            check_plant(artifact, record)
+            self._take(record, held_out=False)
 
     def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
         """Take in the first sample of an episode.
@@ -144,9 +157,12 @@ class Gathering:
             source=self._environment["id"],
             environment=self._environment,
         )
-        self._kept.append((bool(self._every) and self._made % self._every == 1, record))
+        self._take(record, held_out=bool(self._every) and self._made % self._every == 1)
         self._made += 1
-        self._total += n - 1
+
+    def _take(self, record: Record, *, held_out: bool) -> None:
+        self._kept.append((held_out, record))
+        self._total += len(record.t) - 1
         while self._total > self._keep and len(self._kept) > 1:
             self._total -= len(self._kept.popleft()[1].t) - 1
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from observers import MLP, Artifact
 from observers.storage import checksum
 from training.agents.agent import AgentError
-from training.agents.any_environment import learning
+from training.agents.any_environment import learning, observing
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
 from training.agents.any_environment.information import SHOWN, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
@@ -176,6 +176,67 @@ def test_an_agent_on_estimates_is_told_the_truth_until_there_are_some(tmp_path, 
     (tmp_path / "moved.safetensors").write_bytes(content)
     with pytest.raises(ValueError, match=r"another observer|checksum|damaged"):
         player.make(observer=str(tmp_path / "moved.safetensors"))
+
+
+@pytest.mark.parametrize(
+    ("task", "algorithm", "timesteps", "aggregate", "told"),
+    [
+        (CART, "ppo", 1600, 0, 1440 + 2),  # it stops with the first step of what it would collect next
+        (CART, "ppo", 1600, 1, 1440 + 2),
+        (CART, "ppo", 1610, 1, 1472 + 2),
+        (CART, "ppo", 90, 0, 64 + 2),  # of three times 32 steps the last are with estimates
+        (PENDULUM, "sac", 800, 1, 720 + 1),
+        (replace(CART, measurement_noise=0.1), "ppo", 1600, 1, 160),
+    ],
+)
+def test_who_is_told_the_truth_how_long(tmp_path, small, monkeypatch, task, algorithm, timesteps, aggregate, told):
+    fitted = []
+
+    def noted(task, records, folder, **options):
+        fitted.extend(records)
+        raise StopIteration
+
+    monkeypatch.setattr(learning, "learn_observer", noted)
+    with pytest.raises(StopIteration):
+        learn_to_play(task, "x_hat", tmp_path, algorithm=algorithm, timesteps=timesteps, aggregate=aggregate)
+    assert sum(len(record.t) - 1 for record in fitted) == told
+
+
+def test_refits_are_to_what_the_agent_did_before_too(tmp_path, small, monkeypatch):
+    fitted, refitted = [], []
+    learned, refitting = learning.learn_observer, learning.refitting
+
+    def noted(task, records, folder, **options):
+        fitted.append(records)
+        return learned(task, records, folder, **options)
+
+    monkeypatch.setattr(learning, "learn_observer", noted)
+    monkeypatch.setattr(learning, "refitting", lambda *given: refitted.append(given[-1]) or refitting(*given))
+    learn_to_play(CART, "x_hat", tmp_path, timesteps=1000, aggregate=1)
+    assert refitted == fitted
+    assert refitted[0]
+
+
+def test_an_observer_is_learned_from_the_latest_steps(monkeypatch):
+    monkeypatch.setattr(observing, "KEPT", 100)
+    told = Told(CART)
+    envs = [told.make() for _ in range(2)]
+    for row, env in enumerate(envs):
+        env.action_space.seed(row)
+        env.reset(seed=row)
+        for _ in range(200):
+            if any(env.step(env.action_space.sample())[2:4]):
+                env.reset()
+    kept = [record.fingerprint for record in told.records()]
+    monkeypatch.setattr(observing, "KEPT", 10**6)
+    everything = told.records()
+    assert sum(len(record.t) - 1 for record in everything) == 400
+    ends = np.cumsum([len(record.t) - 1 for record in everything])
+    rows = [everything[: np.searchsorted(ends, 200) + 1], everything[np.searchsorted(ends, 200) + 1 :]]
+    for row in rows:
+        latest = [record for record in row if record.fingerprint in kept]
+        assert latest == row[-len(latest) :]
+        assert sum(len(record.t) - 1 for record in latest[1:]) < 50 <= sum(len(record.t) - 1 for record in latest)
 
 
 @pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])

@@ -247,6 +247,40 @@ def test_a_rehearsal_is_played_as_the_agent_will_act(spy, asked, monkeypatch):
     assert len(acted) == 60
 
 
+def test_episodes_from_before_are_fitted_to_as_well(spy, asked):
+    env = vector("Spy-v0", spy, n=1)
+    asked.artifact = in_use(env)[0]
+    ppo(env, 50).learn(100, KKLTrainingCallback(50, held_out=0.0))
+    before = [dataclasses.replace(record, name=f"before {i}") for i, record in enumerate(asked.found[0])]
+    given, lengths = asked.found, [len(record.t) - 1 for record in before]
+    given.clear()
+    ppo(env, 50).learn(100, KKLTrainingCallback(50, records=before))
+    assert [record.name for record in given[0] if "before" in record.name] == [record.name for record in before]
+    assert len(given[0]) > len(before)
+    given.clear()
+    told = []
+    refits = KKLTrainingCallback(50, records=before, keep=sum(lengths) + 75, on_refit=told.append)
+    ppo(env, 50).learn(150, refits)  # of those from before the oldest are forgotten
+    assert 0 < sum("before" in record.name for record in given[-1]) < len(before)
+    assert given[-1][0].name != before[0].name
+    assert [refit.steps for refit in told] == [50, 100]  # without those from before
+
+
+def test_episodes_from_before_must_be_of_the_plant(spy, asked):
+    env = vector("Spy-v0", spy, n=1)
+    asked.artifact = in_use(env)[0]
+    ppo(env, 50).learn(100, KKLTrainingCallback(50, held_out=0.0))
+    record = asked.found[0][0]
+    signals = dataclasses.replace(record.signals, measured=("obs[1]",), hidden=("obs[0]",))
+    for bad, says in [
+        (dataclasses.replace(record, signals=signals), r"measured are obs\[1\], but the observer's obs\[0\]"),
+        (dataclasses.replace(record, x=None), "no hidden states"),
+        (dataclasses.replace(record, environment={**record.environment, "id": "Other-v0"}), "Other-v0"),
+    ]:
+        with pytest.raises(ValueError, match=says):
+            ppo(env, 50).learn(100, KKLTrainingCallback(50, records=[bad]))
+
+
 def test_the_agent_keeps_its_random_numbers(spy, asked):
     env = vector("Spy-v0", spy, n=1)
     asked.artifact = in_use(env)[0]

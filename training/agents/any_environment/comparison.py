@@ -76,8 +76,9 @@ class Case:
         if self.kind == RANDOM:
             return described
         from training.agents.any_environment.learning import (
-            OBSERVER_STEPS,
             REHEARSAL,
+            TOLD,
+            WANDERED,
             algorithm_for,
             hyperparameters,
         )
@@ -91,8 +92,8 @@ class Case:
             "aggregate": 0,
         }
         if self.kind == "x_hat":
-            begins = "wanders" if self.task.measurement_noise else "told"
-            described |= {"aggregate": self.aggregate, begins: OBSERVER_STEPS, "rehearsal": REHEARSAL}
+            begins = {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
+            described |= {"aggregate": self.aggregate, **begins, "rehearsal": REHEARSAL}
         return described
 
     @property

@@ -30,6 +30,7 @@ from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
 from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
+from training.records import Record
 from training.seeds import agent_training_seed
 
 ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
@@ -43,7 +44,9 @@ ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
 }
 RECURRENT = "ppo_lstm"
 CONTINUOUS = ("sac", "td3", "tqc")  # whose actions are bounded numbers
-OBSERVER_STEPS = 0.1  # of the steps of a training, the first ones, in which there are no estimates yet
+# Of the steps of a training, the first ones, in which there are no estimates yet.
+TOLD = 0.9  # without noise: estimates come so near to the truth that what is right with the one is right with the other
+WANDERED = 0.1  # under noise
 REHEARSAL = 0.05  # of the steps, the last ones, in which it acts without exploration and learns no more
 CURVE = "curve.csv"
 _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std")  # and not of the algorithm
@@ -143,8 +146,9 @@ def learn_to_play(
     """Train one agent.
 
     Where an observer has to be learned, the agent's first steps are for both. As there are no estimates yet, the agent
-    is told the truth in their place, and the observer is learned from what happens. Under noise estimates are far from
-    the truth; these steps are then random actions, from which the observer alone is learned. They count too.
+    is told the truth in their place. The observer is learned from what happens, and the agent goes on with estimates.
+    Under noise estimates are far from the truth; these steps are then fewer, and random actions, from which the
+    observer alone is learned. They count too.
 
     Parameters
     ----------
@@ -164,8 +168,8 @@ def learn_to_play(
     observer : str, optional
         File of an observer, for x_hat; by default one is learned.
     observer_steps : int, optional
-        The agent's first steps, from which it is learned; by default a tenth of all. They end with what the algorithm
-        collects at a time.
+        The agent's first steps, from which it is learned; by default nine tenths of all, and under noise one tenth.
+        They end with what the algorithm collects at a time, and before what it collects last.
     aggregate : int
         How many times it is fitted again while the agent learns, on the agent's own steps. A twentieth of all steps,
         the last ones, is then without exploration, and followed by one more fit.
@@ -197,7 +201,8 @@ def learn_to_play(
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
     learns_observer, spent = information == "x_hat" and observer is None, 0
     if learns_observer:
-        spent = round(OBSERVER_STEPS * steps) if observer_steps is None else observer_steps
+        share = WANDERED if task.measurement_noise else TOLD
+        spent = round(share * steps) if observer_steps is None else observer_steps
         if not 0 < spent < steps - rehearsal:
             raise ValueError(
                 f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {spent}"
@@ -207,7 +212,7 @@ def learn_to_play(
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
         learned = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
-        curve, told = Curve(folder / CURVE, began=began), None
+        curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
             observer = str(learned(wander(task, spent, seed=seed, progress=bars)))
             curve.spent = spent
@@ -224,11 +229,12 @@ def learn_to_play(
                         f"the agent would never see an estimate: {name} collects {learner.steps} steps before it goes "
                         f"on; give it more than {steps} (--timesteps)"
                     )
-                observer = str(learned(told.records()))
+                before = told.records()
+                observer = str(learned(before))
                 learner.move(partial(show, task, information, observer))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
-                callbacks.append(refitting(task, aggregate, left - learner.steps, rehearsal, newest))
+                callbacks.append(refitting(task, aggregate, left - learner.steps, rehearsal, newest, before))
             with bars.phase(description, left) as report:
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model
@@ -288,9 +294,13 @@ class _Learner:
         return self.model.num_timesteps
 
     def learn(self, steps: int, callbacks: list[BaseCallback], *, until: int | None = None) -> None:
-        """Learn until there were so many steps; ``until`` stops before, at the end of what is collected at a time."""
+        """Learn until there were so many steps.
+
+        ``until`` stops before, where an algorithm begins to collect, and at the latest where it would collect for the
+        last time.
+        """
         done = self.steps
-        stop = [] if until is None else [_Until(until)]
+        stop = [] if until is None else [_Until(until, steps)]
         self.model.learn(steps - done, callback=[*callbacks, *stop], reset_num_timesteps=not done)
 
     def move(self, make: Callable[[], gym.Env[Any, Any]]) -> None:
@@ -313,14 +323,17 @@ class _Learner:
 
 
 class _Until(BaseCallback):
-    """Stops a training once there were so many steps, where an algorithm begins to collect anew."""
+    """Stops a training once there were so many steps, where an algorithm collects anew, and before the last time."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, last: int) -> None:
         super().__init__()
-        self._steps, self._over = steps, False
+        self._steps, self._last = steps, last
+        self._begun, self._over = 0, False
 
     def _on_rollout_start(self) -> None:
-        self._over = self.num_timesteps >= self._steps
+        collects = self.num_timesteps - self._begun  # as the time before
+        self._begun = self.num_timesteps
+        self._over = self.num_timesteps >= min(self._steps, self._last - collects) and self.num_timesteps > 0
 
     def _on_step(self) -> bool:
         return not self._over

@@ -26,6 +26,7 @@ HEADROOM = 1.5  # of the noise that a map is trained for over the noise that the
 # Per step, of filters under noise: more and slower modes, which average over more steps.
 MODES_UNDER_NOISE, SLOWEST_UNDER_NOISE, FASTEST_UNDER_NOISE = 8, 0.05, 1.0
 HELD_OUT = 0.2  # of the episodes
+KEPT = 100_000  # steps that an observer is learned from, the latest
 SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
@@ -55,14 +56,21 @@ class Told:
         return part_of(recorder, self._task.told(_size(env)))
 
     def records(self) -> list[Record]:
-        """Read what happened in all of them.
+        """Read what happened last in all of them.
 
         Returns
         -------
         list of Record
-            One of each episode.
+            One of each episode, of the latest that make up 100,000 steps together.
         """
-        return [record for recorder in self._recorders for record in recorder.rollouts().records()]
+        each = KEPT // len(self._recorders)
+        return [record for recorder in self._recorders for record in _latest(recorder.rollouts().records(), each)]
+
+
+def _latest(records: list[Record], steps: int) -> list[Record]:
+    """The last records, with so many steps at least if there are as many."""
+    after = np.cumsum([len(record.t) - 1 for record in records[::-1]])
+    return records[-1 - int(np.searchsorted(after, steps)) :]
 
 
 def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
@@ -141,7 +149,9 @@ def learn_observer(
     return path
 
 
-def refitting(task: HiddenTask, times: int, steps: int, rehearsal: int, path: Path) -> KKLTrainingCallback:
+def refitting(
+    task: HiddenTask, times: int, steps: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
+) -> KKLTrainingCallback:
     """Make what fits an observer again to an agent's own steps, at equal distances.
 
     Parameters
@@ -156,6 +166,8 @@ def refitting(task: HiddenTask, times: int, steps: int, rehearsal: int, path: Pa
         Steps after them in which the agent acts without exploration, for a last refit.
     path : Path
         Receives the observer in use at each time.
+    records : sequence of Record
+        What the agent did before, which it is fitted to as well.
 
     Returns
     -------
@@ -163,8 +175,9 @@ def refitting(task: HiddenTask, times: int, steps: int, rehearsal: int, path: Pa
         For the training.
     """
     outputs = CLEAN_Y if task.measurement_noise else "y"
+    every = max(1, steps // (times + 1))
     return KKLTrainingCallback(
-        max(1, steps // (times + 1)), rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
+        every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
     )
 
 
