@@ -1,9 +1,12 @@
-"""Data where the agent goes: an observer from few random steps, refitted while PPO learns to balance CartPole-v1.
+"""Data where the agent goes: PPO learns to balance CartPole-v1 on estimates, in three ways with as many steps each.
 
-Positions are measured, velocities hidden. The same agent is trained with and without the refits.
+Positions are measured, velocities hidden, but a simulator shows them in training. The observer is from random steps;
+or it is refitted while the agent learns; or the agent learns on the true velocities first, and the observer is from
+what it does then.
 """
 
 import tempfile
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -18,12 +21,26 @@ from kkl_gym import KKLObservation
 from observers import Artifact, KKLObserver
 
 ENV_ID, MEASURED, HIDDEN = "CartPole-v1", [0, 2], [1, 3]
+ORDER = MEASURED + HIDDEN  # in which KKLObservation shows them
 AFTER = 20  # steps, of which errors are left out
 
 
 def wrapped(path: Path) -> gym.Env:
     """The environment with an observer."""
     return KKLObservation(gym.make(ENV_ID), path)
+
+
+def told() -> gym.Env:
+    """The environment with the truth where estimates will be."""
+    env = gym.make(ENV_ID)
+    space = gym.spaces.Box(env.observation_space.low[ORDER], env.observation_space.high[ORDER])
+    return gym.wrappers.TransformObservation(env, lambda obs: obs[ORDER], space)
+
+
+def beginner(make: Callable[[], gym.Env], seed: int) -> PPO:
+    """An agent that has learned nothing yet."""
+    envs = make_vec_env(make, 4, seed=seed)
+    return PPO("MlpPolicy", envs, n_steps=256, batch_size=256, learning_rate=1e-3, seed=seed, device="cpu")
 
 
 def own_episodes(agent: PPO, env: gym.Env, episodes: int, seed: int) -> list[tuple[np.ndarray, ...]]:
@@ -48,7 +65,7 @@ def errors(artifact: Artifact, episodes: list[tuple[np.ndarray, ...]]) -> np.nda
 
 
 def main(
-    random_steps: int = 5_000,
+    observer_steps: int = 5_000,
     members: int = 3,
     timesteps: int = 30_000,
     every: int = 5_000,
@@ -58,43 +75,54 @@ def main(
     """Train the agents; returns the larger error of the two hidden signals on the agent's own episodes.
 
     Args:
-        random_steps: from which the first observer is learned.
+        observer_steps: from which the first observer is learned: random ones, or the trained agent's.
         members: networks of the first observer, which are averaged.
-        timesteps: of the agents.
-        every: steps from refit to refit.
+        timesteps: of the agents, beside those.
+        every: steps from refit to refit, and on estimates of an agent that learned on the truth first.
         batches: of each fit.
         seed: of everything random.
     """
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        first = training.learn(
+        learn = partial(
+            training.learn,
             ENV_ID,
             measured=MEASURED,
             hidden=HIDDEN,
-            steps=random_steps,
+            steps=observer_steps,
             inverse_steps=batches,
             members=members,
             seed=seed,
-            out=folder,
         )
-        path = Path(folder) / f"{ENV_ID}.safetensors"
-        for label, refits in (
-            ("without refits", None),
-            ("with refits", training.KKLTrainingCallback(every, inverse_steps=batches, verbose=1)),
-        ):
-            envs = make_vec_env(partial(wrapped, path), 4, seed=seed)
-            agent = PPO("MlpPolicy", envs, n_steps=256, batch_size=256, learning_rate=1e-3, seed=seed, device="cpu")
-            agent.learn(timesteps, refits)
-            env = wrapped(path)
-            if refits is not None:
-                env.replace_observer(refits.artifact)
-            episodes = own_episodes(agent, env, 20, seed + 10_000)
-            print(f"{label}: {np.mean([len(u) for _, u, _ in episodes]):.0f} steps an episode")
-            for name, artifact in (("first", first), ("newest", env.observer.artifact)):
-                error = errors(artifact, episodes)
-                print(f"  errors of the {name} observer: {', '.join(f'{value:.2%}' for value in error)}")
-            found[label] = float(error.max())
+        first, path = learn(out=f"{folder}/random"), Path(folder, "random", f"{ENV_ID}.safetensors")
+
+        fixed = beginner(partial(wrapped, path), seed).learn(timesteps)
+        found["from random steps"] = report("from random steps", fixed, {"": first}, path, seed)
+
+        refits = training.KKLTrainingCallback(every, inverse_steps=batches, verbose=1)
+        refitted = beginner(partial(wrapped, path), seed).learn(timesteps, refits)
+        observers = {"first ": first, "newest ": refits.artifact}
+        found["refitted"] = report("refitted", refitted, observers, path, seed)
+
+        agent = beginner(told, seed).learn(timesteps - every)
+        path = Path(folder, "agent", f"{ENV_ID}.safetensors")
+        after = learn(policy=lambda obs: agent.predict(obs[ORDER])[0], out=path.parent)
+        agent.set_env(make_vec_env(partial(wrapped, path), 4, seed=seed))
+        agent.learn(every, reset_num_timesteps=False)
+        found["on the truth first"] = report("on the truth first", agent, {"": after}, path, seed)
     return found
+
+
+def report(label: str, agent: PPO, observers: dict[str, Artifact], path: Path, seed: int) -> float:
+    """Say how long an agent balances on estimates of the last observer, and how good these are."""
+    env = wrapped(path)
+    env.replace_observer([*observers.values()][-1])
+    episodes = own_episodes(agent, env, 20, seed + 10_000)
+    print(f"{label}: {np.mean([len(u) for _, u, _ in episodes]):.0f} steps an episode")
+    for name, artifact in observers.items():
+        error = errors(artifact, episodes)
+        print(f"  errors of the {name}observer: {', '.join(f'{value:.2%}' for value in error)}")
+    return float(error.max())
 
 
 if __name__ == "__main__":

@@ -53,9 +53,11 @@ def test_any_environment_under_noise(capsys):
 
 @pytest.mark.slow
 def test_any_environment_agent(capsys):
-    small = {"random_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
+    small = {"observer_steps": 400, "members": 1, "timesteps": 2048, "every": 1000, "batches": 40}
     found = example("any_environment_agent")(**small)
-    assert 0 < found["with refits"] != found["without refits"] > 0
+    assert list(found) == ["from random steps", "refitted", "on the truth first"]
+    assert len(set(found.values())) == 3
+    assert min(found.values()) > 0
     assert "refitted the observer at step 1024" in capsys.readouterr().out
 
 

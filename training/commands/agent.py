@@ -77,8 +77,9 @@ class Train:
     observer_steps: Annotated[
         int | None, tyro.conf.arg(help_behavior_hint="(default: nine tenths of all, under noise one tenth)")
     ] = None
-    """First steps of an agent in an environment from which its observer is learned, where none is named. Without noise
-    the agent learns from them too: it is told the truth where estimates will be. Under noise actions are random."""
+    """First steps of an agent in an environment, from the latest 100,000 of which its observer is learned, where none
+    is named. Without noise the agent learns from them too: it is told the truth where estimates will be. Under noise
+    actions are random."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of an agent in an environment."""
 

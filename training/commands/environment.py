@@ -33,7 +33,8 @@ class EnvironmentOptions:
     env_kwargs: EnvironmentArguments = ()
     """An argument of the environment, once for each; values are JSON, or text."""
     aggregate: int = 0
-    """How often an observer is fitted again, to the agent's own steps, while the agent learns on it."""
+    """How often an observer is fitted again, to the agent's own steps, while the agent learns on estimates. The last
+    twentieth of all steps is then without exploration, and followed by one more fit."""
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.

@@ -26,7 +26,7 @@ class Tracking(Teaching):
     and what is measured has to be among the hidden signals.
     """
 
-    steps: Annotated[int | None, tyro.conf.arg(help_behavior_hint="(default: 40,000, or 10,000 with --data)")] = None
+    steps: int = 40_000
     """Batches for the network."""
     trajectories: int = 1600
     """Number of motions on which covariances are calibrated."""
@@ -62,5 +62,5 @@ class Tracking(Teaching):
             from_system=learn_tracking,
             from_records=learn_recorded_tracking,
             trajectories=self.trajectories,
-            **({} if self.steps is None else {"steps": self.steps}),
+            steps=self.steps,
         )

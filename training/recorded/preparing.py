@@ -69,7 +69,7 @@ def check_plant(artifact: Artifact, record: Record) -> None:
     """
     signals, names = record.signals, artifact.signals or {}
     if record.x is None:
-        raise ValueError(f"{record.name}: no hidden states were recorded; name their columns (--hidden)")
+        raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
     for role in ("measured", "hidden", *(["inputs"] if artifact.nu else [])):
         if (here := getattr(signals, role)) != (there := tuple(names[role])):
             raise ValueError(f"{record.name}: {role} are {', '.join(here)}, but the observer's {', '.join(there)}")

@@ -34,7 +34,7 @@ def learn_recorded_tracking(
     records: Sequence[Record],
     held_out: Sequence[Record] | None = None,
     *,
-    steps: int = 10_000,
+    steps: int = 40_000,
     seed: int = 0,
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,

@@ -90,9 +90,9 @@ class KKLTrainingCallback(BaseCallback):
     keep : int, default 100_000
         Steps that are kept; older ones are forgotten.
     records : sequence of training.records.Record, optional
-        Episodes from before, the oldest first, such as those that the observer was learned from
-        (``training.records.read_records(["minari:pendulum/agent-v0"])``). They are kept beside the agent's own, and
-        none of them is held out.
+        Episodes from before, the oldest first, such as those that the observer was learned from, as
+        :func:`training.records.read_records` reads them. They are kept beside the agent's own, and none of them is held
+        out. A refit is then left out while no episode that is held out is as long as the filter remembers.
     rehearsal : int, default 0
         Further steps at the end of each call of ``learn``, in which the agent acts without exploration, as it will when
         it is used, and which end in a last refit. An agent that explores goes elsewhere.
@@ -118,8 +118,8 @@ class KKLTrainingCallback(BaseCallback):
     ------
     ValueError
         If an argument makes no sense. At the beginning of the training, if an environment has no KKLObservation, an
-        observer that was not learned from rollouts, or another one than the others. At a step, if ``info`` lacks the
-        hidden signals, or a wrapper skips samples.
+        observer that was not learned from rollouts, or another one than the others, or if a record is of another plant.
+        At a step, if ``info`` lacks the hidden signals, or a wrapper skips samples.
 
     Notes
     -----
@@ -160,6 +160,8 @@ class KKLTrainingCallback(BaseCallback):
         self._every = integer("every", every, 1)
         self._next = self._every if first is None else integer("first", first, 1)
         self._keep, self._outputs = integer("keep", keep, 1), outputs
+        if not isinstance(records, Sequence) or not all(isinstance(record, Record) for record in records):
+            raise ValueError(f"records must be a list of training.records.Record, got {shown(records)}")
         self._before = tuple(records)
         self._rehearsal = integer("rehearsal", rehearsal, 0)
         if path is not None and not (isinstance(path, str | os.PathLike) and os.fspath(path).endswith(".safetensors")):
@@ -232,7 +234,9 @@ class KKLTrainingCallback(BaseCallback):
         self._next = self._gathering.steps + self._every
         train, held_out = self._gathering.records()
         memory = settling_time(self.artifact.filter)
-        if any(record.duration >= memory for record in train):
+        # Records from before are long enough to learn from, but say nothing of where the agent is now.
+        telling = held_out if self._before and self._config.held_out else train
+        if any(record.duration >= memory for record in telling):
             self._refit(train, held_out)
 
     def _rehearse(self) -> None:

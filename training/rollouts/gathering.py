@@ -2,14 +2,14 @@
 
 from collections import defaultdict, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from observers import Artifact
 from training.recorded.preparing import check_plant
-from training.records import Record, Signals
+from training.records import Record, Signals, check_dt, resampled
 
 LONGEST = 250  # steps of a piece: episodes without an end are cut, so that some of each can be held out
 
@@ -39,7 +39,7 @@ class Gathering:
     outputs : str
         What of ``info`` is recorded as outputs.
     before : sequence of Record
-        Episodes from before, the oldest first. None of them is held out: the observer may know them.
+        Episodes from before, the oldest first, of any dt. None of them is held out: the observer may know them.
 
     Attributes
     ----------
@@ -49,7 +49,8 @@ class Gathering:
     Raises
     ------
     ValueError
-        If an episode from before is of other signals or another environment than the observer.
+        If an episode from before is of other signals or another environment than the observer, without hidden signals,
+        or of steps that do not fit its dt.
     """
 
     def __init__(
@@ -63,9 +64,10 @@ class Gathering:
         self._open = defaultdict[int, _Piece](_Piece)  # by row
         self._kept: deque[tuple[bool, Record]] = deque()
         self._total = self._made = self.steps = 0
+        check_dt(before, self._dt)
         for record in before:
             check_plant(artifact, record)
-            self._take(record, held_out=False)
+            self._take_before(resampled(record, self._dt))
 
     def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
         """Take in the first sample of an episode.
@@ -159,6 +161,15 @@ class Gathering:
         )
         self._take(record, held_out=bool(self._every) and self._made % self._every == 1)
         self._made += 1
+
+    def _take_before(self, record: Record) -> None:
+        """Take in an episode from before in pieces, without inputs where the observer has none."""
+        u = record.u if self._signals.inputs else None
+        record = replace(record, u=u, signals=self._signals)
+        for begin in range(0, len(record.t) - 1, LONGEST):
+            piece = record.part(slice(begin, begin + LONGEST + 1))
+            if piece.x is not None:
+                self._take(piece, held_out=False)
 
     def _take(self, record: Record, *, held_out: bool) -> None:
         self._kept.append((held_out, record))

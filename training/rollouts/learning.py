@@ -51,8 +51,9 @@ def learn(
     seed : int
         Of the rollouts and of the training.
     tracking : bool
-        Whether the observer learns error bars too, and to track, which lowers its errors under noise, see
-        :func:`training.recorded.tracking.learn_recorded_tracking`. What is measured has to be among the hidden signals.
+        Whether the observer learns error bars too, and to track, which lowers its errors under noise and takes a minute
+        or two, see :func:`training.recorded.tracking.learn_recorded_tracking`. What is measured has to be among the
+        hidden signals.
     out : str or Path, optional
         A folder, which then receives checkpoints and ENV_ID.safetensors; by default nothing is written.
     console : rich.console.Console or ProgressBars, optional

@@ -1,6 +1,8 @@
 """Playing episodes, and keeping what happened."""
 
 import copy
+import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -118,6 +120,8 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         Signals, as :func:`kkl_gym.named.resolved` takes them.
     name : str
         Of the rollouts.
+    keep : int, optional
+        An episode is forgotten once the later ones have so many steps together. By default all are kept.
 
     Raises
     ------
@@ -126,7 +130,13 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
     """
 
     def __init__(
-        self, env: gym.Env[Any, Any], *, measured: Sequence[str | int], hidden: Sequence[str | int], name: str = ""
+        self,
+        env: gym.Env[Any, Any],
+        *,
+        measured: Sequence[str | int],
+        hidden: Sequence[str | int],
+        name: str = "",
+        keep: int | None = None,
     ) -> None:
         super().__init__(env)
         source = env.spec.id if env.spec else ""
@@ -141,7 +151,8 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         readers = [Reader(env.observation_space, names, source=source) for names in chosen]
         InputReader(env.action_space, acting(env.action_space), source=source)  # an error now, not after hours
         self._keys = tuple(dict.fromkeys(key for reader in readers for key in reader.keys))
-        self._played = list[Episode]()
+        self._played, self._steps = deque[Episode](), 0
+        self._to_keep = math.inf if keep is None else integer("keep", keep, 1)
         self._begin()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -167,7 +178,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         Returns
         -------
         Rollouts
-            All episodes so far.
+            All episodes that are kept.
 
         Raises
         ------
@@ -206,6 +217,9 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
                     asked,
                 )
             )
+            self._steps += len(self._rewards)
+            while self._steps - len(self._played[0].rewards) >= self._to_keep:
+                self._steps -= len(self._played.popleft().rewards)
         self._begin()
 
 

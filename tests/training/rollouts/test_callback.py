@@ -21,6 +21,7 @@ from kkl_gym import ActionRepeat, KKLObservation, KKLVectorObservation
 from observers import Artifact
 from training import KKLTrainingCallback
 from training.agents import SB3VecEnv
+from training.records import Record, Signals
 from training.rollouts import callback as module
 from training.rollouts.gathering import LONGEST, Gathering
 
@@ -266,6 +267,46 @@ def test_episodes_from_before_are_fitted_to_as_well(spy, asked):
     assert [refit.steps for refit in told] == [50, 100]  # without those from before
 
 
+def test_what_comes_from_before_is_brought_to_the_observers_form(spy):
+    artifact = Artifact.read(spy)
+    before = Record(
+        "slow",
+        2.0 * np.arange(400.0),
+        np.stack([np.arange(400.0)], -1),
+        np.zeros((400, 1)),
+        np.stack([np.arange(400.0)], -1),
+        Signals("seconds", ("obs[0]",), ("action[0]",), ("obs[1]",)),
+        environment=artifact.environment,
+    )
+    train, held_out = Gathering(artifact, keep=10**6, held_out=0.5, before=[before]).records()
+    assert not held_out
+    assert [len(piece.t) for piece in train] == [LONGEST + 1, LONGEST + 1, LONGEST + 1, 799 - 3 * LONGEST]
+    np.testing.assert_allclose(np.concatenate([piece.y[:-1, 0] for piece in train]), np.arange(0, 399, 0.5))
+    without = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], [])
+    (piece, *_), _ = Gathering(without, keep=10**6, held_out=0.5, before=[before]).records()
+    assert piece.u is None
+    assert piece.signals.inputs == ()
+
+
+@pytest.mark.parametrize(("memory", "times"), [(7.0, 2), (8.0, 0)])
+def test_a_refit_is_judged_by_the_agents_own_episodes(spy, asked, monkeypatch, memory, times):
+    """While none that is held out is long enough, records from before are no reason for a refit."""
+    env = vector("Spy-v0", spy, n=1)
+    asked.artifact = in_use(env)[0]
+    record = Record(
+        "long",
+        np.arange(100.0),
+        np.zeros((100, 1)),
+        np.zeros((100, 1)),
+        np.zeros((100, 1)),
+        Signals("t", ("obs[0]",), ("action[0]",), ("obs[1]",)),
+        environment=asked.artifact.environment,
+    )
+    monkeypatch.setattr(module, "settling_time", lambda linear: memory)
+    ppo(env, 50).learn(150, KKLTrainingCallback(50, records=[record]))
+    assert len(asked.found) == times
+
+
 def test_episodes_from_before_must_be_of_the_plant(spy, asked):
     env = vector("Spy-v0", spy, n=1)
     asked.artifact = in_use(env)[0]
@@ -279,6 +320,15 @@ def test_episodes_from_before_must_be_of_the_plant(spy, asked):
     ]:
         with pytest.raises(ValueError, match=says):
             ppo(env, 50).learn(100, KKLTrainingCallback(50, records=[bad]))
+    fast = dataclasses.replace(record, t=1e-3 * record.t)
+    with pytest.raises(ValueError, match="do not fit dt = 1 s"):
+        ppo(env, 50).learn(100, KKLTrainingCallback(50, records=[fast]))
+
+
+@pytest.mark.parametrize("bad", [None, "minari:a/b-v0", 3, [1], ["a"], {"a": 1}])
+def test_records_are_records(bad):
+    with pytest.raises(ValueError, match=r"records must be a list of training\.records\.Record, got"):
+        KKLTrainingCallback(records=bad)
 
 
 def test_the_agent_keeps_its_random_numbers(spy, asked):

@@ -168,11 +168,11 @@ def learn_to_play(
     observer : str, optional
         File of an observer, for x_hat; by default one is learned.
     observer_steps : int, optional
-        The agent's first steps, from which it is learned; by default nine tenths of all, and under noise one tenth.
-        They end with what the algorithm collects at a time, and before what it collects last.
+        The agent's first steps, from the latest 100,000 of which it is learned; by default nine tenths of all, and
+        under noise one tenth. They end with what the algorithm collects at a time, and before what it collects last.
     aggregate : int
-        How many times it is fitted again while the agent learns, on the agent's own steps. A twentieth of all steps,
-        the last ones, is then without exploration, and followed by one more fit.
+        How many times it is fitted again while the agent learns on estimates, where an algorithm begins to collect. A
+        twentieth of all steps, the last ones, is then without exploration, and followed by one more fit.
     progress : ProgressBars, optional
         Where bars are shown.
 
@@ -204,6 +204,8 @@ def learn_to_play(
         share = WANDERED if task.measurement_noise else TOLD
         spent = round(share * steps) if observer_steps is None else observer_steps
         if not 0 < spent < steps - rehearsal:
+            if observer_steps is None:
+                raise ValueError(f"{steps} steps are too few for an observer and an agent; give it more (--timesteps)")
             raise ValueError(
                 f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {spent}"
             )
@@ -212,12 +214,12 @@ def learn_to_play(
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
         learned = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
-        curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()
+        curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()  # no random actions in refits
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
             observer = str(learned(wander(task, spent, seed=seed, progress=bars)))
             curve.spent = spent
         elif learns_observer:
-            told = Told(task)
+            told = Told(task, settings.get("n_envs", 1))
         left = steps - rehearsal - curve.spent
         make = partial(show, task, information, observer) if told is None else told.make
         with closing(_Learner(ALGORITHMS[name], settings, seed, make)) as learner:
@@ -229,8 +231,8 @@ def learn_to_play(
                         f"the agent would never see an estimate: {name} collects {learner.steps} steps before it goes "
                         f"on; give it more than {steps} (--timesteps)"
                     )
-                before = told.records()
-                observer = str(learned(before))
+                observer = str(learned(told.records()))
+                before = told.oldest_first()
                 learner.move(partial(show, task, information, observer))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
@@ -333,7 +335,8 @@ class _Until(BaseCallback):
     def _on_rollout_start(self) -> None:
         collects = self.num_timesteps - self._begun  # as the time before
         self._begun = self.num_timesteps
-        self._over = self.num_timesteps >= min(self._steps, self._last - collects) and self.num_timesteps > 0
+        stopping = self.training_env.num_envs  # steps that it takes: a callback can stop nothing but a step
+        self._over = self.num_timesteps >= min(self._steps, max(1, self._last - stopping - collects))
 
     def _on_step(self) -> bool:
         return not self._over

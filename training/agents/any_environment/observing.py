@@ -31,16 +31,18 @@ SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
 class Told:
-    """Environments in which an agent is told what an observer is to estimate, and which keep what happens.
+    """Environments in which an agent is told what an observer is to estimate, and which keep what happened last.
 
     Parameters
     ----------
     task : HiddenTask
         Of which environment, and what is measured, without noise.
+    rows : int
+        How many will be made, which keep 100,000 steps together.
     """
 
-    def __init__(self, task: HiddenTask) -> None:
-        self._task, self._recorders = task, list[Recorder]()
+    def __init__(self, task: HiddenTask, rows: int) -> None:
+        self._task, self._each, self._recorders = task, max(1, KEPT // rows), list[Recorder]()
 
     def make(self) -> gym.Env[np.ndarray, Any]:
         """Make one environment.
@@ -51,26 +53,38 @@ class Told:
             Its observations are those of an agent on estimates, had these no error.
         """
         env = self._task.make()
-        recorder = Recorder(env, **_signals(self._task, env))
+        recorder = Recorder(env, **_signals(self._task, env), keep=self._each)
         self._recorders.append(recorder)
         return part_of(recorder, self._task.told(_size(env)))
 
     def records(self) -> list[Record]:
-        """Read what happened last in all of them.
+        """Read what they keep.
 
         Returns
         -------
         list of Record
-            One of each episode, of the latest that make up 100,000 steps together.
+            One of each episode, first those of the first environment.
         """
-        each = KEPT // len(self._recorders)
-        return [record for recorder in self._recorders for record in _latest(recorder.rollouts().records(), each)]
+        return [record for records in self._rows() for record in records]
 
+    def oldest_first(self) -> list[Record]:
+        """Read what they keep, those that ended first at the beginning.
 
-def _latest(records: list[Record], steps: int) -> list[Record]:
-    """The last records, with so many steps at least if there are as many."""
-    after = np.cumsum([len(record.t) - 1 for record in records[::-1]])
-    return records[-1 - int(np.searchsorted(after, steps)) :]
+        Returns
+        -------
+        list of Record
+            As of :meth:`records`.
+        """
+        dated = list[tuple[int, Record]]()
+        for records in self._rows():
+            after = 0  # steps that were made since
+            for record in reversed(records):
+                dated.append((after, record))
+                after += len(record.t) - 1
+        return [record for _, record in sorted(dated, key=lambda one: -one[0])]
+
+    def _rows(self) -> list[list[Record]]:
+        return [recorder.rollouts().records() for recorder in self._recorders]
 
 
 def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
@@ -167,7 +181,7 @@ def refitting(
     path : Path
         Receives the observer in use at each time.
     records : sequence of Record
-        What the agent did before, which it is fitted to as well.
+        From before, the oldest first, which it is fitted to as well.
 
     Returns
     -------
