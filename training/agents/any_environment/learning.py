@@ -232,7 +232,7 @@ def learn_to_play(
                         f"on; give it more than {steps} (--timesteps)"
                     )
                 observer = str(learned(told.records()))
-                before = told.oldest_first()
+                before = told.oldest_first() if aggregate else []
                 learner.move(partial(show, task, information, observer))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
