@@ -13,6 +13,8 @@ from observers.checks import real_array, shown
 SHORTEST, LONGEST = 0.5, 10_000.0  # time constants in steps
 SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than it saves
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
+IMAGINED = 64  # steps before the first output
+FILLED = 20  # longest time constants, after which e^-20 is left of what was before
 
 
 class Memory:
@@ -23,11 +25,16 @@ class Memory:
     w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs it is the low-pass
     v' = (u - v) / tau itself, u being held.
 
+    Of what was before the first output nothing is known. It is taken to have been at rest, but for the last 64 steps,
+    in which y is taken to have changed as it has since, in the mean as a filter weighs it. At the age of k steps this
+    multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). No input is taken to have acted.
+
     Of a slow signal all w say nearly the same, tau times its rate. So the memory holds combinations of them: the
     slowest first, and of each faster one what slower ones do not tell. They are uncorrelated and as large as y if y
     wanders as an Ornstein-Uhlenbeck process does, with a correlation time of which only the order is known, from
-    twice the shortest time constant to eight times the longest. Nothing is fitted to data, and white noise on y is
-    amplified at most threefold.
+    twice the shortest time constant to eight times the longest. Nothing is fitted to data. White noise on y is
+    amplified at most threefold in the end. It is amplified more at first, where there is little to tell a rate from:
+    by the default time constants 22-fold in the first step, and fourfold in the fifth.
 
     Parameters
     ----------
@@ -46,12 +53,8 @@ class Memory:
         What w keeps of itself in a step, and what it takes of y's change.
     mixing : ndarray, shape (m, m)
         What makes coordinates, slowest first, of w, fastest first.
-    transition : ndarray, shape (m, m)
-        What coordinates keep of themselves.
-    drive : ndarray, shape (m,)
-        What they take of y's change.
-    input_decay, input_drive : ndarray, shape (k,)
-        What v keeps of itself, and what it takes of the input.
+    input_decay : ndarray, shape (k,)
+        What v keeps of itself in a step; the rest is the input's.
 
     Raises
     ------
@@ -70,30 +73,29 @@ class Memory:
         tau = np.array([*self.time_constants, *self.input_time_constants])
         linear = LinearFilter(-np.diag(1 / tau), 1 / tau[:, None], dt=1.0, nu=1)
         decay = linear.transition.diagonal()[: len(tau)].copy()
-        self.decay, self.rise = decay[:m], 1 - linear.late_y[:m, 0]
+        self.decay, self.input_decay, self.rise = decay[:m], decay[m:], 1 - linear.late_y[:m, 0]
         self.mixing = _mixing(self.time_constants, self.decay, self.rise)
-        self.transition = self.mixing * self.decay @ np.linalg.inv(self.mixing)
-        self.drive = self.mixing @ self.rise
-        self.input_decay, self.input_drive = decay[m:], linear.held_u[len(tau) + m :, 0].copy()
         self._ny, self._nu = ny, nu
-        # A single row advances by one product, where it is small: every call of NumPy would be felt.
-        self._update = self._matrix() if self.size <= SMALL else None
-        self._row: np.ndarray | None = None  # its [y, coordinates, v]
-        self._y: np.ndarray | None = None  # of a batch, (n, ny); it has coordinates, (m, n, ny), and v, (k, n, nu)
+        self._filled = FILLED * math.ceil(self.time_constants[-1])
+        self._row: np.ndarray | None = None  # [y, w, v] of a single one
+        # It advances by one product, where it is small: every call of NumPy would be felt.
+        self._matrices = self._products() if self.size <= SMALL else None
+        self._y: np.ndarray | None = None  # of a batch, (n, ny); it has w, (m, n, ny), and v, (k, n, nu)
 
-    def _matrix(self) -> np.ndarray:
-        """What [state, next y, u] of a single row are multiplied by to give its next state."""
-        ny, nu, size, m = self._ny, self._nu, self.size, len(self.drive)
-        y, q, v = slice(ny), slice(ny, ny + m * ny), slice(ny + m * ny, size)
+    def _products(self) -> tuple[np.ndarray, np.ndarray]:
+        """What [y, w, v, next y, u] of a single row are multiplied by for its next state, and that to be shown."""
+        ny, nu, size, m = self._ny, self._nu, self.size, len(self.decay)
+        y, w, v = slice(ny), slice(ny, ny + m * ny), slice(ny + m * ny, size)
         y_next, u = slice(size, size + ny), slice(size + ny, size + ny + nu)
-        out = np.zeros((size + ny + nu, size))
-        out[y_next, y] = np.eye(ny)
-        out[y_next, q] = np.kron(self.drive, np.eye(ny))
-        out[y, q] = -out[y_next, q]
-        out[q, q] = np.kron(self.transition.T, np.eye(ny))
-        out[v, v] = np.kron(np.diag(self.input_decay), np.eye(nu))
-        out[u, v] = np.kron(self.input_drive, np.eye(nu))
-        return out
+        update, combine = np.zeros((size + ny + nu, size)), np.eye(size)
+        update[w, w] = np.diag(np.repeat(self.decay, ny))
+        update[v, v] = np.diag(np.repeat(self.input_decay, nu))
+        update[y_next, y] = np.eye(ny)
+        update[y_next, w] = np.kron(self.rise, np.eye(ny))
+        update[y, w] = -update[y_next, w]
+        update[u, v] = np.kron(1 - self.input_decay, np.eye(nu))
+        combine[w, w] = np.kron(self.mixing.T, np.eye(ny))
+        return update, combine
 
     @property
     def size(self) -> int:
@@ -115,12 +117,16 @@ class Memory:
         ndarray, shape (2, size)
             Lower and upper bounds, infinite where a signal's are.
         """
-        steps = np.arange(20 * math.ceil(self.time_constants[-1]))[:, None]  # after them e^-20 is left
-        pulse = np.vstack([self.rise, self.rise * (self.decay - 1) * self.decay**steps]) @ self.mixing.T
-        reach = np.maximum(pulse, 0.0).sum(0) * (1 + 1e-6)  # for rounding; responses to a pulse of y have the sum 0
+        reach = np.max([self._reach(age) for age in _ages(self._filled)], axis=0) * (1 + 1e-6)
         of_outputs = np.outer(reach, high - low).ravel()
         of_inputs = np.tile([np.minimum(u_low, 0.0), np.maximum(u_high, 0.0)], len(self.input_decay))  # 0 at first
         return np.hstack([[low, high], [-of_outputs, of_outputs], of_inputs])
+
+    def _reach(self, age: int) -> np.ndarray:
+        """How far outputs between 0 and 1 move the coordinates at an age, at the most; the negative is reached too."""
+        weights = _with_past(self.decay, age) * self.rise * self.decay ** np.arange(age)[:, None]
+        of_changes = self.mixing @ weights.T  # the latest first
+        return np.maximum(np.diff(of_changes, prepend=0.0, append=0.0), 0.0).sum(1)
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget all, as if the outputs had rested at ``y0`` and no input had acted.
@@ -136,14 +142,14 @@ class Memory:
             As :meth:`advance`.
         """
         if y0.ndim == 1:
-            if self._update is None:
+            if self._matrices is None:
                 return self.reset(y0[None])[0]
-            self._row = np.zeros(self.size)
+            self._row, self._row_age = np.zeros(self.size), 0
             self._row[: self._ny] = y0
             return self._row.astype(np.float32)
-        self._y = y0.copy()
-        self._q = np.zeros((len(self.drive), *y0.shape))
-        self._spare = np.empty_like(self._q)  # to find new memory at each step costs as much as to fill it
+        self._y, self._ages = y0.copy(), np.zeros(len(y0), dtype=int)
+        self._w = np.zeros((len(self.decay), *y0.shape))
+        self._spare = np.empty_like(self._w)  # to find new memory at each step costs as much as to fill it
         self._v = np.zeros((len(self.input_decay), len(y0), self._nu))
         return self.shown()
 
@@ -165,7 +171,7 @@ class Memory:
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
         self._y[rows] = y0
-        self._q[:, rows] = self._v[:, rows] = 0.0
+        self._w[:, rows] = self._v[:, rows] = self._ages[rows] = 0
         return self.shown(rows)
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
@@ -194,21 +200,28 @@ class Memory:
         if y.ndim == 1:
             if self._row is None:
                 return self.advance(y[None], u[None])[0]
-            self._row = np.concatenate((self._row, y, u)) @ self._update
-            return self._row.astype(np.float32)
+            update, combine = self._matrices  # type: ignore[misc]  # there are some, where there is a row
+            self._row = np.concatenate((self._row, y, u)) @ update
+            self._row_age += 1
+            row = self._row
+            if self._row_age < self._filled:
+                w = slice(self._ny, self._ny * (1 + len(self.decay)))
+                row = row.copy()
+                row[w] *= np.repeat(_with_past(self.decay, self._row_age), self._ny)
+            return (row @ combine).astype(np.float32)
         if self._y is None:
             raise RuntimeError("reset the environment before its first step")
+        decay, input_decay = self.decay[:, None, None], self.input_decay[:, None, None]
         if rows is not None:
             y = np.where(rows[:, None], y, self._y)
-        change, q, m = y - self._y, self._spare, len(self.drive)
-        np.matmul(self.transition, self._q.reshape(m, -1), out=q.reshape(m, -1))
-        for coordinate, drive in zip(q, self.drive):
-            coordinate += drive * change
-        v = self.input_decay[:, None, None] * self._v + self.input_drive[:, None, None] * u
-        if rows is not None:
-            q[:, ~rows], v[:, ~rows] = self._q[:, ~rows], self._v[:, ~rows]
+            decay, input_decay = (np.where(rows[:, None], kept, 1.0) for kept in (decay, input_decay))
+        change = y - self._y
+        self._w *= decay
+        for w, rise in zip(self._w, self.rise):
+            w += rise * change
+        self._v += (1 - input_decay) * (u - self._v)
         self._y[:] = y
-        self._q, self._spare, self._v = q, self._q, v
+        self._ages += 1 if rows is None else rows
         return self.shown()
 
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
@@ -224,10 +237,26 @@ class Memory:
         ndarray of float32, shape (n, size) or (number of True in rows, size)
             As :meth:`advance`.
         """
-        parts = [self._y, *self._q, *self._v]
+        m = len(self.decay)
+        np.matmul(self.mixing, self._w.reshape(m, -1), out=self._spare.reshape(m, -1))
+        young = np.flatnonzero(self._ages < self._filled)
+        if len(young):
+            means = self._w[:, young] * _with_past(self.decay[:, None, None], self._ages[young, None])
+            self._spare[:, young] = np.tensordot(self.mixing, means, 1)
+        parts = [self._y, *self._spare, *self._v]
         if rows is not None:
             parts = [part[rows] for part in parts]
         return np.concatenate(parts, axis=-1, dtype=np.float32)
+
+
+def _with_past(decay: np.ndarray, age: int | np.ndarray) -> np.ndarray:
+    """What filters are multiplied by at an age in steps."""
+    return (1 - decay ** (age + IMAGINED)) / (1 - decay ** np.maximum(age, 1))  # they are 0 at the age 0
+
+
+def _ages(last: int) -> list[int]:
+    """Ages to look at: all at first, then ever fewer."""
+    return sorted({*range(1, min(64, last)), *np.geomspace(64, max(last, 64), 64).astype(int).tolist()})
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:

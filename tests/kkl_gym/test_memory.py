@@ -61,9 +61,29 @@ def test_the_filters_are_those_that_integration_finds(outputs, inputs):
     state = np.concatenate([np.tile(y[0], tau.size), np.zeros(tau_u.size)])
     for k in range(11):
         state = solve_ivp(rate, (0, 1), state, method="DOP853", rtol=1e-11, atol=1e-12, args=(k,)).y[:, -1]
-        w = y[k + 1] - state[: tau.size * 2].reshape(-1, 2)
+        kept = np.exp(-1 / tau) ** (k + 1)
+        w = (y[k + 1] - state[: tau.size * 2].reshape(-1, 2)) * (1 - kept * np.exp(-64 / tau)) / (1 - kept)
         expected = np.concatenate([y[k + 1], (found.mixing @ w).ravel(), state[tau.size * 2 :]])
         assert np.allclose(shown[k + 1], expected, rtol=1e-5, atol=1e-5)
+
+
+@banks
+def test_a_steady_motion_looks_from_the_first_step_on_as_after_sixty_four_more(outputs, inputs):
+    """That is what the past before the first output is taken for."""
+    y = np.arange(40.0)[:, None] * [[0.3, -2.0]] + 5.0
+    shown = run(memory(2, 1, outputs, inputs), y, np.zeros((39, 1)))[:, 2:]
+    tau = np.array(outputs)[:, None]
+    for k in (1, 2, 20, 39):
+        w = tau * (1 - np.exp(-(k + 64) / tau)) * [[0.3, -2.0]]  # a low-pass lags behind a ramp by tau, in the end
+        expected = (memory(2, 1, outputs, inputs).mixing @ w).ravel()
+        assert np.allclose(shown[k, : expected.size], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_in_the_end_nothing_is_left_of_the_beginning():
+    y, u = signals(400, 2), signals(399, 1, seed=1)
+    late = run(memory(2, 1), y[200:], u[200:])
+    assert np.allclose(run(memory(2, 1), y, u)[-1], late[-1], rtol=1e-6, atol=1e-6)
+    assert not np.allclose(run(memory(2, 1), y, u)[205], late[5], rtol=0.1, atol=0.1)
 
 
 @banks
@@ -104,9 +124,17 @@ def test_noise_is_amplified_at_most_threefold(shortest, ratio):
     most = 1 + int(np.log(9_999 / shortest) / np.log(ratio))
     for m in {1, 2, min(4, most), most}:
         found = memory(1, 0, shortest * ratio ** np.arange(m), ())
-        later = (found.transition @ found.drive - found.drive)[:, None]  # when a pulse of y has come and gone
-        covariance = found.drive[:, None] * found.drive + solve_discrete_lyapunov(found.transition, later @ later.T)
-        assert 0.5 < np.sqrt(covariance.diagonal().max()) < 3.0
+        later = ((found.decay - 1) * found.rise)[:, None]  # when a pulse of y has come and gone
+        of_filters = found.rise[:, None] * found.rise + solve_discrete_lyapunov(np.diag(found.decay), later @ later.T)
+        assert 0.5 < np.sqrt((found.mixing @ of_filters @ found.mixing.T).diagonal().max()) < 3.0
+
+
+def test_noise_is_amplified_more_at_first():
+    pulses = np.eye(6)[:, :, None]  # each row of the batch has one at another step
+    shown = run(memory(1, 0, inputs=()), pulses, np.zeros((5, 6, 0)))[:, :, 1:]
+    first, fifth = (np.sqrt((shown[k] ** 2).sum(0)).max() for k in (1, 5))
+    assert 21 < first < 22.5
+    assert 4 < fifth < 4.5
 
 
 def test_an_output_at_rest_leaves_no_trace():
@@ -122,23 +150,21 @@ def test_an_output_at_rest_leaves_no_trace():
 
 @banks
 def test_bounds_hold_and_are_reached_by_the_worst_signals(outputs, inputs):
-    """For each coordinate the output that drives it furthest, by the response to a pulse, and the worst input."""
-    outputs = tuple(min(tau, 20.0) for tau in outputs)
+    """Of each age and coordinate the output that drives it furthest, by the response to pulses, and the worst input."""
     filters = memory(1, 1, outputs, inputs)
     low, high = filters.bounds(np.array([-1.0]), np.array([3.0]), np.array([-1.0]), np.array([0.5]))
-    steps = 400
-    y = np.zeros((steps, 1))
-    y[0] = 0.0
-    y[1] = 1.0
-    pulse = run(filters, y, np.zeros((steps - 1, 1)))[1:, 1 : 1 + len(outputs)]
-    for i in range(len(outputs)):
-        worst = np.where(pulse[::-1, i] > 0, 3.0, -1.0)[:, None]
-        for y_worst, sign in ((worst, 1), (2.0 - worst, -1)):
-            shown = run(filters, y_worst, np.full((steps, 1), 0.5 * sign - 0.25 * (1 - sign)))
+    reached = np.zeros(len(outputs))
+    for age in (1, 2, 3, 4, 5, 10, 20, 31, 40, 52, 53, 54, 63, 64, 150, 400):
+        pulses = run(filters, np.eye(age + 1)[:, :, None], np.zeros((age, age + 1, 1)))[-1, :, 1 : 1 + len(outputs)]
+        worst = np.where(pulses > 0, 3.0, -1.0)[:, :, None]
+        for y, u in ((worst, 0.5), (2.0 - worst, -1.0)):
+            shown = run(filters, y, np.full((age, len(outputs), 1), u))
             assert (low <= shown).all()
             assert (shown <= high).all()
-            reached = shown[-1, 1 + i] / (high if sign > 0 else low)[1 + i]
-            assert reached > 0.999, (i, reached)
+            reached = np.maximum(
+                reached, shown[-1, :, 1 : 1 + len(outputs)].diagonal() / (high if u > 0 else low)[1 : 1 + len(outputs)]
+            )
+    assert (reached > 0.98).all(), reached
     assert high[1 + len(outputs) :].tolist() == [0.5] * len(inputs)
     assert low[1 + len(outputs) :].tolist() == [-1.0] * len(inputs)
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from kkl_gym import SYSTEMS
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
+from training.agents.information import STACKED
 from training.commands.record import EnvironmentArguments
 from training.progress import ProgressBars
 from training.seeds import agent_evaluation_seed
@@ -35,6 +36,11 @@ class EnvironmentOptions:
     aggregate: int = 0
     """How often an observer is fitted again, to the agent's own steps, while the agent learns on estimates. The last
     twentieth of all steps is then without exploration, and followed by one more fit."""
+
+    time_constants: Annotated[str, tyro.conf.arg(metavar="STEPS", help_behavior_hint="(default: 1,2,4,8)")] = ""
+    """Of the memory that agents on z have, in steps. Where there is no noise, 1,2 may be easier to learn with."""
+    frames: int = STACKED
+    """How many observations, each with the action before it, are stacked for agents on those."""
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.
@@ -69,6 +75,8 @@ class EnvironmentOptions:
             hidden=_indices("hidden", self.hidden) if self.hidden else hidden,
             measurement_noise=measurement_noise,
             env_kwargs=dict(self.env_kwargs),
+            frames=self.frames,
+            **({"time_constants": _steps("time-constants", self.time_constants)} if self.time_constants else {}),
         )
 
 
@@ -77,6 +85,13 @@ def _indices(name: str, text: str) -> tuple[int, ...]:
         return tuple(int(entry) for entry in text.split(",") if entry.strip())
     except ValueError:
         raise ValueError(f"--{name} takes indices in the flattened observation, as in 0,1; got {text!r}") from None
+
+
+def _steps(name: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(entry) for entry in text.split(",") if entry.strip())
+    except ValueError:
+        raise ValueError(f"--{name} takes numbers of steps, as in 1,2; got {text!r}") from None
 
 
 def is_environment(name: str) -> bool:

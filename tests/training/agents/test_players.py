@@ -115,6 +115,19 @@ def test_stacked_observations_hold_actions_and_begin_with_the_first():
     np.testing.assert_array_equal(show(PENDULUM, "recurrent").reset(seed=0)[0], [*y0, 0])
 
 
+def test_a_task_says_how_long_memories_and_stacks_are(tmp_path):
+    task = replace(PENDULUM, time_constants=(1, 2), frames=4)
+    assert show(task, "stacked").observation_space.shape == (4 * 3,)
+    z = show(task, "z")
+    assert z.observation_space.shape == (2 + 2 * 2 + 2,)
+    assert z.get_wrapper_attr("spec").additional_wrappers[-1].kwargs["time_constants"] == (1.0, 2.0)
+    path = tmp_path / "agent.safetensors"
+    network = MLP([np.zeros((1, 8))], [np.zeros(1)], "tanh")
+    player(task=task, information="z", network=network).save(path)
+    assert Player.read(path).task == task
+    assert Player.read(path).make().observation_space == z.observation_space
+
+
 def test_the_full_state_is_without_noise():
     noisy = replace(PENDULUM, measurement_noise=0.3)
     np.testing.assert_array_equal(show(noisy, "state").reset(seed=1)[0], PENDULUM.make().reset(seed=1)[0])
@@ -360,6 +373,10 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
         ({"measured": (0.5,)}, "entry of measured"),
         ({"measured": (0,), "measurement_noise": -1.0}, "from 0 on"),
         ({"measured": (0,), "measurement_noise": np.nan}, "from 0 on"),
+        ({"measured": (0,), "time_constants": (2.0, 1.0)}, "must rise"),
+        ({"measured": (0,), "time_constants": ()}, "at least one"),
+        ({"measured": (0,), "frames": 0}, "frames must be"),
+        ({"measured": (0,), "frames": 2.5}, "frames must be"),
     ],
 )
 def test_a_task_that_makes_no_sense_is_refused(arguments, says):
@@ -557,6 +574,10 @@ def test_the_commands_train_and_play(tmp_path, small, capsys):
         Train("Acrobot-v1", "z", out=tmp_path / "c").run(Console())
     with pytest.raises(ValueError, match="takes indices"):
         Train("CartPole-v1", "z", out=tmp_path / "d", environment=EnvironmentOptions(measured="x")).run(Console())
+    with pytest.raises(ValueError, match="--time-constants takes numbers of steps"):
+        EnvironmentOptions(time_constants="1;2").task("CartPole-v1")
+    shorter = EnvironmentOptions(time_constants="1,2", frames=4).task("CartPole-v1")
+    assert (shorter.time_constants, shorter.frames) == ((1.0, 2.0), 4)
     with pytest.raises(ValueError, match="one number"):
         Train("CartPole-v1", "z", out=tmp_path / "e", measurement_noise=(0.1, 0.2)).run(Console())
     with pytest.raises(ValueError, match="a system knows"):

@@ -14,7 +14,6 @@ from kkl_gym import KKLMemory, KKLObservation
 from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
 from training.agents.any_environment.task import HiddenTask
-from training.agents.information import STACKED
 
 Shown = Literal["state", "x_hat", "z", "stacked", "recurrent", "y"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)
@@ -30,9 +29,9 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
         "state": the whole observation without noise. The others see what is measured, y, with its noise. "x_hat": y,
         and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
-        measured too. "z": y and the memory of
-        :class:`kkl_gym.KKLMemory`. "stacked": the last eight y, each with the action before it. "recurrent": y with the
-        action before it, for a policy that remembers by itself. "y": y alone.
+        measured too. "z": y and the memory of :class:`kkl_gym.KKLMemory`. "stacked": the last y, as many as the task
+        says, each with the action before it. "recurrent": y with the action before it, for a policy that remembers by
+        itself. "y": y alone.
     observer : str, optional
         File of the observer, for "x_hat".
 
@@ -58,11 +57,11 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         shown: Any = env.observation_space
         return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
-        return KKLMemory(env, task.measured)
+        return KKLMemory(env, task.measured, time_constants=task.time_constants)
     env = part_of(env, task.measured)
     if information == "y":
         return env
-    return StackedWithActions(env, 1 if information == "recurrent" else STACKED)
+    return StackedWithActions(env, 1 if information == "recurrent" else task.frames)
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
@@ -103,7 +102,7 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         Observations shown.
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, Any], count: int = STACKED) -> None:
+    def __init__(self, env: gym.Env[np.ndarray, Any], count: int) -> None:
         RecordConstructorArgs.__init__(self, count=count)
         gym.Wrapper.__init__(self, env)
         self._inputs = Inputs(env.action_space, source=source_of(env))

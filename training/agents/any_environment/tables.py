@@ -22,7 +22,7 @@ LABELS = {
     "state": "full state",
     "x_hat": "y and x̂",
     "z": "y and z",
-    "stacked": "8 y and actions",
+    "stacked": "stacked y and actions",
     "recurrent": "y, recurrent agent",
     "y": "y",
 }

@@ -9,7 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
+from kkl_gym.memory import Memory
 from observers.checks import LARGEST, integer, is_finite, shown
+from training.agents.information import STACKED
 from training.rollouts.playing import make
 
 CLEAN, CLEAN_Y = "clean", "clean_y"  # of info, what was before noise was added
@@ -32,6 +34,10 @@ class HiddenTask:
         Standard deviation of the noise on each of them, at each step, in the observation's own units.
     env_kwargs : mapping of str to object
         Arguments of the environment.
+    time_constants : tuple of float
+        Of the memory of what is measured, in steps, as :class:`kkl_gym.KKLMemory` takes them; for agents on z.
+    frames : int
+        How many observations are stacked, for agents that see the last ones.
 
     Raises
     ------
@@ -44,6 +50,8 @@ class HiddenTask:
     hidden: tuple[int, ...] | None = None
     measurement_noise: float = 0.0
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    frames: int = STACKED
 
     def __post_init__(self) -> None:
         for name in ("measured", "hidden"):
@@ -55,6 +63,9 @@ class HiddenTask:
         if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:
             raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
+        memory = Memory(1, 0, time_constants=self.time_constants, input_time_constants=())
+        object.__setattr__(self, "time_constants", memory.time_constants)
+        object.__setattr__(self, "frames", integer("frames", self.frames, 1))
 
     @property
     def name(self) -> str:
