@@ -15,6 +15,7 @@ SMALL = 256  # numbers shown; beyond them the matrix of a step costs more than i
 CLOSEST = 1.5  # ratio of neighbouring ones; closer ones hold the same, and their coordinates would be rounding errors
 IMAGINED = 64  # steps before the first output
 FILLED = 20  # longest time constants, after which e^-20 is left of what was before
+TABLE = 1_000  # ages of which the factors are worked out once
 
 
 class Memory:
@@ -25,9 +26,9 @@ class Memory:
     w_k+1 = decay w_k + rise (y_k+1 - y_k). For each input u and time constant of inputs it is the low-pass
     v' = (u - v) / tau itself, u being held.
 
-    Of what was before the first output nothing is known. It is taken to have been at rest, but for the last 64 steps,
-    in which y is taken to have changed as it has since, in the mean as a filter weighs it. At the age of k steps this
-    multiplies w by (1 - decay^(k + 64)) / (1 - decay^k). No input is taken to have acted.
+    Of what was before the first output nothing is known. y is taken to have rested until 64 steps before it, and then
+    to have changed as fast as since, in the mean as each filter weighs it. At the age of k steps this multiplies w by
+    (1 - decay^(k + 64)) / (1 - decay^k). No input is taken to have acted.
 
     Of a slow signal all w say nearly the same, tau times its rate. So the memory holds combinations of them: the
     slowest first, and of each faster one what slower ones do not tell. They are uncorrelated and as large as y if y
@@ -77,6 +78,7 @@ class Memory:
         self.mixing = _mixing(self.time_constants, self.decay, self.rise)
         self._ny, self._nu = ny, nu
         self._filled = FILLED * math.ceil(self.time_constants[-1])
+        self._factors = np.array([_with_past(self.decay, age) for age in range(min(self._filled, TABLE))])
         self._row: np.ndarray | None = None  # [y, w, v] of a single one
         # It advances by one product, where it is small: every call of NumPy would be felt.
         self._matrices = self._products() if self.size <= SMALL else None
@@ -103,7 +105,7 @@ class Memory:
         return self._ny * (1 + len(self.time_constants)) + self._nu * len(self.input_time_constants)
 
     def bounds(self, low: np.ndarray, high: np.ndarray, u_low: np.ndarray, u_high: np.ndarray) -> np.ndarray:
-        """The least and the largest that can be shown; the worst signals reach them.
+        """The least and the largest that can be shown, at any age; the worst signals come within 1 % of them.
 
         Parameters
         ----------
@@ -117,15 +119,17 @@ class Memory:
         ndarray, shape (2, size)
             Lower and upper bounds, infinite where a signal's are.
         """
-        reach = np.max([self._reach(age) for age in _ages(self._filled)], axis=0) * (1 + 1e-6)
+        ages = {*range(1, min(64, self._filled)), *np.geomspace(64, max(64, self._filled), 64).astype(int).tolist()}
+        with np.errstate(under="ignore"):
+            weights = self.rise * self.decay ** np.arange(max(ages))[:, None]
+            reach = 1.002 * np.max([self._reach(weights[:age]) for age in ages], axis=0)  # of ages between these too
         of_outputs = np.outer(reach, high - low).ravel()
         of_inputs = np.tile([np.minimum(u_low, 0.0), np.maximum(u_high, 0.0)], len(self.input_decay))  # 0 at first
         return np.hstack([[low, high], [-of_outputs, of_outputs], of_inputs])
 
-    def _reach(self, age: int) -> np.ndarray:
-        """How far outputs between 0 and 1 move the coordinates at an age, at the most; the negative is reached too."""
-        weights = _with_past(self.decay, age) * self.rise * self.decay ** np.arange(age)[:, None]
-        of_changes = self.mixing @ weights.T  # the latest first
+    def _reach(self, weights: np.ndarray) -> np.ndarray:
+        """How far outputs from 0 to 1 can move coordinates, if w weighs their changes by these, the latest first."""
+        of_changes = self.mixing @ (weights * _with_past(self.decay, len(weights))).T
         return np.maximum(np.diff(of_changes, prepend=0.0, append=0.0), 0.0).sum(1)
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
@@ -203,11 +207,11 @@ class Memory:
             update, combine = self._matrices  # type: ignore[misc]  # there are some, where there is a row
             self._row = np.concatenate((self._row, y, u)) @ update
             self._row_age += 1
-            row = self._row
-            if self._row_age < self._filled:
-                w = slice(self._ny, self._ny * (1 + len(self.decay)))
+            row, age, ny = self._row, self._row_age, self._ny
+            if age < self._filled:
+                factors = self._factors[age] if age < TABLE else _with_past(self.decay, age)
                 row = row.copy()
-                row[w] *= np.repeat(_with_past(self.decay, self._row_age), self._ny)
+                row[ny : ny + ny * len(factors)] *= factors.repeat(ny)
             return (row @ combine).astype(np.float32)
         if self._y is None:
             raise RuntimeError("reset the environment before its first step")
@@ -237,13 +241,13 @@ class Memory:
         ndarray of float32, shape (n, size) or (number of True in rows, size)
             As :meth:`advance`.
         """
-        m = len(self.decay)
-        np.matmul(self.mixing, self._w.reshape(m, -1), out=self._spare.reshape(m, -1))
-        young = np.flatnonzero(self._ages < self._filled)
-        if len(young):
-            means = self._w[:, young] * _with_past(self.decay[:, None, None], self._ages[young, None])
-            self._spare[:, young] = np.tensordot(self.mixing, means, 1)
-        parts = [self._y, *self._spare, *self._v]
+        w, coordinates = self._w, self._spare
+        if (self._ages < self._filled).any():
+            ages = np.minimum(self._ages, self._filled - 1)
+            factors = self._factors[ages].T if ages.max() < TABLE else _with_past(self.decay[:, None], ages)
+            w = w * factors[:, :, None]
+        np.matmul(self.mixing, w.reshape(len(w), -1), out=coordinates.reshape(len(w), -1))
+        parts = [self._y, *coordinates, *self._v]
         if rows is not None:
             parts = [part[rows] for part in parts]
         return np.concatenate(parts, axis=-1, dtype=np.float32)
@@ -251,12 +255,8 @@ class Memory:
 
 def _with_past(decay: np.ndarray, age: int | np.ndarray) -> np.ndarray:
     """What filters are multiplied by at an age in steps."""
-    return (1 - decay ** (age + IMAGINED)) / (1 - decay ** np.maximum(age, 1))  # they are 0 at the age 0
-
-
-def _ages(last: int) -> list[int]:
-    """Ages to look at: all at first, then ever fewer."""
-    return sorted({*range(1, min(64, last)), *np.geomspace(64, max(last, 64), 64).astype(int).tolist()})
+    with np.errstate(under="ignore"):
+        return (1 - decay ** (age + IMAGINED)) / (1 - decay ** np.maximum(age, 1))  # they are 0 at the age 0
 
 
 def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray) -> np.ndarray:
@@ -292,4 +292,4 @@ def _time_constants(name: str, values: Any) -> tuple[float, ...]:
     return found
 
 
-__all__ = ["Memory"]
+__all__ = ["IMAGINED", "Memory"]

@@ -54,9 +54,9 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
 
     The observation is [y, memory of y, memory of u], float32. y are the entries that are measured. For each of
     them and each time constant follows what a first-order filter keeps of its changes, 0 where y rests; for each input
-    and time constant a running mean. The coordinates are about as large as y, see :class:`kkl_gym.memory.Memory`. At
-    reset the memory is that of an output at rest and of no action. From the first step on, outputs are taken to have
-    changed before it as they have since, for 64 steps. ``info`` is left alone.
+    and time constant a running mean. The coordinates are about as large as y once the memory has filled, see
+    :class:`kkl_gym.memory.Memory`. At reset the memory is that of an output at rest and of no action. From the first
+    step on, outputs are taken to have changed before it as they have since, for 64 steps. ``info`` is left alone.
 
     Parameters
     ----------

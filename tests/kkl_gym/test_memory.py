@@ -148,13 +148,13 @@ def test_an_output_at_rest_leaves_no_trace():
     assert np.abs(shown[2:]).max() < 1e-9
 
 
-@banks
+@pytest.mark.parametrize(("outputs", "inputs"), [*BANKS, ((20.0, 150.0, 600.0), ())])  # the worst age of the last: 456
 def test_bounds_hold_and_are_reached_by_the_worst_signals(outputs, inputs):
     """Of each age and coordinate the output that drives it furthest, by the response to pulses, and the worst input."""
     filters = memory(1, 1, outputs, inputs)
     low, high = filters.bounds(np.array([-1.0]), np.array([3.0]), np.array([-1.0]), np.array([0.5]))
     reached = np.zeros(len(outputs))
-    for age in (1, 2, 3, 4, 5, 10, 20, 31, 40, 52, 53, 54, 63, 64, 150, 400):
+    for age in (1, 2, 3, 4, 5, 10, 20, 31, 40, 52, 53, 54, 63, 64, 150, 400, 456):
         pulses = run(filters, np.eye(age + 1)[:, :, None], np.zeros((age, age + 1, 1)))[-1, :, 1 : 1 + len(outputs)]
         worst = np.where(pulses > 0, 3.0, -1.0)[:, :, None]
         for y, u in ((worst, 0.5), (2.0 - worst, -1.0)):
@@ -185,6 +185,22 @@ def test_one_row_a_batch_and_a_wide_row_agree(monkeypatch):
     assert np.allclose(batch, np.stack(rows, 1), rtol=1e-6, atol=1e-6)
     assert np.array_equal(batch, np.stack(wide, 1))
     assert batch.dtype == rows[0].dtype == np.float32
+
+
+def test_one_row_and_a_batch_agree_at_ages_beyond_the_table(monkeypatch):
+    monkeypatch.setattr(kkl_gym.memory, "TABLE", 5)
+    y, u = signals(12, 3, 2), signals(11, 3, 1, seed=1)
+    batch = run(memory(2, 1), y, u)
+    rows = [run(memory(2, 1), y[:, i], u[:, i]) for i in range(3)]
+    monkeypatch.undo()
+    assert np.allclose(batch, np.stack(rows, 1), rtol=1e-6, atol=1e-6)
+    assert np.allclose(batch, run(memory(2, 1), y, u), rtol=1e-6, atol=1e-6)
+
+
+def test_nothing_underflows_while_a_memory_fills():
+    y = signals(800, 2)
+    with np.errstate(all="raise"):
+        run(memory(2, 1, (0.5, 50.0)), y, signals(799, 1, seed=1))
 
 
 def test_rows_that_rest_and_rows_that_restart():

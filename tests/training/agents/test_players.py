@@ -377,6 +377,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
         ({"measured": (0,), "time_constants": ()}, "at least one"),
         ({"measured": (0,), "frames": 0}, "frames must be"),
         ({"measured": (0,), "frames": 2.5}, "frames must be"),
+        ({"measured": (0,), "frames": 10**9}, "frames must be"),
     ],
 )
 def test_a_task_that_makes_no_sense_is_refused(arguments, says):
@@ -447,6 +448,15 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
         assert (tmp_path / name).stat().st_size > 100
     with pytest.raises(ValueError, match="another comparison: episodes = 4 there, 5 here"):
         Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
+
+
+def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
+    longer = replace(CART, time_constants=(1, 2, 4), frames=9)
+    differ = {
+        kind: Case(CART, kind, 0, 2, None, 0, tmp_path).identity != Case(longer, kind, 0, 2, None, 0, tmp_path).identity
+        for kind in ("random", *SHOWN)
+    }
+    assert {kind for kind in differ if differ[kind]} == {"z", "stacked"}
 
 
 def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):

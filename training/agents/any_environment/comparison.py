@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 import kkl_gym
+from kkl_gym.memory import IMAGINED
 from observers.storage import explained, write
 from training.agents.any_environment.information import SHOWN, Shown, show
 from training.agents.any_environment.task import HiddenTask
@@ -67,10 +68,14 @@ class Case:
     @property
     def identity(self) -> dict[str, Any]:
         """What must not differ between a result that is there and one that is asked for."""
+        task = asdict(self.task)
+        for kind, length in (("z", "time_constants"), ("stacked", "frames")):
+            if self.kind != kind:
+                del task[length]  # which is nothing to the others
         described: dict[str, Any] = {
             "protocol": PROTOCOL,
             "episodes": self.episodes,
-            "task": asdict(self.task),
+            "task": task,
             "version": kkl_gym.__version__,
         }
         if self.kind == RANDOM:
@@ -94,6 +99,8 @@ class Case:
         if self.kind == "x_hat":
             begins = {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
             described |= {"aggregate": self.aggregate, **begins, "rehearsal": REHEARSAL}
+        if self.kind == "z":
+            described["past"] = IMAGINED
         return described
 
     @property

@@ -14,6 +14,7 @@ from observers.checks import LARGEST, integer, is_finite, shown
 from training.agents.information import STACKED
 from training.rollouts.playing import make
 
+MOST_FRAMES = 1_000  # which may come from a stranger's file
 CLEAN, CLEAN_Y = "clean", "clean_y"  # of info, what was before noise was added
 
 
@@ -65,7 +66,7 @@ class HiddenTask:
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
         memory = Memory(1, 0, time_constants=self.time_constants, input_time_constants=())
         object.__setattr__(self, "time_constants", memory.time_constants)
-        object.__setattr__(self, "frames", integer("frames", self.frames, 1))
+        object.__setattr__(self, "frames", integer("frames", self.frames, 1, MOST_FRAMES))
 
     @property
     def name(self) -> str:
