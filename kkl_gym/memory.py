@@ -66,11 +66,9 @@ class Memory:
     def __init__(
         self, ny: int, nu: int, *, time_constants: Sequence[float], input_time_constants: Sequence[float]
     ) -> None:
-        self.time_constants = _time_constants("time_constants", time_constants)
+        self.time_constants = output_time_constants("time_constants", time_constants)
         self.input_time_constants = _time_constants("input_time_constants", input_time_constants)
         m = len(self.time_constants)
-        if not m:
-            raise ValueError("time_constants must name at least one, in steps, such as (1, 2, 4, 8)")
         tau = np.array([*self.time_constants, *self.input_time_constants])
         linear = LinearFilter(-np.diag(1 / tau), 1 / tau[:, None], dt=1.0, nu=1)
         decay = linear.transition.diagonal()[: len(tau)].copy()
@@ -274,6 +272,14 @@ def _mixing(time_constants: Sequence[float], decay: np.ndarray, rise: np.ndarray
     return np.linalg.inv(slowest_first)[:, ::-1].copy()
 
 
+def output_time_constants(name: str, values: Any) -> tuple[float, ...]:
+    """Return time constants of outputs as floats; raises ValueError if they are not as :class:`Memory` takes them."""
+    found = _time_constants(name, values)
+    if not found:
+        raise ValueError(f"{name} must name at least one, in steps, such as (1, 2, 4, 8)")
+    return found
+
+
 def _time_constants(name: str, values: Any) -> tuple[float, ...]:
     """Time constants as floats, or ValueError."""
     array = real_array(name, values)
@@ -292,4 +298,4 @@ def _time_constants(name: str, values: Any) -> tuple[float, ...]:
     return found
 
 
-__all__ = ["IMAGINED", "Memory"]
+__all__ = ["IMAGINED", "Memory", "output_time_constants"]

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
-from kkl_gym.memory import Memory
+from kkl_gym.memory import output_time_constants
 from observers.checks import LARGEST, integer, is_finite, shown
 from training.agents.information import STACKED
 from training.rollouts.playing import make
@@ -64,8 +64,7 @@ class HiddenTask:
         if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:
             raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
-        memory = Memory(1, 0, time_constants=self.time_constants, input_time_constants=())
-        object.__setattr__(self, "time_constants", memory.time_constants)
+        object.__setattr__(self, "time_constants", output_time_constants("time_constants", self.time_constants))
         object.__setattr__(self, "frames", integer("frames", self.frames, 1, MOST_FRAMES))
 
     @property
