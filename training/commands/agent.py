@@ -27,7 +27,7 @@ from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
 
-Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf", "recurrent"]
+Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "stacked_x_hat", "ekf", "recurrent"]
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Train:
         ),
     ]
     information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
-    """What the agent knows: docs/guides/agents.md explains each. In an environment: state, x_hat, z, stacked,
-    recurrent or y."""
+    """What the agent knows: docs/guides/agents.md explains each. In an environment: state, x_hat,
+    stacked_x_hat, z, stacked, recurrent or y (docs/results/partly_observed.md)."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
@@ -123,8 +123,8 @@ class Train:
             if elsewhere:
                 self._in_environment(folder, progress)
                 return
-            if self.information == "recurrent":
-                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got 'recurrent'")
+            if self.information not in INFORMATION:
+                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got {self.information!r}")
             agent = learn(
                 task,
                 self.information,

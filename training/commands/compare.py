@@ -13,7 +13,7 @@ from observers import Artifact
 from observers.names import resolve
 from observers.storage import write
 from training import markdown
-from training.agents.any_environment.information import SHOWN
+from training.agents.any_environment.information import SHOWN, Shown
 from training.agents.comparison import (
     ALL,
     ASKED_FOR,
@@ -69,10 +69,11 @@ class Compare:
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
-        tuple[Compared, ...] | None,
+        tuple[Compared | Shown, ...] | None,
         tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all but x_hat_std)"),
     ] = None
-    """What agents know (docs/guides/agents.md). In environments: state, x_hat, z, stacked, recurrent, y."""
+    """What agents know (docs/guides/agents.md). In environments (docs/results/partly_observed.md): state,
+    x_hat, stacked_x_hat, z, stacked, recurrent, y."""
     seeds: int = 5
     """Agents of each kind. Of our systems at most 3 of the recurrent ones, which take longest, and 1 at the further
     noise levels."""
@@ -117,7 +118,7 @@ class Compare:
             raise ValueError(f"seeds and episodes must be positive, got {self.seeds} and {self.episodes}")
         known: tuple[Any, ...] = SHOWN if self.environments else ALL
         usual: tuple[Any, ...] = SHOWN if self.environments else COMPARED
-        information = usual if self.information is None else self.information
+        information: tuple[Any, ...] = usual if self.information is None else self.information
         for what, given in (
             ("systems", self.systems),
             ("environments", self.environments),

@@ -17,7 +17,7 @@ from observers.storage import checksum
 from training.agents.agent import AgentError
 from training.agents.any_environment import learning, observing
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
-from training.agents.any_environment.information import SHOWN, show
+from training.agents.any_environment.information import ESTIMATES, SHOWN, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
 from training.agents.any_environment.observing import Told, learn_observer, wander
 from training.agents.any_environment.player import Player
@@ -92,7 +92,7 @@ def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
     np.testing.assert_array_equal(*again)
 
 
-@pytest.mark.parametrize("kind", sorted(set(SHOWN) - {"x_hat"}))
+@pytest.mark.parametrize("kind", sorted({*SHOWN} - {*ESTIMATES}))
 @pytest.mark.parametrize("task", [PENDULUM, replace(CART, measurement_noise=0.1)], ids=["pendulum", "cart"])
 def test_what_is_shown_passes_gymnasiums_checker(task, kind):
     with warnings.catch_warnings():
@@ -400,12 +400,12 @@ def test_entries_and_environments_that_are_not_there_are_named():
     ("options", "says"),
     [
         ({"information": "y", "observer": "a.safetensors"}, "no use for the observer"),
-        ({"information": "z", "aggregate": 2}, "no observer to fit again"),
+        ({"information": "z", "aggregate": 2}, "no observer that is fitted again"),
         ({"information": "z", "algorithm": "ppo_lstm"}, "only that"),
         ({"information": "recurrent", "algorithm": "ppo"}, "only that"),
         ({"information": "x_hat", "observer_steps": 10**9}, "fewer than all"),
         ({"information": "x_hat", "timesteps": 4}, r"4 steps are too few .*--timesteps"),
-        ({"information": "z", "observer_steps": 10}, "for agents on x_hat that are given no observer"),
+        ({"information": "z", "observer_steps": 10}, "for agents on x_hat or stacked_x_hat that are given"),
         ({"information": "z", "timesteps": 0}, "must be positive"),
         ({"information": "z", "algorithm": "reinforce"}, "unknown algorithm"),
     ],
@@ -456,7 +456,7 @@ def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
         kind: Case(CART, kind, 0, 2, None, 0, tmp_path).identity != Case(longer, kind, 0, 2, None, 0, tmp_path).identity
         for kind in ("random", *SHOWN)
     }
-    assert {kind for kind in differ if differ[kind]} == {"z", "stacked"}
+    assert {kind for kind in differ if differ[kind]} == {"z", "stacked", "stacked_x_hat"}
 
 
 def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):

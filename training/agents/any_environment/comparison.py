@@ -12,7 +12,7 @@ import numpy as np
 import kkl_gym
 from kkl_gym.memory import IMAGINED
 from observers.storage import explained, write
-from training.agents.any_environment.information import SHOWN, Shown, show
+from training.agents.any_environment.information import ESTIMATES, SHOWN, Shown, show
 from training.agents.any_environment.task import HiddenTask
 from training.jobs import check_identity, claimed_job
 from training.seeds import AGENT_EVALUATION_SEED
@@ -38,7 +38,7 @@ class Case:
     ----------
     task : HiddenTask
         Where it acts.
-    kind : {"random", "state", "x_hat", "z", "stacked", "recurrent", "y"}
+    kind : {"random", "state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
         What it is shown; of "random" nobody learns.
     seed : int
         The agent's.
@@ -69,8 +69,8 @@ class Case:
     def identity(self) -> dict[str, Any]:
         """What must not differ between a result that is there and one that is asked for."""
         task = asdict(self.task)
-        for kind, length in (("z", "time_constants"), ("stacked", "frames")):
-            if self.kind != kind:
+        for length, kinds in (("time_constants", ("z",)), ("frames", ("stacked", "stacked_x_hat"))):
+            if self.kind not in kinds:
                 del task[length]  # which is nothing to the others
         described: dict[str, Any] = {
             "protocol": PROTOCOL,
@@ -96,9 +96,10 @@ class Case:
             "hyperparameters": hyperparameters(algorithm, self.task.env_id),
             "aggregate": 0,
         }
+        if self.kind in ESTIMATES:
+            described |= {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
         if self.kind == "x_hat":
-            begins = {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
-            described |= {"aggregate": self.aggregate, **begins, "rehearsal": REHEARSAL}
+            described |= {"aggregate": self.aggregate, "rehearsal": REHEARSAL}
         if self.kind == "z":
             described["past"] = IMAGINED
         return described

@@ -14,9 +14,11 @@ from kkl_gym import KKLMemory, KKLObservation
 from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
 from training.agents.any_environment.task import HiddenTask
+from training.agents.any_environment.window import WindowEstimator, estimating
 
-Shown = Literal["state", "x_hat", "z", "stacked", "recurrent", "y"]
+Shown = Literal["state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)
+ESTIMATES: tuple[Shown, ...] = ("x_hat", "stacked_x_hat")  # what is learned from hidden signals
 
 
 def show(task: HiddenTask, information: Shown, observer: str | None = None) -> gym.Env[np.ndarray, Any]:
@@ -26,14 +28,14 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
     ----------
     task : HiddenTask
         The environment, what is measured and how well.
-    information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
+    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
         "state": the whole observation without noise. The others see what is measured, y, with its noise. "x_hat": y,
         and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
-        measured too. "z": y and the memory of :class:`kkl_gym.KKLMemory`. "stacked": the last y, as many as the task
-        says, each with the action before it. "recurrent": y with the action before it, for a policy that remembers by
-        itself. "y": y alone.
+        measured too. "stacked_x_hat": the same, estimated by a network from what "stacked" shows. "z": y and the memory
+        of :class:`kkl_gym.KKLMemory`. "stacked": the last y, as many as the task says, each with the action before it.
+        "recurrent": y with the action before it, for a policy that remembers by itself. "y": y alone.
     observer : str, optional
-        File of the observer, for "x_hat".
+        File of the observer, for "x_hat", or of a :class:`WindowEstimator`, for "stacked_x_hat".
 
     Returns
     -------
@@ -49,19 +51,27 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         raise ValueError(f"an agent is shown one of {', '.join(SHOWN)}, got {information!r}")
     if information == "state":
         return task.without_noise.make()
+    if information in ESTIMATES and observer is None:
+        raise ValueError(f"an agent that is shown {information} needs an observer")
     env = task.make()
     if information == "x_hat":
-        if observer is None:
-            raise ValueError("an agent that is shown x_hat needs an observer")
         env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
         shown: Any = env.observation_space
         return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
         return KKLMemory(env, task.measured, time_constants=task.time_constants)
+    whole: Any = env.observation_space
     env = part_of(env, task.measured)
     if information == "y":
         return env
-    return StackedWithActions(env, 1 if information == "recurrent" else task.frames)
+    env = StackedWithActions(env, 1 if information == "recurrent" else task.frames)
+    if observer is None or information != "stacked_x_hat":
+        return env
+    entries, outputs = list(task.told(whole.shape[0])), len(task.measured)
+    if task.measurement_noise:  # what is measured is estimated as well
+        entries, outputs = sorted(entries), 0
+    space = gym.spaces.Box(whole.low[entries], whole.high[entries], dtype=np.float32)
+    return estimating(env, WindowEstimator.read(observer), space, outputs)
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:

@@ -24,10 +24,11 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from observers.storage import replacing
 from training.agents.agent import fingerprint
-from training.agents.any_environment.information import Shown, show
+from training.agents.any_environment.information import ESTIMATES, Shown, show
 from training.agents.any_environment.observing import OBSERVER, Told, learn_observer, refitting, wander
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
+from training.agents.any_environment.window_fit import learn_window
 from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
 from training.records import Record
@@ -154,7 +155,7 @@ def learn_to_play(
     ----------
     task : HiddenTask
         Where it acts.
-    information : {"state", "x_hat", "z", "stacked", "recurrent", "y"}
+    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
         What it is shown, as :func:`training.agents.any_environment.information.show`.
     folder : Path
         Receives the learning curve, curve.csv, an observer's file if one is learned, and, where the policy is a
@@ -166,12 +167,12 @@ def learn_to_play(
     seed : int
         Of networks, exploration and episodes.
     observer : str, optional
-        File of an observer, for x_hat; by default one is learned.
+        File of an observer, for x_hat, or of an estimator, for stacked_x_hat; by default one is learned.
     observer_steps : int, optional
         The agent's first steps, from the latest 100,000 of which it is learned; by default nine tenths of all, and
         under noise one tenth. They end with what the algorithm collects at a time, and before what it collects last.
     aggregate : int
-        How many times it is fitted again while the agent learns on estimates, where an algorithm begins to collect. A
+        How many times it is fitted again while the agent learns on x_hat, where an algorithm begins to collect. A
         twentieth of all steps, the last ones, is then without exploration, and followed by one more fit.
     progress : ProgressBars, optional
         Where bars are shown.
@@ -194,12 +195,12 @@ def learn_to_play(
     settings = hyperparameters(name, task.env_id, timesteps)
     _check_actions(name, actions, task.env_id)
     steps, began = settings["n_timesteps"], time.process_time()
-    if observer is not None and information != "x_hat":
+    if observer is not None and information not in ESTIMATES:
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
     if aggregate and information != "x_hat":
-        raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
+        raise ValueError(f"an agent that is shown {information!r} has no observer that is fitted again")
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
-    learns_observer, spent = information == "x_hat" and observer is None, 0
+    learns_observer, spent = information in ESTIMATES and observer is None, 0
     if learns_observer:
         share = WANDERED if task.measurement_noise else TOLD
         spent = round(share * steps) if observer_steps is None else observer_steps
@@ -210,10 +211,11 @@ def learn_to_play(
                 f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {spent}"
             )
     elif observer_steps is not None:
-        raise ValueError("observer_steps is for agents on x_hat that are given no observer")
+        raise ValueError("observer_steps is for agents on x_hat or stacked_x_hat that are given no observer")
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
-        learned = partial(learn_observer, task, folder=folder, seed=seed, progress=bars)
+        learn = learn_observer if information == "x_hat" else learn_window
+        learned = partial(learn, task, folder=folder, seed=seed, progress=bars)
         curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()  # no random actions in refits
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
             observer = str(learned(wander(task, spent, seed=seed, progress=bars)))

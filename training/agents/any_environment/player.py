@@ -33,7 +33,7 @@ class Player:
         bounds (PPO, A2C); the largest entry, of discrete actions (PPO, A2C, DQN).
     task : HiddenTask
         Where it acts.
-    information : {"state", "x_hat", "z", "stacked", "y"}
+    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "y"}
         What it is shown.
     mean, scale : ndarray, shape (width,), optional
         Observations are shown as (observation - mean) / scale, cut at 10; by default as they are.

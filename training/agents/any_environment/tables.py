@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 LABELS = {
     "state": "full state",
     "x_hat": "y and x̂",
+    "stacked_x_hat": "y and estimates of stacks",
     "z": "y and z",
     "stacked": "stacked y and actions",
     "recurrent": "y, recurrent agent",

@@ -1,0 +1,147 @@
+"""Estimates by a network on stacked observations, the rival of observers that is told as much."""
+
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from observers import MLP
+from training.agents.any_environment import learning
+from training.agents.any_environment.information import StackedWithActions, part_of, show
+from training.agents.any_environment.learning import learn_to_play
+from training.agents.any_environment.observing import SETTINGS, Told, wander
+from training.agents.any_environment.player import Player
+from training.agents.any_environment.task import HIDDEN_VELOCITIES
+from training.agents.any_environment.window import WindowEstimator
+from training.agents.any_environment.window_fit import _Regression, learn_window
+from training.progress import progress_bars
+from training.rollouts.playing import Recorder
+
+PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
+CART = HIDDEN_VELOCITIES["CartPole-v1"]
+FEW_STEPS = {
+    "default": {
+        "n_envs": 2,
+        "n_timesteps": 64,
+        "policy": "MlpPolicy",
+        "n_steps": 16,
+        "batch_size": 16,
+        "policy_kwargs": {"net_arch": [8]},
+    }
+}
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setitem(SETTINGS, "inverse_steps", 300)
+
+
+def wandered(task, steps=2000, seed=0):
+    with progress_bars(None) as bars:
+        return wander(task, steps, seed=seed, progress=bars)
+
+
+def learned(task, folder, records):
+    with progress_bars(None) as bars:
+        return str(learn_window(task, records, folder, seed=0, progress=bars))
+
+
+@pytest.mark.parametrize("task", [PENDULUM, CART], ids=["pendulum", "cart"])
+def test_it_is_fitted_to_the_stacks_that_it_will_see(task):
+    whole = task.make()
+    recorder = Recorder(whole, measured=[str(i) for i in task.measured], hidden=task.estimated(3))
+    env = StackedWithActions(part_of(recorder, task.measured), 5)
+    env.action_space.seed(0)
+    seen, states = [], []
+    for episode in range(3):
+        seen.append(env.reset(seed=episode)[0])
+        over = False
+        while not over:
+            stack, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            seen.append(stack)
+            over = terminated or truncated
+    records = recorder.rollouts().records()
+    states = np.concatenate([record.x for record in records])
+    found = _Regression(records, 5, 0.0)
+    table = found._table[found._stack].numpy() * found._scale + found._mean
+    np.testing.assert_allclose(table.reshape(len(seen), -1), seen, atol=1e-5)
+    np.testing.assert_allclose(found._x.numpy() * found._x_scale + found._x_mean, states, atol=1e-5)
+
+
+def test_an_output_has_one_noise_wherever_it_stands():
+    found, given = _Regression(wandered(PENDULUM, 200), 4, 0.3), []
+    found.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+    found._stack[:] = found._stack[0]  # all of them the first output of an episode, four times
+    found.loss(torch.Generator().manual_seed(0))
+    stacks = given[0].reshape(-1, 4, 3)
+    assert (stacks == stacks[:, :1]).all()
+    noise = (stacks[:, 0] - found._table[found._stack[0, 0]]).numpy() * found._scale
+    np.testing.assert_allclose(noise.std(0), [0.3, 0.3, 0.0], rtol=0.1)
+
+
+def test_its_file_estimates_what_is_hidden(tmp_path):
+    path = learned(CART, tmp_path, wandered(CART, 5000))
+    env, plain = show(CART, "stacked_x_hat", path), CART.make()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about bounds that are infinite, and that the environment is wrapped
+        check_env(env, skip_render_check=True)
+    apart, there = [], []
+    for episode in range(20):
+        obs, whole = env.reset(seed=100 + episode)[0], plain.reset(seed=100 + episode)[0]
+        over = False
+        while not over:
+            np.testing.assert_array_equal(obs[:2], whole[[0, 2]])
+            action = env.action_space.sample()
+            obs, _, over, *_ = env.step(action)
+            whole = plain.step(action)[0]
+            apart.append(obs[2:] - whole[[1, 3]])
+            there.append(whole[[1, 3]])
+    assert (np.std(apart, 0) < 0.05 * np.std(there, 0)).all()
+
+
+def test_under_noise_it_estimates_what_is_measured_too(tmp_path):
+    noisy = replace(PENDULUM, measurement_noise=0.2)
+    env = show(noisy, "stacked_x_hat", learned(noisy, tmp_path, wandered(noisy, 4000)))
+    seen, exact = [], []
+    obs, info = env.reset(seed=7)
+    for _ in range(200):
+        seen.append(obs)
+        exact.append(info["clean"])
+        obs, _, _, _, info = env.step(env.action_space.sample())
+    assert obs.shape == (3,)
+    assert (np.std(np.subtract(seen, exact)[8:], 0)[:2] < 0.15).all()  # of noise of 0.2
+
+
+def test_agents_learn_on_it_and_their_files_act(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "settings_of", lambda name: FEW_STEPS)
+    learn_to_play(CART, "stacked_x_hat", tmp_path, algorithm="ppo", timesteps=400)
+    player = Player.read(tmp_path / "agent.safetensors")
+    env = player.make()
+    obs, _ = env.reset(seed=0)
+    assert obs.shape == (4,)
+    assert env.observation_space == Told(CART, 1).make().observation_space
+    assert player.act(obs, env.action_space) in env.action_space
+
+
+def test_what_is_none_or_anothers_is_refused(tmp_path):
+    path = tmp_path / "window.safetensors"
+    network = MLP([np.zeros((1, 24))], [np.zeros(1)], "tanh")
+    WindowEstimator(network, 8).save(path)
+    assert WindowEstimator.read(path).frames == 8
+    assert show(PENDULUM, "stacked_x_hat", str(path)).observation_space.shape == (3,)
+    with pytest.raises(ValueError, match="made for another task"):
+        show(CART, "stacked_x_hat", str(path))
+    with pytest.raises(ValueError, match="cannot take 7 outputs"):
+        WindowEstimator(network, 7)
+    with pytest.raises(ValueError, match="needs an observer"):
+        show(PENDULUM, "stacked_x_hat")
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="damaged"):
+        WindowEstimator.read(path)
+    with pytest.raises(ValueError, match="stacked_x_hat' has no observer that is fitted again"):
+        learn_to_play(CART, "stacked_x_hat", tmp_path, algorithm="ppo", aggregate=1)
