@@ -5,7 +5,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
@@ -215,11 +216,15 @@ class KKLTrainingCallback(BaseCallback):
             self._begin(row, goes_on=True)
 
     def _on_step(self) -> bool:
-        for row, (info, done) in enumerate(zip(self.locals["infos"], self.locals["dones"], strict=True)):
+        self._took(self.locals["infos"], self.locals["dones"])
+        return True
+
+    def _took(self, infos: Sequence[dict[str, Any]], dones: Iterable[bool]) -> None:
+        """Take in a step of all environments."""
+        for row, (info, done) in enumerate(zip(infos, dones, strict=True)):
             self._gathering.add(row, info)
             if done:
                 self._begin(row)
-        return True
 
     def _on_rollout_start(self) -> None:
         if self._gathering.steps >= self._next:
@@ -227,7 +232,12 @@ class KKLTrainingCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         if self._rehearsal:
-            self._rehearse()
+            for infos, dones in rehearsed(self.model, self._rehearsal):
+                if infos:
+                    self._took(infos, dones)
+                else:
+                    for row in range(self.training_env.num_envs):
+                        self._begin(row)
             self._refit_where_possible()
 
     def _refit_where_possible(self) -> None:
@@ -238,24 +248,6 @@ class KKLTrainingCallback(BaseCallback):
         telling = held_out if self._before and self._config.held_out else train
         if any(record.duration >= memory for record in telling):
             self._refit(train, held_out)
-
-    def _rehearse(self) -> None:
-        """Play the agent as it will act, without exploration, in the environments in which it has learned."""
-        env, until = self.training_env, self._gathering.steps + self._rehearsal
-        with _as_it_is(self.model.get_vec_normalize_env()):
-            observations: Any = env.reset()
-            state: Any = None
-            starts = np.ones(env.num_envs, dtype=bool)
-            for row in range(env.num_envs):
-                self._begin(row)
-            while self._gathering.steps < until:
-                actions, state = self.model.predict(observations, state, starts, deterministic=True)
-                observations, _, starts, infos = env.step(actions)
-                for row, (info, done) in enumerate(zip(infos, starts, strict=True)):
-                    self._gathering.add(row, info)
-                    if done:
-                        self._begin(row)
-        self.model.set_env(env)  # which makes a training that goes on reset it
 
     def _begin(self, row: int, *, goes_on: bool = False) -> None:
         """Begin an episode with what its reset said, or with its first step where that is not known."""
@@ -309,6 +301,34 @@ class KKLTrainingCallback(BaseCallback):
             vector.replace_observer(self.artifact)
 
 
+def rehearsed(model: BaseAlgorithm, steps: int) -> Iterator[tuple[Sequence[dict[str, Any]], np.ndarray]]:
+    """Play an agent as it will act, without exploration, in the environments in which it has learned.
+
+    Parameters
+    ----------
+    model : stable_baselines3 algorithm
+        The agent. What scales its observations learns nothing.
+    steps : int
+        Of all environments together, at least.
+
+    Yields
+    ------
+    infos : sequence of dict
+        Of each environment, after each step; none after the reset.
+    dones : ndarray of bool
+        Whose episodes have ended; all after the reset.
+    """
+    env: Any = model.get_env()
+    with _as_it_is(model.get_vec_normalize_env()):
+        observations, state, dones = env.reset(), None, np.ones(env.num_envs, dtype=bool)
+        yield (), dones
+        for _ in range(math.ceil(steps / env.num_envs)):
+            actions, state = model.predict(observations, state, dones, deterministic=True)
+            observations, _, dones, infos = env.step(actions)
+            yield infos, dones
+    model.set_env(env)  # which makes a training that goes on reset it
+
+
 @contextmanager
 def _as_it_is(scaling: VecNormalize | None) -> Iterator[None]:
     """What scales observations learns nothing inside."""
@@ -350,4 +370,4 @@ def _together(errors: RecordedErrors) -> float:
     return float(np.sqrt(np.mean(np.square(list(errors.relative.values())))))
 
 
-__all__ = ["KKLTrainingCallback", "Refit"]
+__all__ = ["KKLTrainingCallback", "Refit", "rehearsed"]

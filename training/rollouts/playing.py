@@ -172,8 +172,13 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self._rewards.append(float(reward))
         return observation, float(reward), self._terminated, truncated, info
 
-    def rollouts(self) -> Rollouts:
+    def rollouts(self, *, ended: bool = False) -> Rollouts:
         """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with.
+
+        Parameters
+        ----------
+        ended : bool
+            Whether it is to go on instead, and not to count.
 
         Returns
         -------
@@ -185,7 +190,8 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         ValueError
             If ``info`` does not hold what is asked of it.
         """
-        self._end()
+        if not ended:
+            self._end()
         return Rollouts(
             self._name,
             self._identity,

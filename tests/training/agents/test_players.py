@@ -400,7 +400,7 @@ def test_entries_and_environments_that_are_not_there_are_named():
     ("options", "says"),
     [
         ({"information": "y", "observer": "a.safetensors"}, "no use for the observer"),
-        ({"information": "z", "aggregate": 2}, "no observer that is fitted again"),
+        ({"information": "z", "aggregate": 2}, "no observer to fit again"),
         ({"information": "z", "algorithm": "ppo_lstm"}, "only that"),
         ({"information": "recurrent", "algorithm": "ppo"}, "only that"),
         ({"information": "x_hat", "observer_steps": 10**9}, "fewer than all"),

@@ -9,7 +9,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from observers import MLP
-from training.agents.any_environment import learning
+from training.agents.any_environment import learning, window_fit
 from training.agents.any_environment.information import StackedWithActions, part_of, show
 from training.agents.any_environment.learning import learn_to_play
 from training.agents.any_environment.observing import SETTINGS, Told, wander
@@ -21,16 +21,12 @@ from training.progress import progress_bars
 from training.rollouts.playing import Recorder
 
 PENDULUM = HIDDEN_VELOCITIES["Pendulum-v1"]
+NOISY = replace(PENDULUM, measurement_noise=0.3, frames=4)
 CART = HIDDEN_VELOCITIES["CartPole-v1"]
-FEW_STEPS = {
-    "default": {
-        "n_envs": 2,
-        "n_timesteps": 64,
-        "policy": "MlpPolicy",
-        "n_steps": 16,
-        "batch_size": 16,
-        "policy_kwargs": {"net_arch": [8]},
-    }
+NARROW = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [8]}, "n_timesteps": 64}
+SMALL = {
+    "ppo": {"default": {**NARROW, "n_envs": 2, "n_steps": 16, "batch_size": 16}},
+    "sac": {"default": {**NARROW, "n_envs": 2, "learning_starts": 32, "train_freq": 10, "gradient_steps": 1}},
 }
 
 
@@ -65,14 +61,14 @@ def test_it_is_fitted_to_the_stacks_that_it_will_see(task):
             over = terminated or truncated
     records = recorder.rollouts().records()
     states = np.concatenate([record.x for record in records])
-    found = _Regression(records, 5, 0.0)
+    found = _Regression(replace(task, frames=5), records)
     table = found._table[found._stack].numpy() * found._scale + found._mean
     np.testing.assert_allclose(table.reshape(len(seen), -1), seen, atol=1e-5)
     np.testing.assert_allclose(found._x.numpy() * found._x_scale + found._x_mean, states, atol=1e-5)
 
 
 def test_an_output_has_one_noise_wherever_it_stands():
-    found, given = _Regression(wandered(PENDULUM, 200), 4, 0.3), []
+    found, given = _Regression(NOISY, wandered(NOISY, 200)), []
     found.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
     found._stack[:] = found._stack[0]  # all of them the first output of an episode, four times
     found.loss(torch.Generator().manual_seed(0))
@@ -116,7 +112,7 @@ def test_under_noise_it_estimates_what_is_measured_too(tmp_path):
 
 
 def test_agents_learn_on_it_and_their_files_act(tmp_path, monkeypatch):
-    monkeypatch.setattr(learning, "settings_of", lambda name: FEW_STEPS)
+    monkeypatch.setattr(learning, "settings_of", SMALL.get)
     learn_to_play(CART, "stacked_x_hat", tmp_path, algorithm="ppo", timesteps=400)
     player = Player.read(tmp_path / "agent.safetensors")
     env = player.make()
@@ -143,5 +139,25 @@ def test_what_is_none_or_anothers_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match="damaged"):
         WindowEstimator.read(path)
-    with pytest.raises(ValueError, match="stacked_x_hat' has no observer that is fitted again"):
-        learn_to_play(CART, "stacked_x_hat", tmp_path, algorithm="ppo", aggregate=1)
+
+
+@pytest.mark.parametrize(("task", "algorithm"), [(replace(CART, measurement_noise=0.02), "ppo"), (PENDULUM, "sac")])
+def test_it_is_fitted_again_to_what_the_agent_does(tmp_path, monkeypatch, task, algorithm):
+    fits, fitted = [], window_fit.learn_window
+
+    def noted(task, records, **options):
+        fits.append(sum(len(record.t) - 1 for record in records))
+        return fitted(task, records, **options)
+
+    monkeypatch.setattr(window_fit, "learn_window", noted)
+    monkeypatch.setattr(learning, "settings_of", SMALL.get)
+    learn_to_play(task, "stacked_x_hat", tmp_path, algorithm=algorithm, timesteps=4000, aggregate=2)
+    if task.measurement_noise:  # of 3,400 steps after the random ones, and 200 without exploration; some are under way
+        assert len(fits) == 3
+        assert 1000 < fits[0] <= 1200 < 2000 < fits[1] <= 2400 < fits[2] < 3640
+    else:  # all that was told counts as well
+        assert 4000 <= fits[-1] < 4010
+    env = Player.read(tmp_path / "agent.safetensors").make()
+    np.testing.assert_array_equal(
+        env.reset(seed=1)[0], show(task, "stacked_x_hat", str(tmp_path / "observer.safetensors")).reset(seed=1)[0]
+    )

@@ -97,9 +97,8 @@ class Case:
             "aggregate": 0,
         }
         if self.kind in ESTIMATES:
-            described |= {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
-        if self.kind == "x_hat":
-            described |= {"aggregate": self.aggregate, "rehearsal": REHEARSAL}
+            begins = {"wanders": WANDERED} if self.task.measurement_noise else {"told": TOLD}
+            described |= {"aggregate": self.aggregate, **begins, "rehearsal": REHEARSAL}
         if self.kind == "z":
             described["past"] = IMAGINED
         return described
@@ -150,7 +149,7 @@ def _run(case: Case) -> dict[str, Any]:
             case.folder,
             timesteps=case.timesteps,
             seed=case.seed,
-            aggregate=case.aggregate if kind == "x_hat" else 0,
+            aggregate=case.aggregate if kind in ESTIMATES else 0,
         )
     seconds = time.process_time() - began
     shown = "state" if kind == RANDOM else kind

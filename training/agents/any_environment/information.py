@@ -14,14 +14,17 @@ from kkl_gym import KKLMemory, KKLObservation
 from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
 from training.agents.any_environment.task import HiddenTask
-from training.agents.any_environment.window import WindowEstimator, estimating
+from training.agents.any_environment.window import WindowEstimator, WindowObservation
+from training.rollouts.playing import Recorder
 
 Shown = Literal["state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)
 ESTIMATES: tuple[Shown, ...] = ("x_hat", "stacked_x_hat")  # what is learned from hidden signals
 
 
-def show(task: HiddenTask, information: Shown, observer: str | None = None) -> gym.Env[np.ndarray, Any]:
+def show(
+    task: HiddenTask, information: Shown, observer: str | None = None, *, keep: int | None = None
+) -> gym.Env[np.ndarray, Any]:
     """Make a task's environment in which an agent sees what ``information`` says.
 
     Parameters
@@ -36,6 +39,8 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         "recurrent": y with the action before it, for a policy that remembers by itself. "y": y alone.
     observer : str, optional
         File of the observer, for "x_hat", or of a :class:`WindowEstimator`, for "stacked_x_hat".
+    keep : int, optional
+        Of "stacked_x_hat", how many steps are kept to fit the estimator again; by default none.
 
     Returns
     -------
@@ -60,18 +65,26 @@ def show(task: HiddenTask, information: Shown, observer: str | None = None) -> g
         return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
         return KKLMemory(env, task.measured, time_constants=task.time_constants)
-    whole: Any = env.observation_space
+    if information == "stacked_x_hat":
+        return _stacked_estimates(task, env, WindowEstimator.read(str(observer)), keep)
     env = part_of(env, task.measured)
     if information == "y":
         return env
-    env = StackedWithActions(env, 1 if information == "recurrent" else task.frames)
-    if observer is None or information != "stacked_x_hat":
-        return env
+    return StackedWithActions(env, 1 if information == "recurrent" else task.frames)
+
+
+def _stacked_estimates(
+    task: HiddenTask, env: gym.Env[np.ndarray, Any], estimator: WindowEstimator, keep: int | None
+) -> gym.Env[np.ndarray, Any]:
+    """Y and what a network estimates from stacked observations; under noise the estimates alone."""
+    whole: Any = env.observation_space
     entries, outputs = list(task.told(whole.shape[0])), len(task.measured)
     if task.measurement_noise:  # what is measured is estimated as well
         entries, outputs = sorted(entries), 0
     space = gym.spaces.Box(whole.low[entries], whole.high[entries], dtype=np.float32)
-    return estimating(env, WindowEstimator.read(observer), space, outputs)
+    if keep is not None:
+        env = Recorder(env, **task.signals(whole.shape[0]), keep=keep)
+    return WindowObservation(StackedWithActions(part_of(env, task.measured), task.frames), estimator, space, outputs)
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
@@ -143,4 +156,4 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         return np.concatenate(self._rows, dtype=np.float32)
 
 
-__all__ = ["SHOWN", "Shown", "StackedWithActions", "part_of", "show"]
+__all__ = ["ESTIMATES", "SHOWN", "Shown", "StackedWithActions", "part_of", "show"]

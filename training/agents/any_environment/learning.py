@@ -25,10 +25,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from observers.storage import replacing
 from training.agents.agent import fingerprint
 from training.agents.any_environment.information import ESTIMATES, Shown, show
-from training.agents.any_environment.observing import OBSERVER, Told, learn_observer, refitting, wander
+from training.agents.any_environment.observing import KEPT, OBSERVER, Told, learn_observer, refitting, wander
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
-from training.agents.any_environment.window_fit import learn_window
+from training.agents.any_environment.window_fit import learn_window, refitting_window
 from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
 from training.records import Record
@@ -172,7 +172,7 @@ def learn_to_play(
         The agent's first steps, from the latest 100,000 of which it is learned; by default nine tenths of all, and
         under noise one tenth. They end with what the algorithm collects at a time, and before what it collects last.
     aggregate : int
-        How many times it is fitted again while the agent learns on x_hat, where an algorithm begins to collect. A
+        How many times it is fitted again while the agent learns on estimates, where an algorithm begins to collect. A
         twentieth of all steps, the last ones, is then without exploration, and followed by one more fit.
     progress : ProgressBars, optional
         Where bars are shown.
@@ -197,8 +197,8 @@ def learn_to_play(
     steps, began = settings["n_timesteps"], time.process_time()
     if observer is not None and information not in ESTIMATES:
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
-    if aggregate and information != "x_hat":
-        raise ValueError(f"an agent that is shown {information!r} has no observer that is fitted again")
+    if aggregate and information not in ESTIMATES:
+        raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
     learns_observer, spent = information in ESTIMATES and observer is None, 0
     if learns_observer:
@@ -214,7 +214,11 @@ def learn_to_play(
         raise ValueError("observer_steps is for agents on x_hat or stacked_x_hat that are given no observer")
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
-        learn = learn_observer if information == "x_hat" else learn_window
+        refits: Callable[..., BaseCallback]
+        if information == "stacked_x_hat":
+            learn, refits = learn_window, partial(refitting_window, seed=seed, progress=bars)
+        else:
+            learn, refits = learn_observer, refitting
         learned = partial(learn, task, folder=folder, seed=seed, progress=bars)
         curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()  # no random actions in refits
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
@@ -223,7 +227,8 @@ def learn_to_play(
         elif learns_observer:
             told = Told(task, settings.get("n_envs", 1))
         left = steps - rehearsal - curve.spent
-        make = partial(show, task, information, observer) if told is None else told.make
+        keep = KEPT // settings.get("n_envs", 1) if aggregate else None
+        make = partial(show, task, information, observer, keep=keep) if told is None else told.make
         with closing(_Learner(ALGORITHMS[name], settings, seed, make)) as learner:
             if told is not None:
                 with bars.phase(f"{description}, told the truth", spent) as report:
@@ -235,10 +240,10 @@ def learn_to_play(
                     )
                 observer = str(learned(told.records()))
                 before = told.oldest_first() if aggregate else []
-                learner.move(partial(show, task, information, observer))
+                learner.move(partial(show, task, information, observer, keep=keep))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
-                callbacks.append(refitting(task, aggregate, left - learner.steps, rehearsal, newest, before))
+                callbacks.append(refits(task, aggregate, left - learner.steps, rehearsal, newest, before))
             with bars.phase(description, left) as report:
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model

@@ -53,7 +53,7 @@ class Told:
             Its observations are those of an agent on estimates, had these no error.
         """
         env = self._task.make()
-        recorder = Recorder(env, **_signals(self._task, env), keep=self._each)
+        recorder = Recorder(env, **self._task.signals(_size(env)), keep=self._each)
         self._recorders.append(recorder)
         return part_of(recorder, self._task.told(_size(env)))
 
@@ -108,12 +108,8 @@ def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -
     """
     with task.make(noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
         policy = policy_of(WANDERING, env)
-        rollouts = roll_out(env, policy, **_signals(task, env), steps=steps, seed=seed, report=report)
+        rollouts = roll_out(env, policy, **task.signals(_size(env)), steps=steps, seed=seed, report=report)
     return rollouts.records()
-
-
-def _signals(task: HiddenTask, env: gym.Env[np.ndarray, Any]) -> dict[str, Any]:
-    return {"measured": [str(i) for i in task.measured], "hidden": task.estimated(_size(env))}
 
 
 def _size(env: gym.Env[np.ndarray, Any]) -> int:

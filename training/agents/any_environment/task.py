@@ -144,6 +144,21 @@ class HiddenTask:
         """
         return (*self.measured, *self._hidden(size))
 
+    def signals(self, size: int) -> dict[str, Any]:
+        """What is recorded of the environment to learn from, as :class:`training.rollouts.playing.Recorder` takes it.
+
+        Parameters
+        ----------
+        size : int
+            Entries of a flattened observation.
+
+        Returns
+        -------
+        dict
+            ``measured``, with whatever noise there is, and ``hidden``, what is to be estimated.
+        """
+        return {"measured": [str(i) for i in self.measured], "hidden": self.estimated(size)}
+
     def _hidden(self, size: int) -> tuple[int, ...]:
         return tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
 

@@ -2,12 +2,11 @@
 
 import os
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.wrappers import TransformObservation
+from gymnasium.utils import RecordConstructorArgs
 
 from observers import MLP, storage
 from observers.checks import integer
@@ -84,10 +83,8 @@ class WindowEstimator:
             return cls(storage.get_mlp(tensors, "", described["activation"]), described["frames"])
 
 
-def estimating(
-    env: gym.Env[np.ndarray, Any], estimator: WindowEstimator, space: gym.spaces.Box, outputs: int
-) -> gym.Env[np.ndarray, Any]:
-    """Show what an estimator says of stacked observations in their place.
+class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], RecordConstructorArgs):
+    """Shows what an estimator says of stacked observations in their place.
 
     Parameters
     ----------
@@ -100,30 +97,38 @@ def estimating(
     outputs : int
         How many of it are outputs, the first of the latest in the stack. The others are estimates.
 
-    Returns
-    -------
-    gymnasium.Env
-        The environment.
-
     Raises
     ------
     ValueError
         If the estimator was made for stacks, or for signals, of another number.
     """
-    network, stacked = estimator.network, gym.spaces.flatdim(env.observation_space)
-    wanted = stacked, gym.spaces.flatdim(space) - outputs
-    if (network.inputs, network.outputs) != wanted:
-        raise ValueError(
-            f"the estimator makes {network.outputs} numbers of {network.inputs}, and {wanted[1]} of {wanted[0]} are "
-            "needed: it was made for another task"
-        )
-    latest = stacked - stacked // estimator.frames
-    shown = slice(latest, latest + outputs)
-    return TransformObservation(env, partial(_estimated, network, shown, space.low, space.high), space)
+
+    def __init__(
+        self, env: gym.Env[np.ndarray, Any], estimator: WindowEstimator, space: gym.spaces.Box, outputs: int
+    ) -> None:
+        RecordConstructorArgs.__init__(self, estimator=estimator, space=space, outputs=outputs)
+        gym.ObservationWrapper.__init__(self, env)
+        self.observation_space, self._low, self._high = space, space.low, space.high
+        stacked = gym.spaces.flatdim(env.observation_space)
+        latest = stacked - stacked // estimator.frames
+        self._outputs = slice(latest, latest + outputs)
+        self._wanted = stacked, gym.spaces.flatdim(space) - outputs
+        self.replace_estimator(estimator)
+
+    def replace_estimator(self, estimator: WindowEstimator) -> None:
+        """Go on with another estimator of the same signals from as many observations; raises ValueError otherwise."""
+        network, (inputs, outputs) = estimator.network, self._wanted
+        if (network.inputs, network.outputs) != self._wanted:
+            raise ValueError(
+                f"the estimator makes {network.outputs} numbers of {network.inputs}, and {outputs} of {inputs} are "
+                "needed: it was made for another task"
+            )
+        self._network = network
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """What is shown of a stack."""
+        shown = np.concatenate([observation[self._outputs], self._network(observation)])
+        return np.clip(shown, self._low, self._high, dtype=np.float32)
 
 
-def _estimated(network: MLP, shown: slice, low: np.ndarray, high: np.ndarray, stack: np.ndarray) -> np.ndarray:
-    return np.clip(np.concatenate([stack[shown], network(stack)]), low, high, dtype=np.float32)
-
-
-__all__ = ["WindowEstimator", "estimating"]
+__all__ = ["WindowEstimator", "WindowObservation"]

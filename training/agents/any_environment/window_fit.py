@@ -1,10 +1,12 @@
 """Fitting the network that estimates hidden signals from stacked observations."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
 from observers import MLP
@@ -15,7 +17,8 @@ from training.maps.networks import Network
 from training.maps.optimise import optimise_at_once
 from training.progress import ProgressBars
 from training.recorded.config import RecordedConfig
-from training.records import Record
+from training.records import Record, Rollouts
+from training.rollouts.callback import rehearsed
 
 DEFAULT = RecordedConfig(eigenvalues=(-1.0,), dt=1.0, measurement_noise_max=1.0)  # as large a network as an observer's
 
@@ -47,7 +50,7 @@ def learn_window(
         The estimator's file.
     """
     torch.manual_seed(seed)
-    regression = _Regression(records, task.frames, task.measurement_noise)
+    regression = _Regression(task, records)
     name, steps = f"estimates from {task.frames} observations", SETTINGS["inverse_steps"]
     optimise_at_once(
         name, regression, regression.loss, progress, steps=steps, learning_rate=DEFAULT.learning_rate, seed=seed
@@ -60,19 +63,24 @@ def learn_window(
 class _Regression(nn.Module):
     """The network, and the stacks and hidden signals that it is fitted to, all of them scaled."""
 
-    def __init__(self, records: Sequence[Record], frames: int, noise: float) -> None:
+    def __init__(self, task: HiddenTask, records: Sequence[Record]) -> None:
         super().__init__()
         entries, states, stacks, first = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), 0
+        frames, noise, ny = task.frames, task.measurement_noise, len(task.measured)
         for record in records:
             assert record.u is not None
             assert record.x is not None
+            y = record.y
+            if noise:  # what is measured is among the states, as it was before any noise
+                estimated = sorted(task.told(record.x.shape[1]))
+                y = record.x[:, [estimated.index(entry) for entry in task.measured]]
             acted = np.concatenate([np.zeros_like(record.u[:1]), record.u[:-1]])  # before each output
-            entries.append(np.concatenate([record.y, acted], axis=1))
+            entries.append(np.concatenate([y, acted], axis=1))
             states.append(record.x)
-            ages = np.arange(len(record.y))[:, None] - np.arange(frames)[::-1]
+            ages = np.arange(len(y))[:, None] - np.arange(frames)[::-1]
             stacks.append(first + np.maximum(ages, 0))  # before an episode there was its first output
-            first += len(record.y)
-        table, x, ny = np.concatenate(entries), np.concatenate(states), records[0].y.shape[1]
+            first += len(y)
+        table, x = np.concatenate(entries), np.concatenate(states)
         stack = np.concatenate(stacks)[np.isfinite(x).all(1)]
         self._noise = np.where(np.arange(table.shape[1]) < ny, noise, 0.0)
         self._mean, self._x_mean = table.mean(0), np.nanmean(x, 0)
@@ -107,6 +115,93 @@ class _Regression(nn.Module):
         return MLP([scaled, *weights], [bias, *biases], found.activation)
 
 
+class WindowRefits(BaseCallback):
+    """Fits an estimator again to an agent's own episodes, as :class:`training.KKLTrainingCallback` fits an observer.
+
+    Parameters
+    ----------
+    learn : callable
+        As :func:`learn_window`, told all but the records.
+    every : int
+        Steps of all environments together from refit to refit, where an algorithm begins to collect.
+    rehearsal : int
+        Further steps at the end, in which the agent acts without exploration, and which end in a last refit.
+    records : sequence of Record
+        From before, which it is fitted to as well.
+    """
+
+    def __init__(
+        self, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, records: Sequence[Record] = ()
+    ) -> None:
+        super().__init__()
+        self._learn, self._every, self._rehearsal, self._records = learn, every, rehearsal, list(records)
+        self._steps, self._next = 0, every
+
+    def _on_step(self) -> bool:
+        self._steps += self.training_env.num_envs
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self._steps >= self._next:
+            self._next = self._steps + self._every
+            self._refit(ended=True)
+
+    def _on_training_end(self) -> None:
+        for _ in rehearsed(self.model, self._rehearsal):
+            pass  # the environments keep what happens
+        self._refit(ended=False)
+
+    def _refit(self, *, ended: bool) -> None:
+        played: list[Rollouts] = self.training_env.env_method("rollouts", ended=ended)
+        records = [*self._records, *(record for one in played if one.episodes for record in one.records())]
+        if not records:
+            return
+        with torch.random.fork_rng():  # the agent's random numbers stay its own
+            estimator = WindowEstimator.read(self._learn(records))
+        self.training_env.env_method("replace_estimator", estimator)
+
+
+def refitting_window(
+    task: HiddenTask,
+    times: int,
+    steps: int,
+    rehearsal: int,
+    path: Path,
+    records: Sequence[Record] = (),
+    *,
+    seed: int,
+    progress: ProgressBars,
+) -> WindowRefits:
+    """Make what fits an estimator again to an agent's own steps, at equal distances.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        Where the agent acts.
+    times : int
+        How often.
+    steps : int
+        Of the agent's training.
+    rehearsal : int
+        Steps after them in which the agent acts without exploration, for a last refit.
+    path : Path
+        Receives the estimator in use at each time.
+    records : sequence of Record
+        From before, which it is fitted to as well.
+    seed : int
+        Of its training.
+    progress : ProgressBars
+        Where bars are shown.
+
+    Returns
+    -------
+    WindowRefits
+        For the training.
+    """
+    learn = partial(learn_window, task, folder=path.parent, seed=seed, progress=progress)
+    return WindowRefits(learn, max(1, steps // (times + 1)), rehearsal, records)
+
+
 def _or_one(scale: np.ndarray) -> np.ndarray:
     """Of signals that never change, one."""
     return np.where(scale > 1e-9, scale, 1.0)
@@ -116,4 +211,4 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
-__all__ = ["learn_window"]
+__all__ = ["WindowRefits", "learn_window", "refitting_window"]
