@@ -172,13 +172,13 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         self._rewards.append(float(reward))
         return observation, float(reward), self._terminated, truncated, info
 
-    def rollouts(self, *, ended: bool = False) -> Rollouts:
+    def rollouts(self, *, going_on: bool = False) -> Rollouts:
         """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with.
 
         Parameters
         ----------
-        ended : bool
-            Whether it is to go on instead, and not to count.
+        going_on : bool
+            Whether it is to be gone on with.
 
         Returns
         -------
@@ -190,15 +190,16 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         ValueError
             If ``info`` does not hold what is asked of it.
         """
-        if not ended:
+        if not going_on:
             self._end()
+        under_way = [self._episode()] if self._rewards else []
         return Rollouts(
             self._name,
             self._identity,
             sampling_interval(self.env),
             self.env.observation_space,
             self.env.action_space,
-            list(self._played),
+            [*self._played, *under_way],
             self._signals,
         )
 
@@ -213,20 +214,21 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
 
     def _end(self) -> None:
         if self._rewards:
-            asked = {key: _values(list(values), key) for key, values in zip(self._keys, zip(*self._infos))}
-            self._played.append(
-                Episode(
-                    _stacked(self.env.observation_space, self._observations),
-                    _stacked(self.env.action_space, self._actions),
-                    np.array(self._rewards),
-                    bool(self._terminated),
-                    asked,
-                )
-            )
+            self._played.append(self._episode())
             self._steps += len(self._rewards)
             while self._steps - len(self._played[0].rewards) >= self._to_keep:
                 self._steps -= len(self._played.popleft().rewards)
         self._begin()
+
+    def _episode(self) -> Episode:
+        """The one that is going on, as far as it got."""
+        return Episode(
+            _stacked(self.env.observation_space, self._observations),
+            _stacked(self.env.action_space, self._actions),
+            np.array(self._rewards),
+            bool(self._terminated),
+            {key: _values(list(values), key) for key, values in zip(self._keys, zip(*self._infos))},
+        )
 
 
 def _values(values: list[Any], key: str) -> np.ndarray:

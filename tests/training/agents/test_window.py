@@ -16,7 +16,7 @@ from training.agents.any_environment.observing import SETTINGS, Told, wander
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.task import HIDDEN_VELOCITIES
 from training.agents.any_environment.window import WindowEstimator
-from training.agents.any_environment.window_fit import _Regression, learn_window
+from training.agents.any_environment.window_fit import Stacks, learn_window
 from training.progress import progress_bars
 from training.rollouts.playing import Recorder
 
@@ -61,20 +61,24 @@ def test_it_is_fitted_to_the_stacks_that_it_will_see(task):
             over = terminated or truncated
     records = recorder.rollouts().records()
     states = np.concatenate([record.x for record in records])
-    found = _Regression(replace(task, frames=5), records)
-    table = found._table[found._stack].numpy() * found._scale + found._mean
-    np.testing.assert_allclose(table.reshape(len(seen), -1), seen, atol=1e-5)
-    np.testing.assert_allclose(found._x.numpy() * found._x_scale + found._x_mean, states, atol=1e-5)
+    stacks = Stacks(replace(task, frames=5), records)
+    batch = stacks(torch.Generator().manual_seed(0))
+    inputs = batch.inputs.numpy() * stacks.scale + stacks.mean
+    x = batch.x.numpy() * stacks.x_scale + stacks.x_mean
+    apart = np.abs(inputs[:, None] - np.array(seen)).max(-1)
+    here = apart.argmin(1)
+    np.testing.assert_allclose(apart.min(1), 0.0, atol=1e-5)
+    np.testing.assert_allclose(x, states[here], atol=1e-5)
+    ages = np.concatenate([np.arange(len(record.t)) for record in records])
+    np.testing.assert_array_equal(batch.cell, np.minimum(ages[here], 4))
 
 
 def test_an_output_has_one_noise_wherever_it_stands():
-    found, given = _Regression(NOISY, wandered(NOISY, 200)), []
-    found.network.register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
-    found._stack[:] = found._stack[0]  # all of them the first output of an episode, four times
-    found.loss(torch.Generator().manual_seed(0))
-    stacks = given[0].reshape(-1, 4, 3)
-    assert (stacks == stacks[:, :1]).all()
-    noise = (stacks[:, 0] - found._table[found._stack[0, 0]]).numpy() * found._scale
+    stacks = Stacks(NOISY, wandered(NOISY, 200))
+    stacks._known = stacks._known[:1]  # the first output of an episode, four times
+    drawn = stacks(torch.Generator().manual_seed(0)).inputs.reshape(-1, 4, 3)
+    assert (drawn == drawn[:, :1]).all()
+    noise = (drawn[:, 0] - stacks._table[0]).numpy() * stacks.scale[:3]
     np.testing.assert_allclose(noise.std(0), [0.3, 0.3, 0.0], rtol=0.1)
 
 
@@ -122,16 +126,31 @@ def test_agents_learn_on_it_and_their_files_act(tmp_path, monkeypatch):
     assert player.act(obs, env.action_space) in env.action_space
 
 
+def estimator(task, width=24):
+    network = MLP([np.zeros((1, width))], [np.zeros(1)], "tanh")
+    return WindowEstimator(network, np.zeros(width), np.ones(width), WindowEstimator.made_for(task))
+
+
 def test_what_is_none_or_anothers_is_refused(tmp_path):
     path = tmp_path / "window.safetensors"
-    network = MLP([np.zeros((1, 24))], [np.zeros(1)], "tanh")
-    WindowEstimator(network, 8).save(path)
-    assert WindowEstimator.read(path).frames == 8
+    estimator(PENDULUM).save(path)
     assert show(PENDULUM, "stacked_x_hat", str(path)).observation_space.shape == (3,)
-    with pytest.raises(ValueError, match="made for another task"):
-        show(CART, "stacked_x_hat", str(path))
-    with pytest.raises(ValueError, match="cannot take 7 outputs"):
-        WindowEstimator(network, 7)
+    for other, says in (
+        (CART, "env_id = 'Pendulum-v1', not 'CartPole-v1'"),
+        (replace(PENDULUM, measured=(1, 0)), r"measured = \[0, 1\], not \[1, 0\]"),
+        (replace(PENDULUM, env_kwargs={"g": 1.0}), "env_kwargs"),
+        (replace(PENDULUM, frames=12), "frames = 8, not 12"),
+        (replace(PENDULUM, measurement_noise=0.1), "noisy = False, not True"),
+    ):
+        with pytest.raises(ValueError, match=f"another task: .*{says}"):
+            show(other, "stacked_x_hat", str(path))
+    estimator(PENDULUM, width=21).save(path)
+    with pytest.raises(ValueError, match="makes 1 numbers of 21, and 1 of 24 are needed"):
+        show(PENDULUM, "stacked_x_hat", str(path))
+    with pytest.raises(ValueError, match="scale must be positive"):
+        replace(estimator(PENDULUM), scale=np.zeros(24))
+    with pytest.raises(ValueError, match="mean must be 24 finite numbers"):
+        replace(estimator(PENDULUM), mean=np.full(24, np.nan))
     with pytest.raises(ValueError, match="needs an observer"):
         show(PENDULUM, "stacked_x_hat")
     content = bytearray(path.read_bytes())
@@ -139,6 +158,17 @@ def test_what_is_none_or_anothers_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(ValueError, match="damaged"):
         WindowEstimator.read(path)
+
+
+@pytest.mark.parametrize("kind", ["x_hat", "stacked_x_hat"])
+def test_where_nothing_is_hidden_nothing_is_learned(tmp_path, kind):
+    with pytest.raises(ValueError, match="nothing is left to estimate"):
+        learn_to_play(replace(CART, measured=(0, 1, 2, 3)), kind, tmp_path)
+
+
+def test_what_is_measured_may_be_named_as_hidden_under_noise(tmp_path):
+    task = replace(PENDULUM, hidden=(0, 1, 2), measurement_noise=0.1)
+    assert show(task, "stacked_x_hat", learned(task, tmp_path, wandered(task))).reset()[0].shape == (3,)
 
 
 @pytest.mark.parametrize(("task", "algorithm"), [(replace(CART, measurement_noise=0.02), "ppo"), (PENDULUM, "sac")])
@@ -152,11 +182,10 @@ def test_it_is_fitted_again_to_what_the_agent_does(tmp_path, monkeypatch, task, 
     monkeypatch.setattr(window_fit, "learn_window", noted)
     monkeypatch.setattr(learning, "settings_of", SMALL.get)
     learn_to_play(task, "stacked_x_hat", tmp_path, algorithm=algorithm, timesteps=4000, aggregate=2)
-    if task.measurement_noise:  # of 3,400 steps after the random ones, and 200 without exploration; some are under way
-        assert len(fits) == 3
-        assert 1000 < fits[0] <= 1200 < 2000 < fits[1] <= 2400 < fits[2] < 3640
-    else:  # all that was told counts as well
-        assert 4000 <= fits[-1] < 4010
+    # Under noise of 3,400 steps after the random ones, and 200 without exploration. Else all that was told counts too.
+    expected = [1133, 2267, 3600] if task.measurement_noise else [3600 + 67, 3600 + 133, 4000]
+    np.testing.assert_allclose(fits[-3:], expected, atol=64)
+    np.testing.assert_array_less(0, np.subtract(fits[-3:], expected) + 5)
     env = Player.read(tmp_path / "agent.safetensors").make()
     np.testing.assert_array_equal(
         env.reset(seed=1)[0], show(task, "stacked_x_hat", str(tmp_path / "observer.safetensors")).reset(seed=1)[0]

@@ -78,13 +78,15 @@ def _stacked_estimates(
 ) -> gym.Env[np.ndarray, Any]:
     """Y and what a network estimates from stacked observations; under noise the estimates alone."""
     whole: Any = env.observation_space
-    entries, outputs = list(task.told(whole.shape[0])), len(task.measured)
-    if task.measurement_noise:  # what is measured is estimated as well
-        entries, outputs = sorted(entries), 0
-    space = gym.spaces.Box(whole.low[entries], whole.high[entries], dtype=np.float32)
+    size = whole.shape[0]
+    entries = list(task.estimated_entries(size) if task.measurement_noise else task.told(size))
+    low, high = whole.low[entries], whole.high[entries]
+    if task.measurement_noise:  # estimates are not cut, as those of observers are not
+        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
     if keep is not None:
-        env = Recorder(env, **task.signals(whole.shape[0]), keep=keep)
-    return WindowObservation(StackedWithActions(part_of(env, task.measured), task.frames), estimator, space, outputs)
+        env = Recorder(env, **task.signals(size), keep=keep)
+    stacked = StackedWithActions(part_of(env, task.measured), task.frames)
+    return WindowObservation(stacked, task, estimator, gym.spaces.Box(low, high, dtype=np.float32))
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:

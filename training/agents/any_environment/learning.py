@@ -188,7 +188,7 @@ def learn_to_play(
         If something makes no sense or does not fit the environment.
     """
     with show(task, "state") as env:
-        actions = env.action_space
+        actions, estimated = env.action_space, task.estimated(gym.spaces.flatdim(env.observation_space))
     name = algorithm or algorithm_for(actions, task.env_id, information)
     if (name == RECURRENT) != (information == "recurrent"):
         raise ValueError(f"{RECURRENT} is for information 'recurrent', and only that; got {name} and {information!r}")
@@ -197,6 +197,8 @@ def learn_to_play(
     steps, began = settings["n_timesteps"], time.process_time()
     if observer is not None and information not in ESTIMATES:
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
+    if information in ESTIMATES and not estimated:
+        raise ValueError(f"all entries of {task.env_id} are measured, without noise: nothing is left to estimate")
     if aggregate and information not in ESTIMATES:
         raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
@@ -248,8 +250,8 @@ def learn_to_play(
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model
     if name != RECURRENT:
-        if newest.exists():  # which is what the agent has seen last
-            observer = str(newest)
+        if learns_observer or aggregate:
+            observer = str(newest)  # which is what the agent has seen last
         how = {"algorithm": name, **settings, "seed": seed, "observer_steps": spent, "aggregate": aggregate}
         player_of(model, task, information, observer=observer, training=how).save(folder / "agent.safetensors")
     return model

@@ -75,16 +75,32 @@ class Told:
         list of Record
             As of :meth:`records`.
         """
-        dated = list[tuple[int, Record]]()
-        for records in self._rows():
-            after = 0  # steps that were made since
-            for record in reversed(records):
-                dated.append((after, record))
-                after += len(record.t) - 1
-        return [record for _, record in sorted(dated, key=lambda one: -one[0])]
+        return oldest_first(self._rows())
 
     def _rows(self) -> list[list[Record]]:
         return [recorder.rollouts().records() for recorder in self._recorders]
+
+
+def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
+    """Put together what environments have kept that were stepped together.
+
+    Parameters
+    ----------
+    rows : sequence of sequence of Record
+        Of each environment its episodes, in their order.
+
+    Returns
+    -------
+    list of Record
+        Those that ended first at the beginning.
+    """
+    dated = list[tuple[int, Record]]()
+    for records in rows:
+        after = 0  # steps that were made since
+        for record in reversed(records):
+            dated.append((after, record))
+            after += len(record.t) - 1
+    return [record for _, record in sorted(dated, key=lambda one: -one[0])]
 
 
 def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
@@ -191,4 +207,4 @@ def refitting(
     )
 
 
-__all__ = ["OBSERVER", "Told", "learn_observer", "refitting", "wander"]
+__all__ = ["KEPT", "OBSERVER", "Told", "learn_observer", "oldest_first", "refitting", "wander"]

@@ -125,9 +125,13 @@ class HiddenTask:
             Signals as :func:`kkl_gym.named.resolved` takes them, in the order of the entries; under noise as they were
             before it.
         """
-        if not self.measurement_noise:
-            return tuple(f"obs[{i}]" for i in self._hidden(size))
-        return tuple(f"info[{CLEAN}][{i}]" for i in sorted({*self._hidden(size), *self.measured}))
+        name = f"info[{CLEAN}]" if self.measurement_noise else "obs"
+        return tuple(f"{name}[{i}]" for i in self.estimated_entries(size))
+
+    def estimated_entries(self, size: int) -> tuple[int, ...]:
+        """Which entries of an observation of some size an observer estimates; under noise also what is measured."""
+        hidden = self._hidden(size)
+        return tuple(sorted({*hidden, *self.measured})) if self.measurement_noise else hidden
 
     def told(self, size: int) -> tuple[int, ...]:
         """Which entries an agent on estimates would see if these were right and there were no noise.

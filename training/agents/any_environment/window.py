@@ -1,6 +1,8 @@
 """Estimates by a network on stacked observations: what an observer's filter is worth is the difference to them."""
 
+import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,7 +11,8 @@ import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
 from observers import MLP, storage
-from observers.checks import integer
+from observers.checks import shown
+from training.agents.any_environment.task import HiddenTask
 
 FORMAT = 1
 KEY = "kkl-gym-window"
@@ -22,22 +25,62 @@ class WindowEstimator:
     Parameters
     ----------
     network : MLP
-        From a stack, the latest last, to the signals.
-    frames : int
-        How many outputs are in a stack.
+        From a scaled stack, the latest last, to the signals.
+    mean, scale : ndarray, shape (inputs,)
+        The network is given (stack - mean) / scale.
+    task : mapping of str to object
+        What it was made for, as :meth:`made_for` describes it.
 
     Raises
     ------
     ValueError
-        If the network cannot take as many.
+        If mean or scale are not as many finite numbers as the network has inputs, or a scale is not positive.
     """
 
     network: MLP
-    frames: int
+    mean: np.ndarray
+    scale: np.ndarray
+    task: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        if self.network.inputs % integer("frames", self.frames, 1):
-            raise ValueError(f"a network of {self.network.inputs} inputs cannot take {self.frames} outputs")
+        for name, values in (("mean", self.mean), ("scale", self.scale)):
+            if values.shape != (self.network.inputs,) or not np.isfinite(values).all():
+                raise ValueError(f"{name} must be {self.network.inputs} finite numbers, got {shown(values)}")
+        if not (self.scale > 0).all():
+            raise ValueError(f"scale must be positive, got {shown(self.scale)}")
+
+    @staticmethod
+    def made_for(task: HiddenTask) -> dict[str, Any]:
+        """What of a task must be the same where an estimator is used.
+
+        Parameters
+        ----------
+        task : HiddenTask
+            The task.
+
+        Returns
+        -------
+        dict
+            What JSON can hold.
+        """
+        described = {name: getattr(task, name) for name in ("env_id", "env_kwargs", "measured", "hidden", "frames")}
+        found: dict[str, Any] = json.loads(json.dumps({**described, "noisy": task.measurement_noise > 0}))
+        return found
+
+    def __call__(self, stack: np.ndarray) -> np.ndarray:
+        """Estimate.
+
+        Parameters
+        ----------
+        stack : ndarray, shape (..., inputs)
+            The last outputs, each with the input before it.
+
+        Returns
+        -------
+        ndarray of float32, shape (..., outputs)
+            The signals.
+        """
+        return self.network((stack - self.mean) / self.scale)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it to one safetensors file, whole or not at all.
@@ -52,9 +95,9 @@ class WindowEstimator:
         OSError
             If the file cannot be written.
         """
-        tensors: dict[str, np.ndarray] = {}
+        tensors: dict[str, np.ndarray] = {"mean": self.mean, "scale": self.scale}
         storage.put_mlp(tensors, "", self.network)
-        described = {"format": FORMAT, "activation": self.network.activation, "frames": self.frames}
+        described = {"format": FORMAT, "activation": self.network.activation, "task": dict(self.task)}
         storage.save(path, tensors, key=KEY, described=described)
 
     @classmethod
@@ -80,55 +123,63 @@ class WindowEstimator:
         with storage.explained(path, ValueError):
             if described["format"] != FORMAT:
                 raise ValueError(f"it has another format than {FORMAT}, which this version of kkl-gym reads")
-            return cls(storage.get_mlp(tensors, "", described["activation"]), described["frames"])
+            network = storage.get_mlp(tensors, "", described["activation"])
+            return cls(network, tensors["mean"], tensors["scale"], dict(described["task"]))
 
 
 class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], RecordConstructorArgs):
-    """Shows what an estimator says of stacked observations in their place.
+    """Shows y and what an estimator says of stacked observations, in their place; under noise the estimates alone.
 
     Parameters
     ----------
     env : gymnasium.Env
         Whose observations are stacks.
+    task : HiddenTask
+        What is measured, and what is to be estimated.
     estimator : WindowEstimator
         What estimates.
     space : gymnasium.spaces.Box
         Of what is to be shown; it is cut at these bounds.
-    outputs : int
-        How many of it are outputs, the first of the latest in the stack. The others are estimates.
 
     Raises
     ------
     ValueError
-        If the estimator was made for stacks, or for signals, of another number.
+        If the estimator was made for another task.
     """
 
     def __init__(
-        self, env: gym.Env[np.ndarray, Any], estimator: WindowEstimator, space: gym.spaces.Box, outputs: int
+        self, env: gym.Env[np.ndarray, Any], task: HiddenTask, estimator: WindowEstimator, space: gym.spaces.Box
     ) -> None:
-        RecordConstructorArgs.__init__(self, estimator=estimator, space=space, outputs=outputs)
+        RecordConstructorArgs.__init__(self, task=task, estimator=estimator, space=space)
         gym.ObservationWrapper.__init__(self, env)
         self.observation_space, self._low, self._high = space, space.low, space.high
-        stacked = gym.spaces.flatdim(env.observation_space)
-        latest = stacked - stacked // estimator.frames
-        self._outputs = slice(latest, latest + outputs)
-        self._wanted = stacked, gym.spaces.flatdim(space) - outputs
+        stacked, outputs = gym.spaces.flatdim(env.observation_space), len(task.measured)
+        latest = stacked - stacked // task.frames
+        self._outputs = slice(latest, latest if task.measurement_noise else latest + outputs)
+        self._made_for = WindowEstimator.made_for(task)
+        self._widths = stacked, gym.spaces.flatdim(space) - len(range(*self._outputs.indices(stacked)))
         self.replace_estimator(estimator)
 
     def replace_estimator(self, estimator: WindowEstimator) -> None:
-        """Go on with another estimator of the same signals from as many observations; raises ValueError otherwise."""
-        network, (inputs, outputs) = estimator.network, self._wanted
-        if (network.inputs, network.outputs) != self._wanted:
+        """Go on with another estimator for the same task; raises ValueError if it was made for another one."""
+        if dict(estimator.task) != self._made_for:
+            here, there = self._made_for, estimator.task
+            other = [
+                f"{name} = {there.get(name)!r}, not {here[name]!r}" for name in here if there.get(name) != here[name]
+            ]
+            raise ValueError(f"the estimator was made for another task: {'; '.join(other) or shown(there)}")
+        network = estimator.network
+        if (network.inputs, network.outputs) != self._widths:
             raise ValueError(
-                f"the estimator makes {network.outputs} numbers of {network.inputs}, and {outputs} of {inputs} are "
-                "needed: it was made for another task"
+                f"the estimator makes {network.outputs} numbers of {network.inputs}, and {self._widths[1]} of "
+                f"{self._widths[0]} are needed"
             )
-        self._network = network
+        self._estimator = estimator
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         """What is shown of a stack."""
-        shown = np.concatenate([observation[self._outputs], self._network(observation)])
-        return np.clip(shown, self._low, self._high, dtype=np.float32)
+        found = np.concatenate([observation[self._outputs], self._estimator(observation)])
+        return np.clip(found, self._low, self._high, dtype=np.float32)
 
 
 __all__ = ["WindowEstimator", "WindowObservation"]

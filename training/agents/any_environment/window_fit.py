@@ -3,21 +3,23 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from torch import nn
 
 from observers import MLP
-from training.agents.any_environment.observing import OBSERVER, SETTINGS
+from training.agents.any_environment.observing import KEPT, OBSERVER, SETTINGS, oldest_first
 from training.agents.any_environment.task import HiddenTask
 from training.agents.any_environment.window import WindowEstimator
+from training.maps.inverse import InverseProblem
 from training.maps.networks import Network
 from training.maps.optimise import optimise_at_once
+from training.maps.samplers import Batch
 from training.progress import ProgressBars
 from training.recorded.config import RecordedConfig
-from training.records import Record, Rollouts
+from training.records import Record
 from training.rollouts.callback import rehearsed
 
 DEFAULT = RecordedConfig(eigenvalues=(-1.0,), dt=1.0, measurement_noise_max=1.0)  # as large a network as an observer's
@@ -28,15 +30,15 @@ def learn_window(
 ) -> Path:
     """Fit an estimator on stacked observations to an agent's first steps, by what an observer is fitted with.
 
-    That is the same number of batches of the same size, the same optimiser, and a network of the same width and depth.
-    Noise of the task's level is added to the outputs, in each batch anew.
+    That is the same number of batches of the same size, the same optimiser and the same loss, and a network of the same
+    width and depth. Noise of the task's level is added to the outputs, in each batch anew.
 
     Parameters
     ----------
     task : HiddenTask
         Of which environment, what is measured, and how many observations are stacked.
     records : sequence of Record
-        Of these steps, without noise.
+        Of these steps; outputs may have noise only where there is some, and states none.
     folder : Path
         Receives the file.
     seed : int
@@ -50,73 +52,102 @@ def learn_window(
         The estimator's file.
     """
     torch.manual_seed(seed)
-    regression = _Regression(task, records)
-    name, steps = f"estimates from {task.frames} observations", SETTINGS["inverse_steps"]
+    stacks = Stacks(task, records)
+    width, depth, activation = DEFAULT.width, DEFAULT.depth, DEFAULT.activation
+    network = Network(len(stacks.mean), len(stacks.x_mean), width=width, depth=depth, activation=activation)
+    sampler: Any = stacks  # of batches as those of observers are
+    problem = InverseProblem(network, sampler, torch.device("cpu"))
     optimise_at_once(
-        name, regression, regression.loss, progress, steps=steps, learning_rate=DEFAULT.learning_rate, seed=seed
+        f"estimates from {task.frames} observations",
+        problem,
+        problem.loss,
+        progress,
+        steps=SETTINGS["inverse_steps"],
+        learning_rate=DEFAULT.learning_rate,
+        seed=seed,
     )
     path = folder / OBSERVER
-    WindowEstimator(regression.export(), task.frames).save(path)
+    found = stacks.in_units(network.export())
+    WindowEstimator(found, stacks.mean, stacks.scale, WindowEstimator.made_for(task)).save(path)
     return path
 
 
-class _Regression(nn.Module):
-    """The network, and the stacks and hidden signals that it is fitted to, all of them scaled."""
+class Stacks:
+    """Batches of stacked observations and hidden signals, both scaled, in cells by how full stacks are.
+
+    Parameters
+    ----------
+    task : HiddenTask
+        What is measured, how well, and how many observations are stacked.
+    records : sequence of Record
+        Episodes from their reset on.
+
+    Attributes
+    ----------
+    mean, scale : ndarray, shape (inputs,)
+        Of what the network is given.
+    x_mean, x_scale : ndarray, shape (outputs,)
+        Of the signals.
+    cells : int
+        Of like samples.
+    parameters : int
+        None are estimated.
+    """
+
+    parameters = 0
 
     def __init__(self, task: HiddenTask, records: Sequence[Record]) -> None:
-        super().__init__()
-        entries, states, stacks, first = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), 0
-        frames, noise, ny = task.frames, task.measurement_noise, len(task.measured)
+        entries, states, begins = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+        noise, ny, first = task.measurement_noise, len(task.measured), 0
         for record in records:
             assert record.u is not None
             assert record.x is not None
             y = record.y
             if noise:  # what is measured is among the states, as it was before any noise
-                estimated = sorted(task.told(record.x.shape[1]))
+                estimated = task.estimated_entries(record.x.shape[1])  # which are all, where the task names none
                 y = record.x[:, [estimated.index(entry) for entry in task.measured]]
             acted = np.concatenate([np.zeros_like(record.u[:1]), record.u[:-1]])  # before each output
             entries.append(np.concatenate([y, acted], axis=1))
             states.append(record.x)
-            ages = np.arange(len(y))[:, None] - np.arange(frames)[::-1]
-            stacks.append(first + np.maximum(ages, 0))  # before an episode there was its first output
+            begins.append(np.full(len(y), first))
             first += len(y)
         table, x = np.concatenate(entries), np.concatenate(states)
-        stack = np.concatenate(stacks)[np.isfinite(x).all(1)]
-        self._noise = np.where(np.arange(table.shape[1]) < ny, noise, 0.0)
-        self._mean, self._x_mean = table.mean(0), np.nanmean(x, 0)
-        self._scale = _or_one(np.sqrt(table.var(0) + self._noise**2))
-        self._x_scale = _or_one(np.nanstd(x, 0))
-        self._table, self._x = _tensor((table - self._mean) / self._scale), _tensor((x - self._x_mean) / self._x_scale)
-        self._stack, self._noise_scaled = torch.as_tensor(stack), _tensor(self._noise / self._scale)
-        width, depth, activation = DEFAULT.width, DEFAULT.depth, DEFAULT.activation
-        self._frames = frames
-        self.network = Network(frames * table.shape[1], x.shape[1], width=width, depth=depth, activation=activation)
+        known = np.isfinite(x).all(1) & np.isfinite(table).all(1)
+        noisy = np.where(np.arange(table.shape[1]) < ny, noise, 0.0)
+        mean, scale = table[known].mean(0), _or_one(np.sqrt(table[known].var(0) + noisy**2))
+        self.mean, self.scale = np.tile(mean, task.frames), np.tile(scale, task.frames)
+        self.x_mean, self.x_scale = x[known].mean(0), _or_one(x[known].std(0))
+        self.cells = task.frames
+        self._table, self._noise = _tensor((table - mean) / scale), _tensor(noisy / scale)
+        self._x = _tensor((x - self.x_mean) / self.x_scale)
+        self._begins, self._known = torch.as_tensor(np.concatenate(begins)), torch.as_tensor(np.flatnonzero(known))
+        self._back = torch.arange(task.frames - 1, -1, -1)
 
-    def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, in standard deviations of the signals."""
-        stack = self._stack[torch.randint(len(self._stack), (DEFAULT.batch,), generator=generator)]
+    def __call__(self, generator: torch.Generator) -> Batch:
+        """Draw a batch."""
+        rows = self._known[torch.randint(len(self._known), (DEFAULT.batch,), generator=generator)]
+        begins = self._begins[rows]
+        stack = torch.maximum(rows[:, None] - self._back, begins[:, None])  # before an episode there was its first row
         seen = self._table[stack]
         if self._noise.any():
             noise = torch.randn(seen.shape, generator=generator)
-            for i in reversed(range(self._frames - 1)):  # an episode's first output has one noise wherever it stands
-                again = (stack[:, i] == stack[:, i + 1])[:, None]
-                noise[:, i] = torch.where(again, noise[:, i + 1], noise[:, i])
-            seen = seen + self._noise_scaled * noise
-        return {"loss": ((self.network(seen.flatten(1)) - self._x[stack[:, -1]]) ** 2).mean()}
+            for i in reversed(range(self.cells - 1)):  # an episode's first output has one noise wherever it stands
+                noise[:, i] = torch.where((stack[:, i] == stack[:, i + 1])[:, None], noise[:, i + 1], noise[:, i])
+            seen = seen + self._noise * noise
+        cell = torch.clamp(rows - begins, max=self.cells - 1)
+        return Batch(seen.flatten(1), self._x[rows], torch.ones(len(rows)), cell)
 
-    def export(self) -> MLP:
-        """The network in units of the signals."""
-        found = self.network.export()
-        (first, *weights), (bias, *biases) = found.weights, found.biases
-        scaled = first / np.tile(self._scale, self._frames)
-        bias = bias - scaled @ np.tile(self._mean, self._frames)
-        weights[-1] = weights[-1] * self._x_scale[:, None]
-        biases[-1] = biases[-1] * self._x_scale + self._x_mean
-        return MLP([scaled, *weights], [bias, *biases], found.activation)
+    def in_units(self, network: MLP) -> MLP:
+        """A network of scaled signals, in units of these."""
+        (*weights, weight), (*biases, bias) = network.weights, network.biases
+        scale = self.x_scale
+        return MLP([*weights, weight * scale[:, None]], [*biases, bias * scale + self.x_mean], network.activation)
 
 
 class WindowRefits(BaseCallback):
     """Fits an estimator again to an agent's own episodes, as :class:`training.KKLTrainingCallback` fits an observer.
+
+    Nothing is held out, and no fit is refused.
 
     Parameters
     ----------
@@ -127,7 +158,7 @@ class WindowRefits(BaseCallback):
     rehearsal : int
         Further steps at the end, in which the agent acts without exploration, and which end in a last refit.
     records : sequence of Record
-        From before, which it is fitted to as well.
+        From before, the oldest first, which it is fitted to as well.
     """
 
     def __init__(
@@ -144,18 +175,20 @@ class WindowRefits(BaseCallback):
     def _on_rollout_start(self) -> None:
         if self._steps >= self._next:
             self._next = self._steps + self._every
-            self._refit(ended=True)
+            self._refit()
 
     def _on_training_end(self) -> None:
         for _ in rehearsed(self.model, self._rehearsal):
             pass  # the environments keep what happens
-        self._refit(ended=False)
+        self._refit()
 
-    def _refit(self, *, ended: bool) -> None:
-        played: list[Rollouts] = self.training_env.env_method("rollouts", ended=ended)
-        records = [*self._records, *(record for one in played if one.episodes for record in one.records())]
-        if not records:
-            return
+    def _refit(self) -> None:
+        played = self.training_env.env_method("rollouts", going_on=True)
+        records = [*self._records, *oldest_first([one.records() for one in played])]
+        left = sum(len(record.t) - 1 for record in records)
+        while left - (oldest := len(records[0].t) - 1) >= KEPT:
+            left -= oldest
+            del records[0]
         with torch.random.fork_rng():  # the agent's random numbers stay its own
             estimator = WindowEstimator.read(self._learn(records))
         self.training_env.env_method("replace_estimator", estimator)
@@ -211,4 +244,4 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
-__all__ = ["WindowRefits", "learn_window", "refitting_window"]
+__all__ = ["Stacks", "WindowRefits", "learn_window", "refitting_window"]
