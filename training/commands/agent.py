@@ -60,7 +60,7 @@ class Train:
         str | None,
         tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the one of the system's profile, else the newest)"),
     ] = None
-    """A shipped map's name or a .safetensors file, for an agent that knows x_hat, x_hat_std or z."""
+    """A shipped map's name or a .safetensors file, for an agent that knows x_hat, x_hat_std, z or stacked_x_hat."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
         tyro.conf.arg(help_behavior_hint="(default: sac for reverse_duffing and where it is tuned, else ppo)"),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -13,7 +13,7 @@ from observers import Artifact
 from observers.names import resolve
 from observers.storage import write
 from training import markdown
-from training.agents.any_environment.information import SHOWN, Shown
+from training.agents.any_environment.information import SHOWN
 from training.agents.comparison import (
     ALL,
     ASKED_FOR,
@@ -37,6 +37,11 @@ from training.progress import LOG, progress_bars
 
 if TYPE_CHECKING:
     import pandas as pd
+
+# On systems or in environments; a union of the two would be listed with repetitions.
+Knows = Literal[
+    "state", "ekf", "x_hat", "x_hat_std", "stacked_x_hat", "z", "stacked", "y", "recurrent", "recurrent-state"
+]
 
 LABELS = {
     "state": "full state",
@@ -69,7 +74,7 @@ class Compare:
     systems: tuple[str, ...] = tuple(TASKS)
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
-        tuple[Compared | Shown, ...] | None,
+        tuple[Knows, ...] | None,
         tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all but x_hat_std)"),
     ] = None
     """What agents know (docs/guides/agents.md). In environments (docs/results/partly_observed.md): state,

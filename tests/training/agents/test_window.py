@@ -190,3 +190,12 @@ def test_it_is_fitted_again_to_what_the_agent_does(tmp_path, monkeypatch, task, 
     np.testing.assert_array_equal(
         env.reset(seed=1)[0], show(task, "stacked_x_hat", str(tmp_path / "observer.safetensors")).reset(seed=1)[0]
     )
+
+
+def test_a_file_that_is_given_is_the_agents_whatever_else_lies_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(learning, "settings_of", SMALL.get)
+    estimator(PENDULUM).save(tmp_path / "observer.safetensors")
+    given = tmp_path / "given.safetensors"
+    estimator(PENDULUM).save(given)
+    learn_to_play(PENDULUM, "stacked_x_hat", tmp_path, algorithm="sac", observer=str(given))
+    assert Player.read(tmp_path / "agent.safetensors").observer == str(given)
