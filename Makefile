@@ -124,8 +124,8 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/kkl-gym agent compare $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
-	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 --information state x_hat z stacked recurrent \
-		--aggregate 4 --seeds 5 --out runs/agents/noise
+	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 \
+		--information state x_hat stacked_x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
 	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
