@@ -28,7 +28,7 @@ from training.agents.any_environment.information import ESTIMATES, Shown, show
 from training.agents.any_environment.observing import KEPT, OBSERVER, Told, learn_observer, refitting, wander
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
-from training.agents.any_environment.window_fit import learn_window, refitting_window
+from training.agents.any_environment.window_fit import WindowRefits, learn_window
 from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
 from training.records import Record
@@ -216,11 +216,7 @@ def learn_to_play(
         raise ValueError("observer_steps is for agents on x_hat or stacked_x_hat that are given no observer")
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
-        refits: Callable[..., BaseCallback]
-        if information == "stacked_x_hat":
-            learn, refits = learn_window, partial(refitting_window, seed=seed, progress=bars)
-        else:
-            learn, refits = learn_observer, refitting
+        learn = learn_window if information == "stacked_x_hat" else learn_observer
         learned = partial(learn, task, folder=folder, seed=seed, progress=bars)
         curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()  # no random actions in refits
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
@@ -245,7 +241,12 @@ def learn_to_play(
                 learner.move(partial(show, task, information, observer, keep=keep))
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
-                callbacks.append(refits(task, aggregate, left - learner.steps, rehearsal, newest, before))
+                every = max(1, (left - learner.steps) // (aggregate + 1))
+                callbacks.append(
+                    WindowRefits(learned, every, rehearsal, before)
+                    if information == "stacked_x_hat"
+                    else refitting(task, every, rehearsal, newest, before)
+                )
             with bars.phase(description, left) as report:
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model

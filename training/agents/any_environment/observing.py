@@ -176,20 +176,18 @@ def learn_observer(
 
 
 def refitting(
-    task: HiddenTask, times: int, steps: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
+    task: HiddenTask, every: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
 ) -> KKLTrainingCallback:
-    """Make what fits an observer again to an agent's own steps, at equal distances.
+    """Make what fits an observer again to an agent's own steps.
 
     Parameters
     ----------
     task : HiddenTask
         Where the agent acts.
-    times : int
-        How often.
-    steps : int
-        Of the agent's training.
+    every : int
+        Steps from refit to refit.
     rehearsal : int
-        Steps after them in which the agent acts without exploration, for a last refit.
+        Steps after the training in which the agent acts without exploration, for a last refit.
     path : Path
         Receives the observer in use at each time.
     records : sequence of Record
@@ -201,7 +199,6 @@ def refitting(
         For the training.
     """
     outputs = CLEAN_Y if task.measurement_noise else "y"
-    every = max(1, steps // (times + 1))
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
     )

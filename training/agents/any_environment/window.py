@@ -153,11 +153,14 @@ class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], Rec
         RecordConstructorArgs.__init__(self, task=task, estimator=estimator, space=space)
         gym.ObservationWrapper.__init__(self, env)
         self.observation_space, self._low, self._high = space, space.low, space.high
-        stacked, outputs = gym.spaces.flatdim(env.observation_space), len(task.measured)
+        stacked, outputs = (
+            gym.spaces.flatdim(env.observation_space),
+            0 if task.measurement_noise else len(task.measured),
+        )
         latest = stacked - stacked // task.frames
-        self._outputs = slice(latest, latest if task.measurement_noise else latest + outputs)
+        self._outputs = slice(latest, latest + outputs)
         self._made_for = WindowEstimator.made_for(task)
-        self._widths = stacked, gym.spaces.flatdim(space) - len(range(*self._outputs.indices(stacked)))
+        self._widths = stacked, gym.spaces.flatdim(space) - outputs
         self.replace_estimator(estimator)
 
     def replace_estimator(self, estimator: WindowEstimator) -> None:

@@ -1,7 +1,6 @@
 """Fitting the network that estimates hidden signals from stacked observations."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -194,47 +193,6 @@ class WindowRefits(BaseCallback):
         self.training_env.env_method("replace_estimator", estimator)
 
 
-def refitting_window(
-    task: HiddenTask,
-    times: int,
-    steps: int,
-    rehearsal: int,
-    path: Path,
-    records: Sequence[Record] = (),
-    *,
-    seed: int,
-    progress: ProgressBars,
-) -> WindowRefits:
-    """Make what fits an estimator again to an agent's own steps, at equal distances.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Where the agent acts.
-    times : int
-        How often.
-    steps : int
-        Of the agent's training.
-    rehearsal : int
-        Steps after them in which the agent acts without exploration, for a last refit.
-    path : Path
-        Receives the estimator in use at each time.
-    records : sequence of Record
-        From before, which it is fitted to as well.
-    seed : int
-        Of its training.
-    progress : ProgressBars
-        Where bars are shown.
-
-    Returns
-    -------
-    WindowRefits
-        For the training.
-    """
-    learn = partial(learn_window, task, folder=path.parent, seed=seed, progress=progress)
-    return WindowRefits(learn, max(1, steps // (times + 1)), rehearsal, records)
-
-
 def _or_one(scale: np.ndarray) -> np.ndarray:
     """Of signals that never change, one."""
     return np.where(scale > 1e-9, scale, 1.0)
@@ -244,4 +202,4 @@ def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
-__all__ = ["Stacks", "WindowRefits", "learn_window", "refitting_window"]
+__all__ = ["Stacks", "WindowRefits", "learn_window"]
