@@ -14,6 +14,8 @@ from observers.checks import LARGEST, all_finite, integer, real_array, shown
 Space = gym.Space[Any]
 Entries = Sequence[int] | Sequence[str]
 """Indices in a flattened observation, or keys of a Dict."""
+Angles = Sequence[int | Sequence[int]] | Sequence[str | Sequence[str]]
+"""Entries that are angles in rad, and pairs of entries that are the cosine and the sine of one."""
 
 
 class Outputs:
@@ -28,8 +30,9 @@ class Outputs:
         Of one observation.
     measured : sequence of int or of str, optional
         Indices in the flattened observation, or keys of a Dict, which stay in the order of the space; None is all.
-    angles : sequence of int or of str
-        Which of these are angles in rad. Each becomes a cosine and a sine.
+    angles : sequence of int or of str, or of pairs of these
+        Which of these are angles in rad; each becomes a cosine and a sine. A pair names the cosine and the sine of an
+        angle that is measured by these.
     source : str
         Where observations come from, for messages.
 
@@ -39,6 +42,8 @@ class Outputs:
         As given.
     low, high : ndarray, shape (ny,)
         Bounds, which may be infinite.
+    turning : list of tuple of int
+        Where the cosine and the sine of each angle are among the outputs.
 
     Raises
     ------
@@ -46,9 +51,9 @@ class Outputs:
         If images or what has no numbers are to be measured, or an index or a key is unknown or comes twice.
     """
 
-    def __init__(self, space: Space, measured: Entries | None, angles: Entries, *, source: str) -> None:
+    def __init__(self, space: Space, measured: Entries | None, angles: Angles, *, source: str) -> None:
         self.measured = None if measured is None else _entries("measured", measured)
-        self.angles = _entries("angles", angles)
+        self.angles = _angles(angles)
         if self.measured == ():
             raise ValueError("measured must name at least one entry of the observation; None measures all")
         self._source = f"the observation of {source}"
@@ -69,18 +74,30 @@ class Outputs:
         taken = list(range(len(owners)))
         if self.measured and not keys:
             taken = _positions("measured", self.measured, owners)
-        if keys and self.angles and not isinstance(self.angles[0], str):
+        each = [angle if isinstance(angle, tuple) else (angle,) for angle in self.angles]
+        if keys and each and not isinstance(each[0][0], str):
             raise ValueError(f"angles must be keys, as measured is, got {self.angles}")
-        turning = _positions("angles", self.angles, owners)
-        if not set(turning) <= set(taken):
+        at = [tuple(_positions("angles", (entry,), owners) for entry in angle) for angle in each]
+        if not {i for angle in at for entry in angle for i in entry} <= set(taken):
             raise ValueError(f"angles must be among what is measured, {self.measured}, got {self.angles}")
-        self._take = np.repeat(taken, [1 + (i in turning) for i in taken])  # angles twice
+        in_radians = {i for angle in at if len(angle) == 1 for i in angle[0]}
+        self._take = np.repeat(taken, [1 + (i in in_radians) for i in taken])
         self._whole = self._take.tolist() == list(range(len(owners)))
-        self._sines = np.flatnonzero(np.isin(self._take, turning))[1::2]
+        self._sines = np.flatnonzero(np.isin(self._take, list(in_radians)))[1::2]
         self._cosines = self._sines - 1
+        self.turning = list(zip(self._cosines.tolist(), self._sines.tolist()))
+        place = self._take.tolist().index
+        for angle, names in zip(at, each):
+            if len(angle) == 2:
+                if len(angle[0]) != len(angle[1]):
+                    raise ValueError(
+                        f"a cosine and a sine of angles must be equally many, got {names}, which are {len(angle[0])} "
+                        f"and {len(angle[1])} entries"
+                    )
+                self.turning += [(place(cosine), place(sine)) for cosine, sine in zip(*angle)]
         self.low, self.high = low[self._take], high[self._take]
-        for at in (self._cosines, self._sines):
-            self.low[at], self.high[at] = -1.0, 1.0
+        for side in (self._cosines, self._sines):
+            self.low[side], self.high[side] = -1.0, 1.0
 
     def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
         """The outputs in an observation.
@@ -197,6 +214,23 @@ def _entries(name: str, values: Any) -> tuple[Any, ...]:
     return found
 
 
+def _angles(values: Any) -> tuple[Any, ...]:
+    """Entries, and pairs of entries as tuples, or ValueError."""
+    if not isinstance(values, list | tuple | range) and not (isinstance(values, np.ndarray) and values.ndim):
+        raise ValueError(
+            "angles must be a sequence of indices or of keys, or of pairs of them, such as [2] or [(0, 1)], got "
+            f"{shown(values)}"
+        )
+    pairs = [isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0) for value in values]
+    for value, pair in zip(values, pairs):
+        if pair and len(value) != 2:
+            raise ValueError(f"a pair of angles must be a cosine and a sine, such as (0, 1), got {shown(value)}")
+    names = iter(
+        _entries("angles", [name for value, pair in zip(values, pairs) for name in (value if pair else (value,))])
+    )
+    return tuple((next(names), next(names)) if pair else next(names) for pair in pairs)
+
+
 def _check_keys(name: str, keys: Collection[str], known: Collection[Any]) -> None:
     for key in keys:
         if key not in known:
@@ -302,4 +336,4 @@ def _one_hot(value: Any, n: int, start: int, batch: tuple[int, ...]) -> np.ndarr
     return out.reshape(*batch, n)
 
 
-__all__ = ["Inputs", "Outputs"]
+__all__ = ["Angles", "Entries", "Inputs", "Outputs"]

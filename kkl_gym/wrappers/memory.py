@@ -11,7 +11,8 @@ from gymnasium.vector.utils import batch_space
 
 from kkl_gym.identity import source_of
 from kkl_gym.memory import Memory
-from kkl_gym.signals import Entries, Inputs, Outputs
+from kkl_gym.signals import Angles, Entries, Inputs, Outputs
+from kkl_gym.turning import TurningMemory
 from kkl_gym.vector import Infos, with_mask
 from kkl_gym.wrappers.vector import Step, VectorEnv, VectorWrapper, autoreset_mode_in
 from observers.checks import shown
@@ -27,19 +28,16 @@ class _Remembering:
         observation_space: gym.Space[Any],
         *,
         measured: Entries | None,
-        angles: Entries,
+        angles: Angles,
         time_constants: Sequence[float],
         input_time_constants: Sequence[float],
     ) -> None:
         source = source_of(env)
         self.outputs = Outputs(observation_space, measured, angles, source=source)
         self.inputs = Inputs(action_space, source=source)
-        self.memory = Memory(
-            len(self.outputs.low),
-            len(self.inputs.low),
-            time_constants=time_constants,
-            input_time_constants=input_time_constants,
-        )
+        sizes, turning = (len(self.outputs.low), len(self.inputs.low)), self.outputs.turning
+        how: dict[str, Any] = {"time_constants": time_constants, "input_time_constants": input_time_constants}
+        self.memory = TurningMemory(*sizes, turning, **how) if turning else Memory(*sizes, **how)
         with np.errstate(over="ignore"):  # what floats cannot hold is unbounded
             low, high = self.memory.bounds(self.outputs.low, self.outputs.high, self.inputs.low, self.inputs.high)
             self.space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
@@ -65,8 +63,10 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
         images.
     measured : sequence of int or of str, optional
         What the agent may see: indices in the flattened observation, or keys of a Dict. None is all.
-    angles : sequence of int or of str
-        Which of these are angles in rad. Each is replaced by its cosine and sine.
+    angles : sequence of int or of str, or of pairs of these
+        Which of these are angles in rad; each is replaced by its cosine and sine. A pair such as (0, 1) names the
+        cosine and the sine of an angle that is measured by them. Of angles it is remembered how far they have turned,
+        see :class:`kkl_gym.turning.TurningMemory`.
     time_constants : sequence of float
         Of the outputs' filters, in steps, from 0.5 to 10,000, each at least 1.5 times the one before. Longer ones
         remember longer.
@@ -96,7 +96,7 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
         env: gym.Env[Any, Any],
         measured: Entries | None = None,
         *,
-        angles: Entries = (),
+        angles: Angles = (),
         time_constants: Sequence[float] = (1.0, 2.0, 4.0, 8.0),
         input_time_constants: Sequence[float] = (1.0, 4.0),
     ) -> None:
@@ -187,7 +187,7 @@ class KKLVectorMemory(VectorWrapper):
         Any vector environment with the spaces that :class:`KKLMemory` takes.
     measured : sequence of int or of str, optional
         As for :class:`KKLMemory`, of one environment's observation.
-    angles : sequence of int or of str
+    angles : sequence of int or of str, or of pairs of these
         As for :class:`KKLMemory`.
     time_constants : sequence of float
         As for :class:`KKLMemory`.
@@ -220,7 +220,7 @@ class KKLVectorMemory(VectorWrapper):
         env: VectorEnv,
         measured: Entries | None = None,
         *,
-        angles: Entries = (),
+        angles: Angles = (),
         time_constants: Sequence[float] = (1.0, 2.0, 4.0, 8.0),
         input_time_constants: Sequence[float] = (1.0, 4.0),
     ) -> None:

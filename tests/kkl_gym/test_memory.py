@@ -26,6 +26,7 @@ import kkl_gym.memory
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLMemory, KKLVectorEnv, KKLVectorMemory
 from kkl_gym.memory import Memory
 from kkl_gym.signals import Inputs, Outputs
+from kkl_gym.turning import TurningMemory
 
 modes = pytest.mark.parametrize("mode", list(AutoresetMode))
 BANKS = [((1.0, 2.0, 4.0, 8.0), (1.0, 4.0)), ((0.5, 3.0, 500.0), ()), ((7.0,), (0.5, 30.0, 9000.0))]
@@ -225,6 +226,125 @@ def test_a_memory_begins_with_a_reset():
         memory(2, 1).restart(np.zeros((1, 2)), np.array([True, False]))
 
 
+# Angles
+
+ANGLES = [(3, 1), (0, 4)]  # of five outputs, of which the third is none
+
+
+def turning(steps, *shape, seed=0):
+    """Five outputs of two angles that turn around more than once, and these angles, unwrapped."""
+    rng = np.random.default_rng(seed)
+    angles = rng.uniform(-np.pi, np.pi, (*shape, 2)) + rng.uniform(-2.5, 2.5, (steps, *shape, 2)).cumsum(0)
+    other = rng.normal(size=(steps, *shape, 1))
+    (a, b), (cos, sin) = np.moveaxis(angles, -1, 0), (np.cos, np.sin)
+    return np.stack([cos(b), sin(a), other[..., 0], cos(a), sin(b)], axis=-1), np.concatenate([other, angles], axis=-1)
+
+
+def of_angles(**how):
+    return TurningMemory(5, 2, ANGLES, **{"time_constants": (1, 3), "input_time_constants": (2,), **how})
+
+
+@pytest.mark.parametrize("shape", [(), (4,)])
+def test_of_angles_it_is_remembered_how_far_they_have_turned(shape):
+    (y, unwrapped), u = turning(40, *shape), signals(39, *shape, 2, seed=1)
+    assert np.ptp(unwrapped[..., 1:], axis=0).min() > 2 * np.pi
+    seen, plain = run(of_angles(), y, u), run(memory(3, 2, (1, 3), (2,)), unwrapped, u)
+    assert np.allclose(seen[..., :5], y)
+    assert np.allclose(seen[..., 5:], plain[..., 3:], atol=1e-5)
+    assert seen.dtype == np.float32
+
+
+def test_a_rate_is_told_wherever_the_angle_is():
+    angle = np.linspace(0, 40, 200)
+    y = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    seen = run(TurningMemory(2, 0, [(0, 1)], time_constants=(2, 5), input_time_constants=()), y, np.zeros((199, 0)))
+    assert np.ptp(seen[1:, 2:], axis=0).max() < 1e-5
+    assert seen[1, 2] > 0.1
+
+
+def test_rows_with_angles_that_rest_and_that_restart():
+    (y, _), u = turning(4, 3), signals(3, 3, 2, seed=1)
+    filters = of_angles()
+    before = run(filters, y[:3], u[:2])[-1]
+    some = np.array([True, False, True])
+    after = filters.advance(y[3], u[2], some)
+    assert np.array_equal(after[1], before[1])
+    assert np.allclose(after[some], run(of_angles(), y, u)[-1][some])
+    first = filters.restart(y[0, :1], ~some)
+    assert np.array_equal(filters.shown()[some], after[some])
+    assert np.array_equal(filters.shown()[1:2], first)
+    assert np.array_equal(first[0], of_angles().reset(y[0, 0]))
+    again = filters.advance(y[1], u[0], ~some)[1]
+    fresh = of_angles()
+    fresh.reset(y[0, 0])
+    assert np.allclose(again, fresh.advance(y[1, 1], u[0, 1]), atol=1e-6)
+
+
+def test_a_memory_of_angles_begins_with_a_reset():
+    with pytest.raises(RuntimeError, match="before its first step"):
+        of_angles().advance(np.zeros(5), np.zeros(2))
+    with pytest.raises(RuntimeError, match="before its first step"):
+        of_angles().shown()
+    with pytest.raises(RuntimeError, match="reset all environments"):
+        of_angles().restart(np.zeros((1, 5)), np.array([True, False]))
+
+
+class Hand(gym.Env):
+    """A hand that turns as far as its action says, and shows its angle in rad, or where it is."""
+
+    action_space = spaces.Box(-3.0, 3.0, (1,))
+
+    def __init__(self, *, radians=False, most=7):
+        self.radians, self.most = radians, most
+        self.observation_space = spaces.Box(-np.inf, np.inf, (1 if radians else 2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.angle, self.steps = self.np_random.uniform(-3, 3), 0
+        return self._seen(), {}
+
+    def _seen(self):
+        seen = [self.angle] if self.radians else [np.cos(self.angle), np.sin(self.angle)]
+        return np.array(seen, dtype=np.float32)
+
+    def step(self, action):
+        self.angle += float(action[0])
+        self.steps += 1
+        return self._seen(), 0.0, self.steps == self.most, False, {}
+
+
+@modes
+def test_angles_in_vectors_that_reset(mode):
+    arguments = {"angles": [(0, 1)], "time_constants": [1, 5]}
+    ours = KKLVectorMemory(
+        SyncVectorEnv([partial(Hand, most=3 + i) for i in range(3)], autoreset_mode=mode), **arguments
+    )
+    theirs = SyncVectorEnv(
+        [lambda i=i: KKLMemory(Hand(most=3 + i), **arguments) for i in range(3)], autoreset_mode=mode
+    )
+    radians = KKLVectorMemory(
+        SyncVectorEnv([partial(Hand, most=3 + i, radians=True) for i in range(3)], autoreset_mode=mode),
+        angles=[0],
+        time_constants=[1, 5],
+    )
+    every = (ours, theirs, radians)
+    first, *others = (envs.reset(seed=1) for envs in every)
+    for other in others:
+        assert_alike(first, other)
+    ours.action_space.seed(0)
+    for _ in range(20):
+        actions = ours.action_space.sample()
+        first, *others = (envs.step(actions) for envs in every)
+        for other in others:
+            assert_alike(first, other)
+        ended = first[2] | first[3]
+        if mode is AutoresetMode.DISABLED and ended.any():
+            first, *others = (envs.reset(options={"reset_mask": ended.copy()}) for envs in every)
+            for other in others:
+                assert_alike(first, other)
+    assert np.abs(first[0]).max() > 1
+
+
 # What is read of observations and actions
 
 SPACES = [
@@ -313,9 +433,26 @@ def test_what_is_measured_and_angles():
     )
     read = Outputs(parts, ["way", "place"], ["way"], source="")
     assert np.allclose(read({"place": values[:2], "way": values[1:2]}), [0.1, 2.0, np.cos(2.0), np.sin(2.0)])
+    assert read.turning == [(2, 3)]
+
+
+def test_pairs_are_cosines_and_sines_that_are_measured():
+    space = spaces.Box(-10.0, 10.0, (5,))
+    values = np.arange(5.0)
+    read = Outputs(space, [4, 3, 0, 1], [(0, 4), [1, 3]], source="")
+    assert read(values).tolist() == [4.0, 3.0, 0.0, 1.0]
+    assert read.turning == [(2, 0), (3, 1)]
+    assert read.angles == ((0, 4), (1, 3))
+    read = Outputs(space, None, [1, (4, 2)], source="")
+    assert np.allclose(read(values), [0, np.cos(1), np.sin(1), 2, 3, 4])
+    assert read.turning == [(1, 2), (5, 3)]
+    assert Outputs(space, None, np.array([[0, 1], [2, 3]]), source="").turning == [(0, 1), (2, 3)]
+    joints = spaces.Dict(cos=spaces.Box(-1, 1, (2,)), other=spaces.Box(-1, 1, (1,)), sin=spaces.Box(-1, 1, (2,)))
+    assert Outputs(joints, None, [("cos", "sin")], source="").turning == [(0, 3), (1, 4)]
 
 
 IMAGE = spaces.Box(0, 255, (8, 8, 3), np.uint8)
+UNEVEN = spaces.Dict(a=spaces.Box(-1, 1, (1,)), b=spaces.Box(-1, 1, (2,)))
 MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Text(5))
 
 
@@ -331,6 +468,14 @@ MIXED = spaces.Dict(camera=IMAGE, place=spaces.Box(-1, 1, (2,)), word=spaces.Tex
         (spaces.Box(-1, 1, (3,)), "0", (), "measured must be a sequence of indices or of keys"),
         (spaces.Box(-1, 1, (3,)), 0, (), "measured must be a sequence of indices or of keys"),
         (spaces.Box(-1, 1, (3,)), [0, 1], [2], r"angles must be among what is measured, \(0, 1\), got \(2,\)"),
+        (spaces.Box(-1, 1, (3,)), [0, 1], [(0, 2)], r"angles must be among what is measured, \(0, 1\), got"),
+        (spaces.Box(-1, 1, (3,)), None, [(0, 3)], "angles names entry 3, but .* entries 0 to 2"),
+        (spaces.Box(-1, 1, (3,)), None, [(0, 1), 1], r"angles must name each entry once, got \[0, 1, 1\]"),
+        (spaces.Box(-1, 1, (3,)), None, [(0, 1, 2)], r"a cosine and a sine, such as \(0, 1\), got \(0, 1, 2\)"),
+        (spaces.Box(-1, 1, (3,)), None, 1, r"angles must be .* pairs of them, such as \[2\] or \[\(0, 1\)\], got 1"),
+        (spaces.Box(-1, 1, (3,)), None, [(0, "x")], "indices or keys, not both"),
+        (MIXED, ["place"], [(0, 1)], "angles must be keys, as measured is"),
+        (UNEVEN, None, [("a", "b")], r"equally many, got \('a', 'b'\), which are 1 and 2 entries"),
         (spaces.Box(-1, 1, (3,)), [0, "x"], (), "indices or keys, not both"),
         (IMAGE, None, (), r"X-v0 is an image, .*: let an encoder .*TransformObservation"),
         (MIXED, None, (), "X-v0, 'camera', is an image"),
@@ -439,6 +584,15 @@ def test_checkers_are_content(env_id):
 @applied(as_bare)
 def test_specs_copies_and_pickles_go_on_alike(env_id):
     env = KKLMemory(gym.make(env_id), measured=[0], time_constants=[1, 3], input_time_constants=np.array([2.0]))
+    assert_alike_when_copied(env)
+
+
+@pytest.mark.parametrize("angles", [[0], [(0, 1)], np.array([[0, 1]]), [[0, 1], 2]], ids=str)
+def test_specs_copies_and_pickles_of_memories_of_angles(angles):
+    assert_alike_when_copied(KKLMemory(gym.make("Pendulum-v1"), angles=angles))
+
+
+def assert_alike_when_copied(env):
     again = gym.make(EnvSpec.from_json(env.spec.to_json()))
     assert isinstance(again, KKLMemory)
     assert again.spec.to_json() == env.spec.to_json()
@@ -724,9 +878,10 @@ def test_wrong_arguments(argument, value, match):
         KKLMemory(gym.make("Pendulum-v1"), **{argument: value})
 
 
+entry = st.one_of(st.integers(-2, 5), st.floats(), st.text(max_size=2), st.booleans())
 bad = st.one_of(
     st.sampled_from(ATOMS).map(lambda make: make()),
-    st.lists(st.one_of(st.integers(-2, 5), st.floats(), st.text(max_size=2), st.booleans()), max_size=4),
+    st.lists(st.one_of(entry, st.lists(entry, max_size=3)), max_size=4),
 )
 
 

@@ -41,6 +41,11 @@ class EnvironmentOptions:
     """Of the memory that agents on z have, in steps. Where there is no noise, 1,2 may be easier to learn with."""
     frames: int = STACKED
     """How many observations, each with the action before it, are stacked for agents on those."""
+    angles: Annotated[
+        tuple[str, ...], tyro.conf.arg(metavar="COS,SIN [COS,SIN ...]", help_behavior_hint="(default: none)")
+    ] = ()
+    """Pairs of measured entries that are the cosine and the sine of an angle, as in 0,1. Agents on z then remember how
+    far it has turned, and agents on stacked observations see it."""
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.
@@ -76,6 +81,7 @@ class EnvironmentOptions:
             measurement_noise=measurement_noise,
             env_kwargs=dict(self.env_kwargs),
             frames=self.frames,
+            angles=tuple(_indices("angles", angle) for angle in self.angles),  # type: ignore[misc]  # checked there
             **({"time_constants": _steps("time-constants", self.time_constants)} if self.time_constants else {}),
         )
 

@@ -93,7 +93,11 @@ def test_noise_lies_on_what_is_measured_and_leaves_episodes_as_they_are():
 
 
 @pytest.mark.parametrize("kind", sorted({*SHOWN} - {*ESTIMATES}))
-@pytest.mark.parametrize("task", [PENDULUM, replace(CART, measurement_noise=0.1)], ids=["pendulum", "cart"])
+@pytest.mark.parametrize(
+    "task",
+    [PENDULUM, replace(CART, measurement_noise=0.1), replace(PENDULUM, angles=((0, 1),))],
+    ids=["pendulum", "cart", "angle"],
+)
 def test_what_is_shown_passes_gymnasiums_checker(task, kind):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about bounds that are infinite, and that the environment is wrapped
@@ -124,6 +128,31 @@ def test_a_task_says_how_long_memories_and_stacks_are(tmp_path):
     path = tmp_path / "agent.safetensors"
     network = MLP([np.zeros((1, 8))], [np.zeros(1)], "tanh")
     player(task=task, information="z", network=network).save(path)
+    assert Player.read(path).task == task
+    assert Player.read(path).make().observation_space == z.observation_space
+
+
+def test_agents_on_memories_and_stacks_can_be_told_of_angles(tmp_path):
+    task = replace(PENDULUM, measured=(1, 0), angles=((0, 1),), frames=4)
+    z = show(task, "z")
+    assert z.observation_space.shape == (2 + 4 + 2,)
+    env, plain = show(task, "stacked"), show(task, "y")
+    (first, _), (y0, _) = env.reset(seed=0), plain.reset(seed=0)
+    np.testing.assert_array_equal(first, np.float32([0, 0] * 3 + [*y0, 0]))
+    turned, actions, rate = [0.0] * 4, [0.0] * 4, 0.0
+    for _ in range(60):
+        action = np.array([2.0 if rate >= 0 else -2.0], dtype=np.float32)  # which swings it all around
+        shown = env.step(action)[0]
+        y = plain.step(action)[0]
+        rate = env.unwrapped.state[1]
+        turned = [*turned[1:], turned[-1] + 0.05 * rate]  # Euler's, with the new rate
+        actions = [*actions[1:], action[0] / 2]
+        earlier = np.stack([actions[:3], turned[-1] - np.array(turned[:3])], axis=1).ravel()
+        np.testing.assert_allclose(shown, [*earlier, *y, actions[-1]], atol=1e-5)
+        assert shown in env.observation_space
+    assert abs(turned[-1]) > 2 * np.pi
+    path = tmp_path / "agent.safetensors"
+    player(task=task, information="z", network=MLP([np.zeros((1, 8))], [np.zeros(1)], "tanh")).save(path)
     assert Player.read(path).task == task
     assert Player.read(path).make().observation_space == z.observation_space
 
@@ -375,6 +404,12 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
         ({"measured": (0,), "measurement_noise": np.nan}, "from 0 on"),
         ({"measured": (0,), "time_constants": (2.0, 1.0)}, "must rise"),
         ({"measured": (0,), "time_constants": ()}, "at least one"),
+        ({"measured": (0,), "angles": ((0, 1),)}, r"that are measured, \(0,\), each once, got \(\(0, 1\),\)"),
+        ({"measured": (0, 1), "angles": ((0, 0),)}, "each once"),
+        ({"measured": (0, 1), "angles": ((0, -1),)}, "a sine must be an integer, not negative, got -1"),
+        ({"measured": (0, 1), "angles": (0, 1)}, "angles must be pairs of entries"),
+        ({"measured": (0, 1), "angles": ((0,),)}, "angles must be pairs of entries"),
+        ({"measured": (0, 1), "angles": None}, "angles must be pairs of entries"),
         ({"measured": (0,), "frames": 0}, "frames must be"),
         ({"measured": (0,), "frames": 2.5}, "frames must be"),
         ({"measured": (0,), "frames": 10**9}, "frames must be"),
@@ -451,12 +486,13 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
 
 
 def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
-    longer = replace(CART, time_constants=(1, 2, 4), frames=9)
-    differ = {
-        kind: Case(CART, kind, 0, 2, None, 0, tmp_path).identity != Case(longer, kind, 0, 2, None, 0, tmp_path).identity
-        for kind in ("random", *SHOWN)
-    }
-    assert {kind for kind in differ if differ[kind]} == {"z", "stacked", "stacked_x_hat"}
+    def differ(changed):
+        cases = {kind: [Case(task, kind, 0, 2, None, 0, tmp_path) for task in (PENDULUM, changed)] for kind in KINDS}
+        return {kind for kind, (one, other) in cases.items() if one.identity != other.identity}
+
+    KINDS = ("random", *SHOWN)
+    assert differ(replace(PENDULUM, time_constants=(1, 2, 4), frames=9)) == {"z", "stacked", "stacked_x_hat"}
+    assert differ(replace(PENDULUM, angles=((0, 1),))) == {"z", "stacked"}
 
 
 def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):
@@ -588,6 +624,11 @@ def test_the_commands_train_and_play(tmp_path, small, capsys):
         EnvironmentOptions(time_constants="1;2").task("CartPole-v1")
     shorter = EnvironmentOptions(time_constants="1,2", frames=4).task("CartPole-v1")
     assert (shorter.time_constants, shorter.frames) == ((1.0, 2.0), 4)
+    assert EnvironmentOptions(angles=("3,1", "4,2")).task("InvertedDoublePendulum-v5").angles == ((3, 1), (4, 2))
+    with pytest.raises(ValueError, match="--angles takes indices"):
+        EnvironmentOptions(angles=("cos",)).task("Pendulum-v1")
+    with pytest.raises(ValueError, match="angles must be pairs of entries"):
+        EnvironmentOptions(angles=("0,1,2",)).task("Pendulum-v1")
     with pytest.raises(ValueError, match="one number"):
         Train("CartPole-v1", "z", out=tmp_path / "e", measurement_noise=(0.1, 0.2)).run(Console())
     with pytest.raises(ValueError, match="a system knows"):

@@ -69,9 +69,13 @@ class Case:
     def identity(self) -> dict[str, Any]:
         """What must not differ between a result that is there and one that is asked for."""
         task = asdict(self.task)
-        for length, kinds in (("time_constants", ("z",)), ("frames", ("stacked", "stacked_x_hat"))):
+        for option, kinds in (
+            ("time_constants", ("z",)),
+            ("frames", ("stacked", "stacked_x_hat")),
+            ("angles", ("z", "stacked")),
+        ):
             if self.kind not in kinds:
-                del task[length]  # which is nothing to the others
+                del task[option]  # which is nothing to the others
         described: dict[str, Any] = {
             "protocol": PROTOCOL,
             "episodes": self.episodes,

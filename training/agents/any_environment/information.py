@@ -1,5 +1,6 @@
 """What an agent is shown of an environment of which a part is hidden."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -13,6 +14,7 @@ from gymnasium.wrappers import TransformObservation
 from kkl_gym import KKLMemory, KKLObservation
 from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
+from kkl_gym.turning import unwrapped
 from training.agents.any_environment.task import HiddenTask
 from training.agents.any_environment.window import WindowEstimator, WindowObservation
 from training.rollouts.playing import Recorder
@@ -64,13 +66,16 @@ def show(
         shown: Any = env.observation_space
         return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
-        return KKLMemory(env, task.measured, time_constants=task.time_constants)
+        return KKLMemory(env, task.measured, angles=task.angles, time_constants=task.time_constants)
     if information == "stacked_x_hat":
         return _stacked_estimates(task, env, WindowEstimator.read(str(observer)), keep)
     env = part_of(env, task.measured)
     if information == "y":
         return env
-    return StackedWithActions(env, 1 if information == "recurrent" else task.frames)
+    if information == "recurrent":
+        return StackedWithActions(env, 1)
+    at = task.measured.index
+    return StackedWithActions(env, task.frames, [(at(cosine), at(sine)) for cosine, sine in task.angles])
 
 
 def _stacked_estimates(
@@ -117,7 +122,8 @@ def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
 class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Shows the last observations, each with the action before it, the latest last.
 
-    Before an episode's first step there were its first observation and no action.
+    Before an episode's first step there were its first observation and no action. Of an angle earlier observations
+    show how far it has turned since, in rad; from one to the next it turns by less than half a turn.
 
     Parameters
     ----------
@@ -125,37 +131,59 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         With rows of numbers as observations.
     count : int
         Observations shown.
+    angles : sequence of pairs of int
+        Entries that are the cosine and the sine of an angle.
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, Any], count: int) -> None:
-        RecordConstructorArgs.__init__(self, count=count)
+    def __init__(self, env: gym.Env[np.ndarray, Any], count: int, angles: Sequence[tuple[int, int]] = ()) -> None:
+        RecordConstructorArgs.__init__(self, count=count, angles=angles)
         gym.Wrapper.__init__(self, env)
         self._inputs = Inputs(env.action_space, source=source_of(env))
+        self._cosines, self._sines = ([angle[side] for angle in angles] for side in (0, 1))
         self._rows: deque[np.ndarray] = deque(maxlen=count)
+        self._turned: deque[np.ndarray] = deque(maxlen=count)  # angles in rad
         of: Any = env.observation_space
         low, high = np.append(of.low, self._inputs.low), np.append(of.high, self._inputs.high)
         low[of.shape[0] :], high[of.shape[0] :] = np.minimum(self._inputs.low, 0.0), np.maximum(self._inputs.high, 0.0)
-        self.observation_space = gym.spaces.Box(
-            np.tile(low, count).astype(np.float32), np.tile(high, count).astype(np.float32), dtype=np.float32
+        self._straight = [i for i in range(len(low)) if i not in {*self._cosines, *self._sines}]
+        furthest = np.full(len(angles), math.pi * (count - 1))
+        low, high = (
+            np.concatenate([*[np.append(side[self._straight], turned)] * (count - 1), side]).astype(np.float32)
+            for side, turned in ((low, -furthest), (high, furthest))
         )
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Reset the environment, and forget what was before."""
         observation, info = self.env.reset(seed=seed, options=options)
-        first = np.append(observation, np.zeros(len(self._inputs.low)))
-        self._rows.extend([first] * (self._rows.maxlen or 1))
+        first, count = np.append(observation, np.zeros(len(self._inputs.low))), self._rows.maxlen or 1
+        self._rows.extend([first] * count)
+        self._turned.extend([self._angles(first)] * count)
         return self._shown(), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Step the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        self._rows.append(np.append(observation, self._inputs(action)))
+        row = np.append(observation, self._inputs(action))
+        self._rows.append(row)
+        self._turned.append(unwrapped(self._angles(row), self._turned[-1]))
         return self._shown(), float(reward), terminated, truncated, info
 
+    def _angles(self, row: np.ndarray) -> np.ndarray:
+        return np.arctan2(row[self._sines], row[self._cosines])
+
     def _shown(self) -> np.ndarray:
-        return np.concatenate(self._rows, dtype=np.float32)
+        if not self._sines:
+            return np.concatenate(self._rows, dtype=np.float32)
+        *earlier, last = self._rows
+        parts = [
+            part
+            for row, turned in zip(earlier, self._turned)
+            for part in (row[self._straight], self._turned[-1] - turned)
+        ]
+        return np.concatenate([*parts, last], dtype=np.float32)
 
 
 __all__ = ["ESTIMATES", "SHOWN", "Shown", "StackedWithActions", "part_of", "show"]

@@ -39,6 +39,10 @@ class HiddenTask:
         Of the memory of what is measured, in steps, as :class:`kkl_gym.KKLMemory` takes them; for agents on z.
     frames : int
         How many observations are stacked, for agents that see the last ones.
+    angles : tuple of tuple of int
+        Pairs of measured entries that are the cosine and the sine of an angle. Agents on z then have a memory of how
+        far it has turned, as :class:`kkl_gym.KKLMemory` takes them; agents on stacked observations see how far it has
+        turned since each.
 
     Raises
     ------
@@ -53,6 +57,7 @@ class HiddenTask:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     frames: int = STACKED
+    angles: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("measured", "hidden"):
@@ -61,6 +66,7 @@ class HiddenTask:
                 if len(set(entries)) < len(entries) or (name == "measured" and not entries):
                     raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
                 object.__setattr__(self, name, entries)
+        object.__setattr__(self, "angles", _pairs(self.angles, self.measured))
         if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:
             raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
@@ -165,6 +171,20 @@ class HiddenTask:
 
     def _hidden(self, size: int) -> tuple[int, ...]:
         return tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
+
+
+def _pairs(values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+    """Angles as pairs of entries, or ValueError."""
+    pairs = isinstance(values, list | tuple) and all(
+        isinstance(pair, list | tuple) and len(pair) == 2 for pair in values
+    )
+    if not pairs:
+        raise ValueError(f"angles must be pairs of entries, cosine and sine, as in ((0, 1),), got {shown(values)}")
+    found = tuple((integer("a cosine", pair[0], 0), integer("a sine", pair[1], 0)) for pair in values)
+    named = [entry for pair in found for entry in pair]
+    if len(set(named)) < len(named) or not set(named) <= set(measured):
+        raise ValueError(f"angles must name entries that are measured, {measured}, each once, got {shown(values)}")
+    return found
 
 
 class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):

@@ -1,0 +1,109 @@
+"""A memory of signals of which some are angles: of these it keeps how far they have turned."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from kkl_gym.memory import Memory
+
+
+def unwrapped(angles: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Angles in rad, moved by whole turns to where they are nearest to what they were before."""
+    return angles - 2 * math.pi * np.round((angles - before) / (2 * math.pi))
+
+
+class TurningMemory:
+    """A :class:`Memory` in which an angle that is measured by its cosine and its sine is one signal.
+
+    Filters of a cosine and a sine hold the rate of an angle only as a product with where it is. What is remembered
+    here is the angle itself, unwrapped: from one sample to the next it has turned by less than half a turn.
+
+    Parameters
+    ----------
+    ny, nu : int
+        Numbers of outputs and inputs.
+    angles : sequence of pairs of int
+        Which outputs are the cosine and the sine of an angle, each output once.
+    time_constants, input_time_constants : sequence of float
+        As :class:`Memory` takes them.
+
+    Raises
+    ------
+    ValueError
+        As :class:`Memory`.
+    """
+
+    def __init__(
+        self,
+        ny: int,
+        nu: int,
+        angles: Sequence[tuple[int, int]],
+        *,
+        time_constants: Sequence[float],
+        input_time_constants: Sequence[float],
+    ) -> None:
+        self._cosines, self._sines = map(list, zip(*angles))
+        self._others = [i for i in range(ny) if i not in {*self._cosines, *self._sines}]
+        signals = len(self._others) + len(angles)
+        self._memory = Memory(signals, nu, time_constants=time_constants, input_time_constants=input_time_constants)
+        self._hidden = signals  # numbers of what it shows that are the signals themselves
+        self._y: np.ndarray | None = None
+        self._turned = np.empty(0)  # angles in rad since the reset, (number of angles,) or (n, number of angles)
+
+    @property
+    def time_constants(self) -> tuple[float, ...]:
+        """Of the outputs, in steps."""
+        return self._memory.time_constants
+
+    @property
+    def input_time_constants(self) -> tuple[float, ...]:
+        """Of the inputs, in steps."""
+        return self._memory.input_time_constants
+
+    def bounds(self, low: np.ndarray, high: np.ndarray, u_low: np.ndarray, u_high: np.ndarray) -> np.ndarray:
+        """As :meth:`Memory.bounds`; memories of angles have none, because these may turn for ever."""
+        for_ever = np.full(len(self._cosines), np.inf)
+        low_of, high_of = np.append(low[self._others], -for_ever), np.append(high[self._others], for_ever)
+        return np.hstack([[low, high], self._memory.bounds(low_of, high_of, u_low, u_high)[:, self._hidden :]])
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """As :meth:`Memory.reset`."""
+        self._y, self._turned = y0.copy(), self._angles(y0)
+        return self._shown(self._y, self._memory.reset(self._signals()))
+
+    def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """As :meth:`Memory.restart`."""
+        if self._y is None:
+            raise RuntimeError("reset all environments before some of them")
+        self._y[rows], self._turned[rows] = y0, self._angles(y0)
+        return self._shown(y0, self._memory.restart(self._signals()[rows], rows))
+
+    def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """As :meth:`Memory.advance`; memories of angles come after those of the other outputs."""
+        if self._y is None:
+            raise RuntimeError("reset the environment before its first step")
+        self._y = y.copy() if rows is None else np.where(rows[:, None], y, self._y)
+        self._turned = unwrapped(self._angles(self._y), self._turned)
+        return self._shown(self._y, self._memory.advance(self._signals(), u, rows))
+
+    def shown(self) -> np.ndarray:
+        """As :meth:`Memory.shown`, of all rows."""
+        if self._y is None:
+            raise RuntimeError("reset the environment before its first step")
+        return self._shown(self._y, self._memory.shown())
+
+    def _angles(self, y: np.ndarray) -> np.ndarray:
+        return np.arctan2(y[..., self._sines], y[..., self._cosines])
+
+    def _signals(self) -> np.ndarray:
+        """What the memory filters: the other outputs, then the angles."""
+        assert self._y is not None
+        return np.concatenate((self._y[..., self._others], self._turned), axis=-1)
+
+    def _shown(self, y: np.ndarray, filtered: np.ndarray) -> np.ndarray:
+        """Outputs in place of the signals that are filtered."""
+        return np.concatenate((y, filtered[..., self._hidden :]), axis=-1, dtype=np.float32)
+
+
+__all__ = ["TurningMemory", "unwrapped"]
