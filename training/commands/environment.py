@@ -41,6 +41,8 @@ class EnvironmentOptions:
     """Of the memory that agents on z have, in steps. Where there is no noise, 1,2 may be easier to learn with."""
     frames: int = STACKED
     """How many observations, each with the action before it, are stacked for agents on those."""
+    no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Leave past actions out of what agents on z and on stacked observations are shown."""
     angles: Annotated[
         tuple[str, ...], tyro.conf.arg(metavar="COS,SIN [COS,SIN ...]", help_behavior_hint="(default: none)")
     ] = ()
@@ -81,6 +83,7 @@ class EnvironmentOptions:
             measurement_noise=measurement_noise,
             env_kwargs=dict(self.env_kwargs),
             frames=self.frames,
+            past_actions=not self.no_past_actions,
             angles=tuple(_indices("angles", angle) for angle in self.angles),  # type: ignore[misc]  # checked there
             **({"time_constants": _steps("time-constants", self.time_constants)} if self.time_constants else {}),
         )

@@ -132,6 +132,20 @@ def test_a_task_says_how_long_memories_and_stacks_are(tmp_path):
     assert Player.read(path).make().observation_space == z.observation_space
 
 
+def test_past_actions_can_be_left_out():
+    z, stacked = (show(replace(CART, past_actions=False), kind) for kind in ("z", "stacked"))
+    assert z.observation_space.shape == (2 + 2 * 4,)
+    seen = [z.reset(seed=0)[0], *(z.step(action)[0] for action in (0, 1, 1))]
+    first = stacked.reset(seed=0)[0]
+    for action in (0, 1, 1):
+        last = stacked.step(action)[0]
+    np.testing.assert_array_equal(first, np.tile(seen[0][:2], 8))
+    np.testing.assert_array_equal(last.reshape(8, 2)[-4:], np.array(seen)[:, :2])
+    np.testing.assert_array_equal(last.reshape(8, 2)[:4], np.tile(seen[0][:2], (4, 1)))
+    check = (stacked.observation_space.shape, stacked.observation_space.contains(last))
+    assert check == ((16,), True)
+
+
 def test_agents_on_memories_and_stacks_can_be_told_of_angles(tmp_path):
     task = replace(PENDULUM, measured=(1, 0), angles=((0, 1),), frames=4)
     z = show(task, "z")
@@ -404,6 +418,7 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
         ({"measured": (0,), "measurement_noise": np.nan}, "from 0 on"),
         ({"measured": (0,), "time_constants": (2.0, 1.0)}, "must rise"),
         ({"measured": (0,), "time_constants": ()}, "at least one"),
+        ({"measured": (0,), "past_actions": "no"}, "past_actions must be"),
         ({"measured": (0,), "angles": ((0, 1),)}, r"that are measured, \(0,\), each once, got \(\(0, 1\),\)"),
         ({"measured": (0, 1), "angles": ((0, 0),)}, "each once"),
         ({"measured": (0, 1), "angles": ((0, -1),)}, "a sine must be an integer, not negative, got -1"),
@@ -493,6 +508,7 @@ def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
     KINDS = ("random", *SHOWN)
     assert differ(replace(PENDULUM, time_constants=(1, 2, 4), frames=9)) == {"z", "stacked", "stacked_x_hat"}
     assert differ(replace(PENDULUM, angles=((0, 1),))) == {"z", "stacked"}
+    assert differ(replace(PENDULUM, past_actions=False)) == {"z", "stacked"}
 
 
 def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):
@@ -624,6 +640,7 @@ def test_the_commands_train_and_play(tmp_path, small, capsys):
         EnvironmentOptions(time_constants="1;2").task("CartPole-v1")
     shorter = EnvironmentOptions(time_constants="1,2", frames=4).task("CartPole-v1")
     assert (shorter.time_constants, shorter.frames) == ((1.0, 2.0), 4)
+    assert not EnvironmentOptions(no_past_actions=True).task("CartPole-v1").past_actions
     assert EnvironmentOptions(angles=("3,1", "4,2")).task("InvertedDoublePendulum-v5").angles == ((3, 1), (4, 2))
     with pytest.raises(ValueError, match="--angles takes indices"):
         EnvironmentOptions(angles=("cos",)).task("Pendulum-v1")

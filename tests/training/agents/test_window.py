@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import check_env
 
 from observers import MLP
 from training.agents.any_environment import learning
-from training.agents.any_environment.information import StackedWithActions, part_of, show
+from training.agents.any_environment.information import Stacked, part_of, show
 from training.agents.any_environment.learning import learn_to_play
 from training.agents.any_environment.observing import SETTINGS, Told, wander
 from training.agents.any_environment.player import Player
@@ -49,7 +49,7 @@ def learned(task, folder, records):
 def test_it_is_fitted_to_the_stacks_that_it_will_see(task):
     whole = task.make()
     recorder = Recorder(whole, **task.signals(whole.observation_space.shape[0]))
-    env = StackedWithActions(part_of(recorder, task.measured), 5)
+    env = Stacked(part_of(recorder, task.measured), 5)
     env.action_space.seed(0)
     seen = []
     for episode in range(3):

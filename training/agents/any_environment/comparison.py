@@ -72,6 +72,7 @@ class Case:
         for option, kinds in (
             ("time_constants", ("z",)),
             ("frames", ("stacked", "stacked_x_hat")),
+            ("past_actions", ("z", "stacked")),
             ("angles", ("z", "stacked")),
         ):
             if self.kind not in kinds:

@@ -66,16 +66,18 @@ def show(
         shown: Any = env.observation_space
         return part_of(env, range(len(task.measured), shown.shape[0])) if task.measurement_noise else env
     if information == "z":
-        return KKLMemory(env, task.measured, angles=task.angles, time_constants=task.time_constants)
+        without = {} if task.past_actions else {"input_time_constants": ()}
+        return KKLMemory(env, task.measured, angles=task.angles, time_constants=task.time_constants, **without)
     if information == "stacked_x_hat":
         return _stacked_estimates(task, env, WindowEstimator.read(str(observer)), keep)
     env = part_of(env, task.measured)
     if information == "y":
         return env
     if information == "recurrent":
-        return StackedWithActions(env, 1)
+        return Stacked(env, 1)
     at = task.measured.index
-    return StackedWithActions(env, task.frames, [(at(cosine), at(sine)) for cosine, sine in task.angles])
+    angles = [(at(cosine), at(sine)) for cosine, sine in task.angles]
+    return Stacked(env, task.frames, angles, actions=task.past_actions)
 
 
 def _stacked_estimates(
@@ -90,7 +92,7 @@ def _stacked_estimates(
         low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
     if keep is not None:
         env = Recorder(env, **task.signals(size), keep=keep)
-    stacked = StackedWithActions(part_of(env, task.measured), task.frames)
+    stacked = Stacked(part_of(env, task.measured), task.frames)
     return WindowObservation(stacked, task, estimator, gym.spaces.Box(low, high, dtype=np.float32))
 
 
@@ -119,8 +121,8 @@ def _taken(entries: list[int], observation: np.ndarray) -> np.ndarray:
     return observation[entries].astype(np.float32)
 
 
-class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
-    """Shows the last observations, each with the action before it, the latest last.
+class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+    """Shows the last observations, the latest last, and with each the action before it.
 
     Before an episode's first step there were its first observation and no action. Of an angle earlier observations
     show how far it has turned since, in rad; from one to the next it turns by less than half a turn.
@@ -133,18 +135,30 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         Observations shown.
     angles : sequence of pairs of int
         Entries that are the cosine and the sine of an angle.
+    actions : bool
+        Whether actions are shown.
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, Any], count: int, angles: Sequence[tuple[int, int]] = ()) -> None:
-        RecordConstructorArgs.__init__(self, count=count, angles=angles)
+    def __init__(
+        self,
+        env: gym.Env[np.ndarray, Any],
+        count: int,
+        angles: Sequence[tuple[int, int]] = (),
+        *,
+        actions: bool = True,
+    ) -> None:
+        RecordConstructorArgs.__init__(self, count=count, angles=angles, actions=actions)
         gym.Wrapper.__init__(self, env)
-        self._inputs = Inputs(env.action_space, source=source_of(env))
+        self._inputs = Inputs(env.action_space, source=source_of(env)) if actions else None
         self._cosines, self._sines = ([angle[side] for angle in angles] for side in (0, 1))
         self._rows: deque[np.ndarray] = deque(maxlen=count)
         self._turned: deque[np.ndarray] = deque(maxlen=count)  # angles in rad
         of: Any = env.observation_space
-        low, high = np.append(of.low, self._inputs.low), np.append(of.high, self._inputs.high)
-        low[of.shape[0] :], high[of.shape[0] :] = np.minimum(self._inputs.low, 0.0), np.maximum(self._inputs.high, 0.0)
+        low, high = of.low, of.high
+        if self._inputs is not None:  # 0 before the first step
+            low = np.append(low, np.minimum(self._inputs.low, 0.0))
+            high = np.append(high, np.maximum(self._inputs.high, 0.0))
+        self._width = len(low)
         self._straight = [i for i in range(len(low)) if i not in {*self._cosines, *self._sines}]
         furthest = np.full(len(angles), math.pi * (count - 1))
         low, high = (
@@ -158,7 +172,7 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Reset the environment, and forget what was before."""
         observation, info = self.env.reset(seed=seed, options=options)
-        first, count = np.append(observation, np.zeros(len(self._inputs.low))), self._rows.maxlen or 1
+        first, count = np.append(observation, np.zeros(self._width - len(observation))), self._rows.maxlen or 1
         self._rows.extend([first] * count)
         self._turned.extend([self._angles(first)] * count)
         return self._shown(), info
@@ -166,7 +180,7 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Step the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        row = np.append(observation, self._inputs(action))
+        row = observation if self._inputs is None else np.append(observation, self._inputs(action))
         self._rows.append(row)
         self._turned.append(unwrapped(self._angles(row), self._turned[-1]))
         return self._shown(), float(reward), terminated, truncated, info
@@ -186,4 +200,4 @@ class StackedWithActions(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCo
         return np.concatenate([*parts, last], dtype=np.float32)
 
 
-__all__ = ["ESTIMATES", "SHOWN", "Shown", "StackedWithActions", "part_of", "show"]
+__all__ = ["ESTIMATES", "SHOWN", "Shown", "Stacked", "part_of", "show"]

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 
 from kkl_gym.memory import output_time_constants
-from observers.checks import LARGEST, integer, is_finite, shown
+from observers.checks import LARGEST, flag, integer, is_finite, shown
 from training.agents.information import STACKED
 from training.rollouts.playing import make
 
@@ -39,6 +39,8 @@ class HiddenTask:
         Of the memory of what is measured, in steps, as :class:`kkl_gym.KKLMemory` takes them; for agents on z.
     frames : int
         How many observations are stacked, for agents that see the last ones.
+    past_actions : bool
+        Whether agents on z and on stacked observations are shown what they did before.
     angles : tuple of tuple of int
         Pairs of measured entries that are the cosine and the sine of an angle. Agents on z then have a memory of how
         far it has turned, as :class:`kkl_gym.KKLMemory` takes them; agents on stacked observations see how far it has
@@ -57,6 +59,7 @@ class HiddenTask:
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     time_constants: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     frames: int = STACKED
+    past_actions: bool = True
     angles: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
@@ -71,6 +74,7 @@ class HiddenTask:
             raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
         object.__setattr__(self, "time_constants", output_time_constants("time_constants", self.time_constants))
+        object.__setattr__(self, "past_actions", flag("past_actions", self.past_actions))
         object.__setattr__(self, "frames", integer("frames", self.frames, 1, MOST_FRAMES))
 
     @property
