@@ -102,7 +102,15 @@ class Memory:
         """How many numbers are shown."""
         return self._ny * (1 + len(self.time_constants)) + self._nu * len(self.input_time_constants)
 
-    def bounds(self, low: np.ndarray, high: np.ndarray, u_low: np.ndarray, u_high: np.ndarray) -> np.ndarray:
+    def bounds(
+        self,
+        low: np.ndarray,
+        high: np.ndarray,
+        u_low: np.ndarray,
+        u_high: np.ndarray,
+        *,
+        change: np.ndarray | float = np.inf,
+    ) -> np.ndarray:
         """The least and the largest that can be shown, at any age; the worst signals come within 1 % of them.
 
         Parameters
@@ -111,6 +119,8 @@ class Memory:
             Bounds of the outputs, which may be infinite.
         u_low, u_high : ndarray, shape (nu,)
             Bounds of the inputs.
+        change : ndarray, shape (ny,), or float
+            What outputs change by in a step, at most; may be infinite.
 
         Returns
         -------
@@ -120,15 +130,19 @@ class Memory:
         ages = {*range(1, min(64, self._filled)), *np.geomspace(64, max(64, self._filled), 64).astype(int).tolist()}
         with np.errstate(under="ignore"):
             weights = self.rise * self.decay ** np.arange(max(ages))[:, None]
-            reach = 1.002 * np.max([self._reach(weights[:age]) for age in ages], axis=0)  # of ages between these too
-        of_outputs = np.outer(reach, high - low).ravel()
+            reach, path = 1.002 * np.max([self._reach(weights[:age]) for age in ages], axis=0)  # of ages between, too
+        of_outputs = np.minimum(np.outer(reach, high - low), np.outer(path, np.broadcast_to(change, low.shape))).ravel()
         of_inputs = np.tile([np.minimum(u_low, 0.0), np.maximum(u_high, 0.0)], len(self.input_decay))  # 0 at first
         return np.hstack([[low, high], [-of_outputs, of_outputs], of_inputs])
 
-    def _reach(self, weights: np.ndarray) -> np.ndarray:
-        """How far outputs from 0 to 1 can move coordinates, if w weighs their changes by these, the latest first."""
+    def _reach(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far outputs from 0 to 1 can move coordinates, and outputs that change by 1 in each step.
+
+        w weighs their changes by the weights, the latest first.
+        """
         of_changes = self.mixing @ (weights * _with_past(self.decay, len(weights))).T
-        return np.maximum(np.diff(of_changes, prepend=0.0, append=0.0), 0.0).sum(1)
+        within = np.maximum(np.diff(of_changes, prepend=0.0, append=0.0), 0.0).sum(1)
+        return within, np.abs(of_changes).sum(1)
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget all, as if the outputs had rested at ``y0`` and no input had acted.

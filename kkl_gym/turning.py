@@ -8,16 +8,32 @@ import numpy as np
 from kkl_gym.memory import Memory
 
 
-def unwrapped(angles: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Angles in rad, moved by whole turns to where they are nearest to what they were before."""
-    return angles - 2 * math.pi * np.round((angles - before) / (2 * math.pi))
+def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
+    """Angles in rad that have turned by less than half a turn since before, and have not where nothing is known.
+
+    Parameters
+    ----------
+    cosines, sines : ndarray
+        Of the angles; both 0, or NaN, where nothing is known.
+    before : ndarray or float
+        What the angles were, in rad, which may be more than a turn.
+
+    Returns
+    -------
+    ndarray
+        What they are.
+    """
+    angles = np.arctan2(sines, cosines)
+    nearest = angles - 2 * math.pi * np.round((angles - before) / (2 * math.pi))
+    return np.where(np.isnan(angles) | ((cosines == 0) & (sines == 0)), before, nearest)
 
 
 class TurningMemory:
     """A :class:`Memory` in which an angle that is measured by its cosine and its sine is one signal.
 
     Filters of a cosine and a sine hold the rate of an angle only as a product with where it is. What is remembered
-    here is the angle itself, unwrapped: from one sample to the next it has turned by less than half a turn.
+    here is the angle itself, unwrapped. It is taken to turn by less than half a turn from one sample to the next; one
+    that is faster is remembered as turning the other way. Where cosine and sine are both 0, it is taken to rest.
 
     Parameters
     ----------
@@ -62,29 +78,31 @@ class TurningMemory:
         return self._memory.input_time_constants
 
     def bounds(self, low: np.ndarray, high: np.ndarray, u_low: np.ndarray, u_high: np.ndarray) -> np.ndarray:
-        """As :meth:`Memory.bounds`; memories of angles have none, because these may turn for ever."""
+        """As :meth:`Memory.bounds`; angles may turn for ever, but by no more than half a turn in a step."""
         for_ever = np.full(len(self._cosines), np.inf)
         low_of, high_of = np.append(low[self._others], -for_ever), np.append(high[self._others], for_ever)
-        return np.hstack([[low, high], self._memory.bounds(low_of, high_of, u_low, u_high)[:, self._hidden :]])
+        change = np.append(np.full(len(self._others), np.inf), np.full(len(self._cosines), math.pi))
+        of_memory = self._memory.bounds(low_of, high_of, u_low, u_high, change=change)
+        return np.hstack([[low, high], of_memory[:, self._hidden :]])
 
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """As :meth:`Memory.reset`."""
-        self._y, self._turned = y0.copy(), self._angles(y0)
+        self._y, self._turned = y0.copy(), self._angles(y0, 0.0)
         return self._shown(self._y, self._memory.reset(self._signals()))
 
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """As :meth:`Memory.restart`."""
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
-        self._y[rows], self._turned[rows] = y0, self._angles(y0)
+        self._y[rows], self._turned[rows] = y0, self._angles(y0, 0.0)
         return self._shown(y0, self._memory.restart(self._signals()[rows], rows))
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """As :meth:`Memory.advance`; memories of angles come after those of the other outputs."""
+        """As :meth:`Memory.advance`; memories of angles come after those of the other outputs, in their order."""
         if self._y is None:
             raise RuntimeError("reset the environment before its first step")
         self._y = y.copy() if rows is None else np.where(rows[:, None], y, self._y)
-        self._turned = unwrapped(self._angles(self._y), self._turned)
+        self._turned = self._angles(self._y, self._turned)
         return self._shown(self._y, self._memory.advance(self._signals(), u, rows))
 
     def shown(self) -> np.ndarray:
@@ -93,8 +111,8 @@ class TurningMemory:
             raise RuntimeError("reset the environment before its first step")
         return self._shown(self._y, self._memory.shown())
 
-    def _angles(self, y: np.ndarray) -> np.ndarray:
-        return np.arctan2(y[..., self._sines], y[..., self._cosines])
+    def _angles(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
+        return turned(y[..., self._cosines], y[..., self._sines], before)
 
     def _signals(self) -> np.ndarray:
         """What the memory filters: the other outputs, then the angles."""
@@ -106,4 +124,4 @@ class TurningMemory:
         return np.concatenate((y, filtered[..., self._hidden :]), axis=-1, dtype=np.float32)
 
 
-__all__ = ["TurningMemory", "unwrapped"]
+__all__ = ["TurningMemory", "turned"]

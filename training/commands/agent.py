@@ -105,6 +105,7 @@ class Train:
 
         elsewhere = is_environment(self.system)
         if not elsewhere:
+            self.environment.refuse()
             task = get_task(self.system, self.measurement_noise)
         name = self.system.replace("/", "-") if elsewhere else get_system(task.system).name
         folder = self.out or Path("runs/agents") / f"{name}-{self.information}-{self.seed}"

@@ -136,6 +136,8 @@ class Compare:
                 raise ValueError(f"agents are compared by {', '.join(known)} here, got {what!r}")
         if self.beside is not None and not self.environments:
             raise ValueError("--beside is for environments; agents on systems are collected from the folder of results")
+        if not self.environments:
+            self.environment.refuse()
         if self.environments:
             self._in_environments(information, console)
         else:

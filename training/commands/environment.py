@@ -1,7 +1,7 @@
 """Agents in any environment as options of a command, and their training and evaluation."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,12 +42,23 @@ class EnvironmentOptions:
     frames: int = STACKED
     """How many observations, each with the action before it, are stacked for agents on those."""
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Leave past actions out of what agents on z and on stacked observations are shown."""
+    """Leave past actions out of what z and stacked hold; of these two alone."""
     angles: Annotated[
-        tuple[str, ...], tyro.conf.arg(metavar="COS,SIN [COS,SIN ...]", help_behavior_hint="(default: none)")
+        tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="PAIR", help_behavior_hint="(default: none)")
     ] = ()
-    """Pairs of measured entries that are the cosine and the sine of an angle, as in 0,1. Agents on z then remember how
-    far it has turned, and agents on stacked observations see it."""
+    """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. Then z holds how
+    far it has turned, and so do stacked, in place of earlier cosines and sines; these two alone."""
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """Options that are not as they are by default."""
+        names = (field.name for field in fields(self) if getattr(self, field.name) != field.default)
+        return tuple(f"--{name.replace('_', '-')}" for name in names)
+
+    def refuse(self) -> None:
+        """Raise ValueError if options are given, although nobody acts in an environment."""
+        if self.given:
+            raise ValueError(f"{', '.join(self.given)}: this is for agents in an environment, and none is named")
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.
@@ -84,7 +95,7 @@ class EnvironmentOptions:
             env_kwargs=dict(self.env_kwargs),
             frames=self.frames,
             past_actions=not self.no_past_actions,
-            angles=tuple(_indices("angles", angle) for angle in self.angles),  # type: ignore[misc]  # checked there
+            angles=tuple(map(_pair, self.angles)),
             **({"time_constants": _steps("time-constants", self.time_constants)} if self.time_constants else {}),
         )
 
@@ -94,6 +105,15 @@ def _indices(name: str, text: str) -> tuple[int, ...]:
         return tuple(int(entry) for entry in text.split(",") if entry.strip())
     except ValueError:
         raise ValueError(f"--{name} takes indices in the flattened observation, as in 0,1; got {text!r}") from None
+
+
+def _pair(text: str) -> tuple[int, int]:
+    entries = _indices("angles", text)
+    if len(entries) != 2:
+        raise ValueError(
+            f"--angles takes the cosine's entry and the sine's, once for each angle, as in 0,1; got {text!r}"
+        )
+    return entries[0], entries[1]
 
 
 def _steps(name: str, text: str) -> tuple[float, ...]:

@@ -14,7 +14,7 @@ from gymnasium.wrappers import TransformObservation
 from kkl_gym import KKLMemory, KKLObservation
 from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
-from kkl_gym.turning import unwrapped
+from kkl_gym.turning import turned
 from training.agents.any_environment.task import HiddenTask
 from training.agents.any_environment.window import WindowEstimator, WindowObservation
 from training.rollouts.playing import Recorder
@@ -38,7 +38,8 @@ def show(
         and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
         measured too. "stacked_x_hat": the same, estimated by a network from what "stacked" shows. "z": y and the memory
         of :class:`kkl_gym.KKLMemory`. "stacked": the last y, as many as the task says, each with the action before it.
-        "recurrent": y with the action before it, for a policy that remembers by itself. "y": y alone.
+        "recurrent": y with the action before it, for a policy that remembers by itself. "y": y alone. The task says
+        whether "z" and "stacked" hold past actions, and which entries are angles there.
     observer : str, optional
         File of the observer, for "x_hat", or of a :class:`WindowEstimator`, for "stacked_x_hat".
     keep : int, optional
@@ -125,7 +126,7 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
     """Shows the last observations, the latest last, and with each the action before it.
 
     Before an episode's first step there were its first observation and no action. Of an angle earlier observations
-    show how far it has turned since, in rad; from one to the next it turns by less than half a turn.
+    show how far it has turned since, in rad, as :func:`kkl_gym.turning.turned` finds it.
 
     Parameters
     ----------
@@ -174,19 +175,21 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
         observation, info = self.env.reset(seed=seed, options=options)
         first, count = np.append(observation, np.zeros(self._width - len(observation))), self._rows.maxlen or 1
         self._rows.extend([first] * count)
-        self._turned.extend([self._angles(first)] * count)
+        if self._sines:
+            self._turned.extend([self._angles(first, 0.0)] * count)
         return self._shown(), info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Step the environment."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        row = observation if self._inputs is None else np.append(observation, self._inputs(action))
+        row = np.append(observation, () if self._inputs is None else self._inputs(action))
         self._rows.append(row)
-        self._turned.append(unwrapped(self._angles(row), self._turned[-1]))
+        if self._sines:
+            self._turned.append(self._angles(row, self._turned[-1]))
         return self._shown(), float(reward), terminated, truncated, info
 
-    def _angles(self, row: np.ndarray) -> np.ndarray:
-        return np.arctan2(row[self._sines], row[self._cosines])
+    def _angles(self, row: np.ndarray, before: np.ndarray | float) -> np.ndarray:
+        return turned(row[self._cosines], row[self._sines], before)
 
     def _shown(self) -> np.ndarray:
         if not self._sines:

@@ -69,7 +69,7 @@ class HiddenTask:
                 if len(set(entries)) < len(entries) or (name == "measured" and not entries):
                     raise ValueError(f"{name} must name entries of the observation, each once, got {shown(given)}")
                 object.__setattr__(self, name, entries)
-        object.__setattr__(self, "angles", _pairs(self.angles, self.measured))
+        object.__setattr__(self, "angles", _pairs(self.env_id, self.angles, self.measured or ()))
         if not is_finite(self.measurement_noise) or not 0 <= self.measurement_noise < LARGEST:
             raise ValueError(f"measurement_noise must be a number from 0 on, got {shown(self.measurement_noise)}")
         object.__setattr__(self, "measurement_noise", float(self.measurement_noise))
@@ -177,17 +177,19 @@ class HiddenTask:
         return tuple(i for i in range(size) if i not in self.measured) if self.hidden is None else self.hidden
 
 
-def _pairs(values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
+def _pairs(env_id: str, values: Any, measured: tuple[int, ...]) -> tuple[tuple[int, int], ...]:
     """Angles as pairs of entries, or ValueError."""
-    pairs = isinstance(values, list | tuple) and all(
-        isinstance(pair, list | tuple) and len(pair) == 2 for pair in values
-    )
-    if not pairs:
-        raise ValueError(f"angles must be pairs of entries, cosine and sine, as in ((0, 1),), got {shown(values)}")
-    found = tuple((integer("a cosine", pair[0], 0), integer("a sine", pair[1], 0)) for pair in values)
+    given = values.tolist() if isinstance(values, np.ndarray) else values
+    if not (
+        isinstance(given, list | tuple) and all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in given)
+    ):
+        raise ValueError(f"angles must be pairs of entries, cosine and sine, such as 0,1; got {shown(values)}")
+    found = tuple((integer("a cosine", cosine, 0), integer("a sine", sine, 0)) for cosine, sine in given)
     named = [entry for pair in found for entry in pair]
     if len(set(named)) < len(named) or not set(named) <= set(measured):
-        raise ValueError(f"angles must name entries that are measured, {measured}, each once, got {shown(values)}")
+        raise ValueError(
+            f"angles must name entries of {env_id} that are measured, {shown(measured)}, each once, got {shown(values)}"
+        )
     return found
 
 
