@@ -52,9 +52,10 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
 
     The observation is [y, memory of y, memory of u], float32. y are the entries that are measured. For each of
     them and each time constant follows what a first-order filter keeps of its changes, 0 where y rests; for each input
-    and time constant a running mean. The coordinates are about as large as y once the memory has filled, see
-    :class:`kkl_gym.memory.Memory`. At reset the memory is that of an output at rest and of no action. From the first
-    step on, outputs are taken to have changed before it as they have since, for 64 steps. ``info`` is left alone.
+    and time constant a running mean. An angle's cosine and sine have one memory, of how far it has turned. The
+    coordinates are about as large as y once the memory has filled, see :class:`kkl_gym.memory.Memory`. At reset the
+    memory is that of an output at rest and of no action. From the first step on, outputs are taken to have changed
+    before it as they have since, for 64 steps. ``info`` is left alone.
 
     Parameters
     ----------
@@ -65,8 +66,8 @@ class KKLMemory(gym.Wrapper[np.ndarray, Any, Any, Any], RecordConstructorArgs):
         What the agent may see: indices in the flattened observation, or keys of a Dict. None is all.
     angles : sequence of int or of str, or of pairs of these
         Which of these are angles in rad; each is replaced by its cosine and sine. A pair such as (0, 1) names the
-        cosine and the sine of an angle that is measured by them. Of angles it is remembered how far they have turned,
-        see :class:`kkl_gym.turning.TurningMemory`.
+        cosine and the sine of an angle that is measured by them. An angle is taken to turn by less than half a turn in
+        a step, see :class:`kkl_gym.turning.TurningMemory`.
     time_constants : sequence of float
         Of the outputs' filters, in steps, from 0.5 to 10,000, each at least 1.5 times the one before. Longer ones
         remember longer.

@@ -280,6 +280,32 @@ def test_rows_with_angles_that_rest_and_that_restart():
     assert np.allclose(again, fresh.advance(y[1, 1], u[0, 1]), atol=1e-6)
 
 
+def test_where_cosine_and_sine_are_zero_an_angle_is_taken_to_rest():
+    still = np.array([[np.cos(2), np.sin(2)]] * 5)
+    still[2], still[3] = 0.0, -0.0
+    seen = run(TurningMemory(2, 0, [(0, 1)], time_constants=(1, 3), input_time_constants=()), still, np.zeros((4, 0)))
+    assert np.abs(seen[:, 2:]).max() < 1e-6
+
+
+@banks
+def test_memories_of_angles_have_bounds_that_the_worst_turns_reach(outputs, inputs):
+    filters = TurningMemory(2, 0, [(0, 1)], time_constants=outputs, input_time_constants=())
+    nothing, plain = np.zeros(0), memory(1, 0, outputs, ())
+    low, high = filters.bounds(np.array([-1.0, -1.0]), np.array([1.0, 1.0]), nothing, nothing)[:, 2:]
+    assert np.array_equal(low, -high)
+    reached = np.zeros(len(outputs))
+    for age in (1, 2, 5, 40, 2000):
+        # What one change of the angle leaves at this age tells the worst direction of each.
+        weights = plain.rise * plain.decay ** np.arange(age)[::-1, None]
+        for j, row in enumerate(plain.mixing @ (weights * kkl_gym.memory._with_past(plain.decay, age)).T):
+            angle = np.append(0, np.where(row >= 0, 1, -1).cumsum()) * 0.999 * np.pi
+            y = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+            seen = run(filters, y, np.zeros((age, 0)))[:, 2:]
+            assert (np.abs(seen) <= high).all()
+            reached[j] = max(reached[j], seen[-1, j] / high[j])
+    assert reached.min() > 0.9
+
+
 def test_a_memory_of_angles_begins_with_a_reset():
     with pytest.raises(RuntimeError, match="before its first step"):
         of_angles().advance(np.zeros(5), np.zeros(2))

@@ -1,6 +1,7 @@
 """``kkl-gym agent compare ENV_ID ...``."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from training.progress import LOG, progress_bars
 if TYPE_CHECKING:
     import pandas as pd
 
+SETTINGS = ("time_constants", "frames", "past_actions", "angles")  # of tasks, that a command gives to all
 COLUMNS = {
     "results.csv": ["environment", "noise", "shown", "seed", "return", "seconds"],
     "curves.csv": ["environment", "noise", "shown", "steps", "seconds", "return"],
@@ -96,12 +98,21 @@ def compare_environments(
                     progress.say(f"beside these {len(here)} agents, {len(results) - len(here)} from {beside}")
                 write(out / "results.csv", results.to_csv(index=False))
                 write(out / "curves.csv", learned.to_csv(index=False))
-                write_table(out / "table.md", results, partial)
+                write_table(out / "table.md", results, partial, unusual(tasks))
                 draw_scores(out / "scores.png", results, partial)
                 draw_curves(out / "curves.png", learned, partial)
                 progress.say(f"wrote results.csv, curves.csv, table.md, scores.png and curves.png in {out}")
     if failures:
         raise ValueError(f"{len(failures)} of {len(cases)} agents failed; the first: {failures[0]}")
+
+
+def unusual(tasks: Sequence[HiddenTask]) -> str:
+    """What agents on memories and stacks were told that is not as by default, as a sentence, or nothing."""
+    found = []
+    for field in fields(HiddenTask):
+        values = {getattr(task, field.name) for task in tasks} if field.name in SETTINGS else set()
+        found += [f"`{field.name}` {value}" for value in values if value != field.default]
+    return f"Agents on z and on stacked observations: {', '.join(found)}." if found else ""
 
 
 def _earlier(folder: Path | None, name: str) -> "pd.DataFrame":

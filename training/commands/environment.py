@@ -38,7 +38,7 @@ class EnvironmentOptions:
     twentieth of all steps is then without exploration, and followed by one more fit."""
 
     time_constants: Annotated[str, tyro.conf.arg(metavar="STEPS", help_behavior_hint="(default: 1,2,4,8)")] = ""
-    """Of the memory that agents on z have, in steps. Where there is no noise, 1,2 may be easier to learn with."""
+    """Of the memory that agents on z have, in steps. Where there is no noise, 1 or 1,2 may be easier to learn with."""
     frames: int = STACKED
     """How many observations, each with the action before it, are stacked for agents on those."""
     no_past_actions: tyro.conf.FlagCreatePairsOff[bool] = False

@@ -4,6 +4,7 @@ import json
 import shutil
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +18,7 @@ from observers.storage import checksum
 from training.agents.agent import AgentError
 from training.agents.any_environment import learning, observing
 from training.agents.any_environment.comparison import Case, collect, planned, run_case
-from training.agents.any_environment.information import ESTIMATES, SHOWN, show
+from training.agents.any_environment.information import ESTIMATES, SHOWN, Stacked, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
 from training.agents.any_environment.observing import Told, learn_observer, wander
 from training.agents.any_environment.player import Player
@@ -25,7 +26,7 @@ from training.agents.any_environment.tables import cell, curves, write_table
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.commands.agent import Evaluate, Train
 from training.commands.compare import Compare
-from training.commands.compare_environments import COLUMNS
+from training.commands.compare_environments import COLUMNS, unusual
 from training.commands.environment import EnvironmentOptions
 from training.commands.record import RecordCommand
 from training.commands.running import Workers
@@ -169,6 +170,29 @@ def test_agents_on_memories_and_stacks_can_be_told_of_angles(tmp_path):
     player(task=task, information="z", network=MLP([np.zeros((1, 8))], [np.zeros(1)], "tanh")).save(path)
     assert Player.read(path).task == task
     assert Player.read(path).make().observation_space == z.observation_space
+
+
+def test_stacks_of_angles_outlive_samples_without_one():
+    class Blind(gym.Env):
+        observation_space = gym.spaces.Box(-1, 1, (2,))
+        action_space = gym.spaces.Box(-1, 1, (1,))
+        seen = np.float32([1, 0])
+
+        def reset(self, *, seed=None, options=None):
+            return self.seen, {}
+
+        def step(self, action):
+            return self.seen, 0.0, False, False, {}
+
+    for nothing in ([0, 0], [np.nan, 0], [-0.0, -0.0]):
+        env = Stacked(Blind(), 3, [(0, 1)], actions=False)
+        env.reset()
+        env.unwrapped.seen = np.float32(nothing)
+        env.step(np.zeros(1))
+        env.unwrapped.seen = np.float32([0, 1])
+        np.testing.assert_allclose(env.step(np.zeros(1))[0], [np.pi / 2, np.pi / 2, 0, 1], atol=1e-6)
+        env.unwrapped.seen[:] = [-1, 0]  # a buffer that is filled again
+        np.testing.assert_allclose(env.step(np.zeros(1))[0], [np.pi, np.pi / 2, -1, 0], atol=1e-6)
 
 
 def test_the_full_state_is_without_noise():
@@ -419,11 +443,15 @@ def test_damaged_and_foreign_files_are_refused(tmp_path):
         ({"measured": (0,), "time_constants": (2.0, 1.0)}, "must rise"),
         ({"measured": (0,), "time_constants": ()}, "at least one"),
         ({"measured": (0,), "past_actions": "no"}, "past_actions must be"),
-        ({"measured": (0,), "angles": ((0, 1),)}, r"that are measured, \(0,\), each once, got \(\(0, 1\),\)"),
+        (
+            {"measured": (0,), "angles": ((0, 1),)},
+            r"of Pendulum-v1 that are measured, \(0,\), each once, got \(\(0, 1\),\)",
+        ),
         ({"measured": (0, 1), "angles": ((0, 0),)}, "each once"),
         ({"measured": (0, 1), "angles": ((0, -1),)}, "a sine must be an integer, not negative, got -1"),
         ({"measured": (0, 1), "angles": (0, 1)}, "angles must be pairs of entries"),
         ({"measured": (0, 1), "angles": ((0,),)}, "angles must be pairs of entries"),
+        ({"measured": (0, 1), "angles": ([0, [1]],)}, "a sine must be an integer"),
         ({"measured": (0, 1), "angles": None}, "angles must be pairs of entries"),
         ({"measured": (0,), "frames": 0}, "frames must be"),
         ({"measured": (0,), "frames": 2.5}, "frames must be"),
@@ -496,6 +524,7 @@ def test_a_comparison_resumes_and_says_what_is_missing(tmp_path, small):
     assert "Partial" not in table
     for name in ("scores.png", "curves.png", "curves.csv"):
         assert (tmp_path / name).stat().st_size > 100
+    assert "frames" not in table
     with pytest.raises(ValueError, match="another comparison: episodes = 4 there, 5 here"):
         Compare(**{**options, "episodes": 5}, information=("y",)).run(Console())
 
@@ -509,6 +538,15 @@ def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
     assert differ(replace(PENDULUM, time_constants=(1, 2, 4), frames=9)) == {"z", "stacked", "stacked_x_hat"}
     assert differ(replace(PENDULUM, angles=((0, 1),))) == {"z", "stacked"}
     assert differ(replace(PENDULUM, past_actions=False)) == {"z", "stacked"}
+    for kind in SHOWN:  # as comparisons were written before there were these options
+        assert not {"angles", "past_actions"} & set(Case(PENDULUM, kind, 0, 2, None, 0, tmp_path).identity["task"])
+
+
+def test_a_table_says_what_agents_were_told():
+    told = EnvironmentOptions(angles=("0,1",), frames=2, no_past_actions=True)
+    says = "Agents on z and on stacked observations: `frames` 2, `past_actions` False, `angles` ((0, 1),)."
+    assert unusual([told.task("Pendulum-v1", noise) for noise in (0.0, 0.1)]) == says
+    assert unusual([PENDULUM, CART]) == ""
 
 
 def test_an_agent_that_was_interrupted_is_trained_anew(tmp_path, small, monkeypatch):
@@ -644,8 +682,13 @@ def test_the_commands_train_and_play(tmp_path, small, capsys):
     assert EnvironmentOptions(angles=("3,1", "4,2")).task("InvertedDoublePendulum-v5").angles == ((3, 1), (4, 2))
     with pytest.raises(ValueError, match="--angles takes indices"):
         EnvironmentOptions(angles=("cos",)).task("Pendulum-v1")
-    with pytest.raises(ValueError, match="angles must be pairs of entries"):
+    with pytest.raises(ValueError, match=r"--angles takes the cosine's entry and the sine's, .* got '0,1,2'"):
         EnvironmentOptions(angles=("0,1,2",)).task("Pendulum-v1")
+    with pytest.raises(ValueError, match=r"angles must name entries of CartPole-v1 that are measured, \(0, 2\)"):
+        EnvironmentOptions(angles=("0,1",)).task("CartPole-v1")
+    for command in (Compare, partial(Train, "lorenz")):  # as in --angles 0,1 without an environment
+        with pytest.raises(ValueError, match="--frames, --angles: this is for agents in an environment"):
+            command(environment=EnvironmentOptions(angles=("0,1",), frames=2), out=tmp_path / "i").run(Console())
     with pytest.raises(ValueError, match="one number"):
         Train("CartPole-v1", "z", out=tmp_path / "e", measurement_noise=(0.1, 0.2)).run(Console())
     with pytest.raises(ValueError, match="a system knows"):

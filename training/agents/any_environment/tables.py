@@ -74,7 +74,7 @@ def cell(results: "pd.DataFrame", task: Task, shown: str) -> dict[str, Any] | No
     return found
 
 
-def write_table(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
+def write_table(path: Path, results: "pd.DataFrame", partial: str = "", settings: str = "") -> None:
     """Write the table of a comparison.
 
     Parameters
@@ -85,6 +85,8 @@ def write_table(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
         As :func:`training.agents.any_environment.comparison.collect` returns them.
     partial : str
         What is missing, as a sentence.
+    settings : str
+        What is not as by default, as a sentence.
     """
     tasks = tasks_in(results)
     shown = [kind for kind in SHOWN if kind in set(results.shown)]
@@ -94,6 +96,7 @@ def write_table(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
         "Return: interquartile mean over agents. In brackets the normalised return, where 0 is random actions and 1 "
         "agents that see the full state without noise, with a bootstrap 95 % interval; then the number of agents. The "
         f"steps from which an observer was learned count.{partial}",
+        *(["", settings] if settings else []),
         "",
     ]
     rows, spent = [], []
