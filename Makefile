@@ -130,7 +130,8 @@ environments: $(VENV)/ready  ## agents that see a part of other environments, ho
 	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
 	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
-	$(BIN)/kkl-gym agent compare Pendulum-v1 --information z stacked --time-constants 1,2 --frames 4 --out runs/agents/short
+	$(BIN)/kkl-gym agent compare Pendulum-v1 --information z stacked --angles 0,1 --time-constants 1 --frames 2 \
+		--no-past-actions --out runs/agents/short
 	cp runs/agents/short/results.csv docs/results/environments/short.csv
 	$(MAKE) figures
 
