@@ -7,6 +7,8 @@ import numpy as np
 
 from kkl_gym.memory import Memory
 
+TURN = 2 * math.pi
+
 
 def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
     """Angles in rad that have turned by less than half a turn since before, and have not where nothing is known.
@@ -24,8 +26,10 @@ def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -
         What they are.
     """
     angles = np.arctan2(sines, cosines)
-    nearest = angles - 2 * math.pi * np.round((angles - before) / (2 * math.pi))
-    return np.where(np.isnan(angles) | ((cosines == 0) & (sines == 0)), before, nearest)
+    nearest = angles - TURN * np.rint((angles - before) / TURN)
+    if np.count_nonzero(cosines) == np.count_nonzero(np.isfinite(nearest)) == nearest.size:
+        return nearest  # as nearly always, and soon found out
+    return np.where(cosines * cosines + sines * sines > 0, nearest, before)
 
 
 class TurningMemory:
@@ -59,8 +63,8 @@ class TurningMemory:
         time_constants: Sequence[float],
         input_time_constants: Sequence[float],
     ) -> None:
-        self._cosines, self._sines = map(list, zip(*angles))
-        self._others = [i for i in range(ny) if i not in {*self._cosines, *self._sines}]
+        self._cosines, self._sines = np.array(angles).T
+        self._others = np.setdiff1d(np.arange(ny), [self._cosines, self._sines])
         signals = len(self._others) + len(angles)
         self._memory = Memory(signals, nu, time_constants=time_constants, input_time_constants=input_time_constants)
         self._hidden = signals  # numbers of what it shows that are the signals themselves
@@ -112,12 +116,12 @@ class TurningMemory:
         return self._shown(self._y, self._memory.shown())
 
     def _angles(self, y: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-        return turned(y[..., self._cosines], y[..., self._sines], before)
+        return turned(y.take(self._cosines, -1), y.take(self._sines, -1), before)
 
     def _signals(self) -> np.ndarray:
         """What the memory filters: the other outputs, then the angles."""
         assert self._y is not None
-        return np.concatenate((self._y[..., self._others], self._turned), axis=-1)
+        return np.concatenate((self._y.take(self._others, -1), self._turned), axis=-1)
 
     def _shown(self, y: np.ndarray, filtered: np.ndarray) -> np.ndarray:
         """Outputs in place of the signals that are filtered."""
