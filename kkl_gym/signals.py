@@ -201,9 +201,13 @@ class Inputs:
         return np.minimum(np.maximum(u, self.low), self.high)
 
 
+def _is_sequence(values: Any) -> bool:
+    return isinstance(values, list | tuple | range) or (isinstance(values, np.ndarray) and values.ndim > 0)
+
+
 def _entries(name: str, values: Any) -> tuple[Any, ...]:
     """Indices or keys as a tuple, or ValueError."""
-    if not isinstance(values, list | tuple | range) and not (isinstance(values, np.ndarray) and values.ndim):
+    if not _is_sequence(values):
         raise ValueError(f"{name} must be a sequence of indices or of keys, such as [0, 2], got {shown(values)}")
     keys = [value for value in values if isinstance(value, str)]
     found = tuple(map(str, keys)) if keys else tuple(integer(f"an entry of {name}", value, 0) for value in values)
@@ -216,12 +220,12 @@ def _entries(name: str, values: Any) -> tuple[Any, ...]:
 
 def _angles(values: Any) -> tuple[Any, ...]:
     """Entries, and pairs of entries as tuples, or ValueError."""
-    if not isinstance(values, list | tuple | range) and not (isinstance(values, np.ndarray) and values.ndim):
+    if not _is_sequence(values):
         raise ValueError(
             "angles must be a sequence of indices or of keys, or of pairs of them, such as [2] or [(0, 1)], got "
             f"{shown(values)}"
         )
-    pairs = [isinstance(value, list | tuple) or (isinstance(value, np.ndarray) and value.ndim > 0) for value in values]
+    pairs = [_is_sequence(value) for value in values]
     for value, pair in zip(values, pairs):
         if pair and len(value) != 2:
             raise ValueError(f"a pair of angles must be a cosine and a sine, such as (0, 1), got {shown(value)}")

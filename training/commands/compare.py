@@ -136,11 +136,10 @@ class Compare:
                 raise ValueError(f"agents are compared by {', '.join(known)} here, got {what!r}")
         if self.beside is not None and not self.environments:
             raise ValueError("--beside is for environments; agents on systems are collected from the folder of results")
-        if not self.environments:
-            self.environment.refuse()
         if self.environments:
             self._in_environments(information, console)
         else:
+            self.environment.refuse()
             self._on_systems(information, self.out or Path("runs/agents/comparison"), console)
 
     def _in_environments(self, information: tuple[Any, ...], console: Console) -> None:

@@ -49,16 +49,13 @@ class EnvironmentOptions:
     """Measured entries that are the cosine and the sine of an angle, once for each angle, as in 0,1. Then z holds how
     far it has turned, and so do stacked, in place of earlier cosines and sines; these two alone."""
 
-    @property
-    def given(self) -> tuple[str, ...]:
-        """Options that are not as they are by default."""
-        names = (field.name for field in fields(self) if getattr(self, field.name) != field.default)
-        return tuple(f"--{name.replace('_', '-')}" for name in names)
-
     def refuse(self) -> None:
         """Raise ValueError if options are given, although nobody acts in an environment."""
-        if self.given:
-            raise ValueError(f"{', '.join(self.given)}: this is for agents in an environment, and none is named")
+        given = [
+            f"--{field.name.replace('_', '-')}" for field in fields(self) if getattr(self, field.name) != field.default
+        ]
+        if given:
+            raise ValueError(f"{', '.join(given)}: this is for agents in an environment, and none is named")
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
         """The task that these options describe.

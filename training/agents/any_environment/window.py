@@ -153,10 +153,8 @@ class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], Rec
         RecordConstructorArgs.__init__(self, task=task, estimator=estimator, space=space)
         gym.ObservationWrapper.__init__(self, env)
         self.observation_space, self._low, self._high = space, space.low, space.high
-        stacked, outputs = (
-            gym.spaces.flatdim(env.observation_space),
-            0 if task.measurement_noise else len(task.measured),
-        )
+        stacked = gym.spaces.flatdim(env.observation_space)
+        outputs = 0 if task.measurement_noise else len(task.measured)  # shown as they are
         latest = stacked - stacked // task.frames
         self._outputs = slice(latest, latest + outputs)
         self._made_for = WindowEstimator.made_for(task)
