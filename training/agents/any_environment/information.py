@@ -163,8 +163,8 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
         self._straight = [i for i in range(len(low)) if i not in {*self._cosines, *self._sines}]
         furthest = np.full(len(angles), math.pi * (count - 1))
         low, high = (
-            np.concatenate([*[np.append(side[self._straight], turned)] * (count - 1), side]).astype(np.float32)
-            for side, turned in ((low, -furthest), (high, furthest))
+            np.concatenate([*[np.append(side[self._straight], angles_to)] * (count - 1), side]).astype(np.float32)
+            for side, angles_to in ((low, -furthest), (high, furthest))
         )
         self.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
 
@@ -197,8 +197,8 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
         *earlier, last = self._rows
         parts = [
             part
-            for row, turned in zip(earlier, self._turned)
-            for part in (row[self._straight], self._turned[-1] - turned)
+            for row, angles in zip(earlier, self._turned)
+            for part in (row[self._straight], self._turned[-1] - angles)
         ]
         return np.concatenate([*parts, last], dtype=np.float32)
 
