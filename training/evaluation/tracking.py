@@ -12,7 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
-from training.maps.flow import draw_increments, fit_flow, usual_error
+from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_error
 from training.maps.regions import LEVELS, Regions, distances_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -23,6 +23,7 @@ from training.trajectories.signals import DRIVEN
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
 OF_OUTPUT = 1e-4  # the same in multiples of each output's standard deviation: below, covariances would be rounding
+WIDTH = 16  # of the flow's network
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -167,6 +168,8 @@ def _learned(
     flow = fit_flow(
         increments,
         u_scale,
+        degree=largest_degree(artifact.nx + nu),
+        width=WIDTH,
         steps=steps,
         seed=seed,
         progress=progress,

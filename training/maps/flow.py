@@ -10,6 +10,7 @@ from torch import nn
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Factors, Flow
+from observers.polynomial import count, monomials
 from training.maps.networks import Network, tensor
 from training.maps.optimise import optimise_at_once
 from training.progress import ProgressBars
@@ -25,7 +26,8 @@ PAIRS = 400_000
 # most of them near and some far. That a tracker does not leave the motions it is the near ones that decide.
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
-WIDTH, DEPTH, BATCH, LEARNING_RATE = 32, 2, 1024, 3e-3
+DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
+MOST_TERMS = 60  # of the polynomial: degree 5 for two states and an input, 3 for three and one
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
@@ -116,7 +118,7 @@ def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndar
 
 
 class FlowProblem(nn.Module):
-    """The network of :class:`observers.Flow`, on what a linear fit leaves of the increments.
+    """The network of :class:`observers.Flow`, on what a polynomial leaves of the increments.
 
     Parameters
     ----------
@@ -124,38 +126,38 @@ class FlowProblem(nn.Module):
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
-    width, depth : int
-        Neurons in each hidden layer, and number of these.
-    batch : int
-        Samples in a batch.
+    degree : int
+        Of the polynomial.
+    width : int
+        Neurons in each hidden layer.
     device : torch.device
         Where the network is trained.
 
     Attributes
     ----------
-    bias, linear : ndarray, shapes (nx,) and (nx, nx + nu)
-        The linear fit, of scaled increments.
+    polynomial : ndarray, shape (nx, terms)
+        The polynomial, of scaled increments, by least squares.
     gain : ndarray, shape (nx,)
         Scale of what it leaves.
     """
 
     def __init__(
-        self, increments: Increments, u_scale: np.ndarray, *, width: int, depth: int, batch: int, device: torch.device
+        self, increments: Increments, u_scale: np.ndarray, *, degree: int, width: int, device: torch.device
     ) -> None:
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)
         change = increments.change / increments.x_scale
-        found = np.linalg.lstsq(np.column_stack([inputs, np.ones(len(inputs))]), change, rcond=None)[0]
-        self.linear, self.bias = found[:-1].T, found[-1]
-        left = change - inputs @ self.linear.T - self.bias
+        terms = monomials(inputs, degree)
+        self.polynomial = np.linalg.lstsq(terms, change, rcond=None)[0].T
+        left = change - terms @ self.polynomial.T
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
-        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=depth, activation="tanh").to(device)
-        self._batch, self._inputs, self._left = batch, tensor(inputs, device), tensor(left, device)
+        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=DEPTH, activation="tanh").to(device)
+        self._inputs, self._left = tensor(inputs, device), tensor(left, device)
         self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, relative to what the linear fit leaves of each sample.
+        """Mean square error of a batch, relative to what the polynomial leaves of each sample.
 
         Parameters
         ----------
@@ -167,10 +169,29 @@ class FlowProblem(nn.Module):
         dict of str to Tensor
             "loss", and "error", its root.
         """
-        rows = torch.randint(len(self._inputs), (self._batch,), generator=generator, device=self._inputs.device)
+        rows = torch.randint(len(self._inputs), (BATCH,), generator=generator, device=self._inputs.device)
         square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
         loss = (self._weight[rows] * square).mean()
         return {"loss": loss, "error": loss.detach().sqrt()}
+
+
+def largest_degree(variables: int) -> int:
+    """Find the degree of a polynomial that costs no more than the network beside it.
+
+    Parameters
+    ----------
+    variables : int
+        States and inputs.
+
+    Returns
+    -------
+    int
+        The largest of which there are at most ``MOST_TERMS``, or 1.
+    """
+    degree = 1
+    while count(variables, degree + 1) <= MOST_TERMS:
+        degree += 1
+    return degree
 
 
 def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
@@ -183,6 +204,8 @@ def fit_flow(
     increments: Increments,
     u_scale: np.ndarray,
     *,
+    degree: int,
+    width: int,
     steps: int,
     seed: int,
     progress: ProgressBars,
@@ -197,6 +220,10 @@ def fit_flow(
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
+    degree : int
+        Of the polynomial.
+    width : int
+        Neurons in each hidden layer of the network.
     steps : int
         Batches.
     seed : int
@@ -214,7 +241,7 @@ def fit_flow(
         One that has no error, and no factors yet.
     """
     device = device or torch.device("cpu")
-    problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
+    problem = FlowProblem(increments, u_scale, degree=degree, width=width, device=device)
     optimise_at_once(
         "flow", problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed
     )
@@ -223,9 +250,8 @@ def fit_flow(
         x_offset=increments.x_offset,
         x_scale=increments.x_scale,
         u_scale=u_scale,
-        bias=problem.bias,
         gain=problem.gain,
-        linear=problem.linear,
+        polynomial=problem.polynomial,
         error=np.zeros(len(increments.x_scale)),
         factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
         **of_plant,

@@ -1,0 +1,72 @@
+"""Monomials of several variables, up to a degree."""
+
+import functools
+import itertools
+import math
+
+import numpy as np
+
+
+def count(variables: int, degree: int) -> int:
+    """How many monomials there are, 1 among them."""
+    return math.comb(variables + degree, degree)
+
+
+def degree_of(terms: int, variables: int) -> int | None:
+    """The degree up to which there are so many monomials; None where there is none."""
+    degrees = itertools.takewhile(lambda degree: count(variables, degree) <= terms, itertools.count())
+    degree = max(degrees, default=0)
+    return degree if variables and count(variables, degree) == terms else None
+
+
+@functools.cache
+def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """What monomials are made of, in the order of their degrees.
+
+    Parameters
+    ----------
+    variables : int
+        How many.
+    degree : int
+        Of the last monomials.
+
+    Returns
+    -------
+    before, by : ndarray of int, shape (terms,)
+        Each is one that comes before it, times a variable. (The first is 1, for which both are 0.)
+    """
+    before, by, newest = [0], [0], [0]
+    for _ in range(degree):
+        made = [(t, j) for t in newest for j in range(by[t], variables)]  # each once: by variables that do not fall
+        newest = list(range(len(before), len(before) + len(made)))
+        before += [t for t, _ in made]
+        by += [j for _, j in made]
+    return np.array(before), np.array(by)
+
+
+def monomials(q: np.ndarray, degree: int) -> np.ndarray:
+    """Evaluate them.
+
+    Parameters
+    ----------
+    q : ndarray, shape (..., variables)
+        Of the variables.
+    degree : int
+        Of the last monomials.
+
+    Returns
+    -------
+    ndarray, shape (..., terms)
+        1, the variables, their products of two, and so on.
+    """
+    variables = q.shape[-1]
+    before, by = table(variables, degree)
+    terms = np.empty((*q.shape[:-1], len(before)))
+    terms[..., 0] = 1.0
+    for k in range(1, degree + 1):
+        new = slice(count(variables, k - 1), count(variables, k))
+        np.multiply(terms[..., before[new]], q[..., by[new]], out=terms[..., new])
+    return terms
+
+
+__all__ = ["count", "degree_of", "monomials", "table"]
