@@ -14,12 +14,14 @@ import numpy as np
 
 from observers.compiled import _kernels
 from observers.flow import Flow
+from observers.polynomial import count as monomials
 from observers.polynomial import table
 from observers.unscented import Gaussian
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE = range(6)  # columns of the table of states
+_BLOCK = 64  # points that go through the polynomial at a time
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 _ALL = np.ones(1, dtype=bool)
 
@@ -57,7 +59,8 @@ class CompiledTracker:
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
         one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
-        polynomial = np.ascontiguousarray(flow.polynomial, dtype=float)
+        polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # as of four terms at a time
+        polynomial[:, : flow.polynomial.shape[1]] = flow.polynomial
         of_network = network.packed, network.widths, network.between
         self._one = functools.partial(one, states, outputs, scale, polynomial, *of_network)
         self._enter = functools.partial(enter, states, scale, polynomial)
@@ -122,29 +125,6 @@ def _inlined(function: _F) -> _F:
     return cast(_F, made)
 
 
-def _polynomial(nx: int, nu: int, degree: int) -> Callable[..., Any]:
-    """Where scaled states, (nx + nu, n) with scaled inputs, go by a polynomial: (nx, n).
-
-    Written out, for loops over so few monomials would be mostly overhead; so the loop over n is one of vectors.
-    """
-    terms = range(1, math.comb(nx + nu + degree, degree))
-    lines = ["def along(polynomial, signals, moved):"]
-    lines += [f"    c{i}_{t} = polynomial[{i}, {t}]" for i in range(nx) for t in (0, *terms)]
-    lines += [f"    signal{j} = signals[{j}]" for j in range(nx + nu)]
-    lines += [f"    moved{i} = moved[{i}]" for i in range(nx)]
-    lines += ["    for n in range(signals.shape[1]):"]
-    lines += [f"        m{1 + j} = signal{j}[n]" for j in range(nx + nu)]
-    earlier, by = table(nx + nu, degree)
-    lines += [f"        m{t} = m{earlier[t]} * m{1 + by[t]}" for t in terms if t > nx + nu]
-    for i in range(nx):
-        total = " + ".join(f"c{i}_{t} * m{t}" for t in terms)
-        lines += [f"        moved{i}[n] = m{1 + i} + c{i}_0 + {total}"]
-    namespace: dict[str, Any] = {}
-    exec("\n".join(lines), namespace)
-    found: Callable[..., Any] = namespace["along"]
-    return found
-
-
 @functools.cache
 def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
     """The kernels of :class:`CompiledTracker`."""
@@ -153,7 +133,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     evaluate, count, far = _kernels(activation)[1], 2 * nx + 1, math.sqrt(3.0)
     central, others, entries = (3 - nx) / 3 + 2.0, 1 / 6, nx * nx  # weights of the points in covariances
-    along = _inlined(_polynomial(nx, nu, degree))
+    (earlier, by), terms = table(nx + nu, degree), monomials(nx + nu, degree)
 
     @_inlined
     def within(states: np.ndarray, i: int, s: float) -> float:
@@ -193,6 +173,38 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
                 inputs[p, i] = points[i, p]
             for j in range(nu):
                 points[nx + j, p] = inputs[p, nx + j] = u[j] * scale[j]
+
+    @_inlined
+    def multiply(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> None:
+        for p in range(len(product)):
+            product[p] = a[p] * b[p]
+
+    @_inlined
+    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
+        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+        for p in range(len(total)):
+            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+
+    @_inlined
+    def along(polynomial: np.ndarray, points: np.ndarray, block: int, moved: np.ndarray) -> None:
+        """Where points go by the polynomial, block by block: loops over rows in the cache, as vectors."""
+        signals, total = np.zeros((nx + nu, block)), np.empty(block)
+        products = np.zeros((polynomial.shape[1], block))
+        products[0] = 1.0
+        for first in range(0, points.shape[1], block):
+            size = min(block, points.shape[1] - first)
+            for j in range(nx + nu):
+                for p in range(size):
+                    signals[j, p] = points[j, first + p]
+            for t in range(1, terms):
+                multiply(products[earlier[t]], signals[by[t]], products[t])
+            for i in range(nx):
+                total[:] = signals[i]
+                for t in range(0, polynomial.shape[1], 4):
+                    add_four(polynomial[i, t : t + 4], products[t : t + 4], total)
+                for p in range(size):
+                    moved[i, first + p] = total[p]
 
     @_inlined
     def after(
@@ -281,7 +293,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         points, moved = np.empty((nx + nu, count)), np.empty((nx, count))
         inputs, h = np.empty((count, nx + nu), np.float32), np.empty((count, nx), np.float32)
         before(states, scale, state[0], u[0], L, points, inputs)
-        along(polynomial, points, moved)
+        along(polynomial, points, count, moved)
         for p in range(count):
             evaluate(inputs[p], packed, widths, between, h[p])
         after(states, outputs, h, moved, y[0], rows[0], found, across, state[0], expected[0])
@@ -301,7 +313,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         for row in range(len(state)):
             own = slice(row * count, (row + 1) * count)
             before(states, scale, state[row], u[row], L, points[:, own], inputs[own])
-        along(polynomial, points, moved)
+        along(polynomial, points, _BLOCK, moved)
 
     @compiled
     def leave(

@@ -27,7 +27,9 @@ PAIRS = 400_000
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
 DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
-MOST_TERMS = 60  # of the polynomial: degree 5 for two states and an input, 3 for three and one
+# Of the polynomial: degree 5 for two states and an input, 3 for three and one. Higher powers of states that are far off
+# grow too fast.
+MOST_TERMS, HIGHEST_DEGREE = 60, 5
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
@@ -186,12 +188,9 @@ def largest_degree(variables: int) -> int:
     Returns
     -------
     int
-        The largest of which there are at most ``MOST_TERMS``, or 1.
+        The highest up to 5 of which there are at most 60 terms, or 1.
     """
-    degree = 1
-    while count(variables, degree + 1) <= MOST_TERMS:
-        degree += 1
-    return degree
+    return max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
 
 
 def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
