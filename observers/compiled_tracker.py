@@ -93,7 +93,14 @@ class CompiledTracker:
         moved = np.empty((self._nx, len(y) * self._points))
         inputs = np.empty((moved.shape[1], self._nx + u.shape[1]), np.float32)
         self._enter(u, state, inputs, moved)
-        self._leave(self._network.batch(inputs), moved, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, expected)
+        self._leave(
+            self._network.batch(inputs),
+            moved,
+            y,
+            np.ones(len(y), dtype=bool) if rows is None else rows,
+            state,
+            expected,
+        )
         return expected
 
     def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:

@@ -13,9 +13,7 @@ from observers.polynomial import count, degree_of, monomials, table
 @pytest.mark.parametrize(("variables", "degree"), [(1, 4), (2, 1), (3, 5), (4, 3), (7, 2)])
 def test_monomials_are_all_products_once(variables, degree):
     q = np.random.default_rng(0).normal(size=(6, 2, variables))
-    chosen = [
-        each for k in range(degree + 1) for each in itertools.combinations_with_replacement(range(variables), k)
-    ]
+    chosen = [each for k in range(degree + 1) for each in itertools.combinations_with_replacement(range(variables), k)]
     expected = np.stack([np.prod(q[..., list(each)], axis=-1) for each in chosen], axis=-1)
     np.testing.assert_allclose(monomials(q, degree), expected, rtol=1e-13)
     assert count(variables, degree) == len(chosen)

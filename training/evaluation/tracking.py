@@ -23,7 +23,6 @@ from training.trajectories.signals import DRIVEN
 LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
 LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
 OF_OUTPUT = 1e-4  # the same in multiples of each output's standard deviation: below, covariances would be rounding
-WIDTH = 16  # of the flow's network
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -169,7 +168,6 @@ def _learned(
         increments,
         u_scale,
         degree=largest_degree(artifact.nx + nu),
-        width=WIDTH,
         steps=steps,
         seed=seed,
         progress=progress,

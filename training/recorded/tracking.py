@@ -26,9 +26,9 @@ OUTLIER = 6.0  # standard deviations of what is left, by its median
 # What is assumed at least: of the flow's error in parts of what states change by over a sample, and of measurement
 # noise in standard deviations of the outputs. A filter that trusts its model wholly stops listening.
 LEAST_ERROR, LEAST_NOISE = 0.01, 1e-4
-# Of the flow's network. Beside it there is no polynomial but a linear one: of recorded states some lie alone, and a motion
-# that jumps now and then, as at a contact, is no polynomial's.
-WIDTH = 32
+# Of the flow's polynomial. Of recorded states some lie alone, where higher powers are anything; and a motion that jumps
+# now and then, as at a contact, is no polynomial's.
+DEGREE = 1
 WINDOW = 10  # samples at least over which innovations are averaged
 
 
@@ -99,8 +99,7 @@ def learn_recorded_tracking(
         flow = fit_flow(
             learned,
             np.where(u_scale > 0, u_scale, 1.0),
-            degree=1,
-            width=WIDTH,
+            degree=DEGREE,
             steps=steps,
             seed=seed,
             progress=progress,

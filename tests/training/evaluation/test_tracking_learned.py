@@ -149,7 +149,6 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(degree):
             increments,
             np.array([4.0]),
             degree=degree,
-            width=4,
             steps=1,
             seed=0,
             progress=progress,
@@ -162,6 +161,7 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(degree):
         )
     apart = np.abs(found(x, u) - x - change).max()
     assert apart < 1e-12 if degree == 3 else apart > 1e-3
+    assert found.mlp.weights[0].shape == (16 if degree == 3 else 32, 3)
 
 
 def test_degrees_are_as_high_as_sixty_terms_allow():
