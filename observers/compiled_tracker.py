@@ -59,7 +59,7 @@ class CompiledTracker:
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
         one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
-        polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # as of four terms at a time
+        polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # four terms are added at a time
         polynomial[:, : flow.polynomial.shape[1]] = flow.polynomial
         of_network = network.packed, network.widths, network.between
         self._one = functools.partial(one, states, outputs, scale, polynomial, *of_network)
@@ -93,14 +93,8 @@ class CompiledTracker:
         moved = np.empty((self._nx, len(y) * self._points))
         inputs = np.empty((moved.shape[1], self._nx + u.shape[1]), np.float32)
         self._enter(u, state, inputs, moved)
-        self._leave(
-            self._network.batch(inputs),
-            moved,
-            y,
-            np.ones(len(y), dtype=bool) if rows is None else rows,
-            state,
-            expected,
-        )
+        taken = np.ones(len(y), dtype=bool) if rows is None else rows
+        self._leave(self._network.batch(inputs), moved, y, taken, state, expected)
         return expected
 
     def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:
@@ -195,7 +189,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
 
     @_inlined
     def along(polynomial: np.ndarray, points: np.ndarray, block: int, moved: np.ndarray) -> None:
-        """Where points go by the polynomial, block by block: loops over rows in the cache, as vectors."""
+        """Where points go by the polynomial, (nx, n). A block of them stays in the cache, its loops are vectors."""
         signals, total = np.zeros((nx + nu, block)), np.empty(block)
         products = np.zeros((polynomial.shape[1], block))
         products[0] = 1.0

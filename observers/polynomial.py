@@ -14,9 +14,10 @@ def count(variables: int, degree: int) -> int:
 
 def degree_of(terms: int, variables: int) -> int | None:
     """The degree up to which there are so many monomials; None where there is none."""
-    degrees = itertools.takewhile(lambda degree: count(variables, degree) <= terms, itertools.count())
-    degree = max(degrees, default=0)
-    return degree if variables and count(variables, degree) == terms else None
+    if variables < 1:
+        return None
+    degree = next(degree for degree in itertools.count() if count(variables, degree) >= terms)
+    return degree if count(variables, degree) == terms else None
 
 
 @functools.cache

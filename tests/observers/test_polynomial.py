@@ -23,7 +23,7 @@ def test_monomials_are_all_products_once(variables, degree):
 def test_what_is_no_number_of_monomials_has_no_degree():
     found = [degree_of(terms, 3) for terms in range(12)]
     assert found == [None, 0, None, None, 1, *[None] * 5, 2, None]
-    assert degree_of(0, 0) is None
+    assert degree_of(0, 0) is degree_of(5, 0) is None
 
 
 def test_each_monomial_is_an_earlier_one_times_a_variable():

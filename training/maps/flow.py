@@ -27,8 +27,8 @@ PAIRS = 400_000
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
 DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
-# Neurons in each hidden layer: the fewer ones where the polynomial alone is usually off by less than a part of a state's
-# standard deviation.
+# Neurons in each hidden layer: the fewer ones where the polynomial alone is usually off by less than that part of a
+# state's standard deviation.
 NARROW, WIDE, LITTLE = 16, 32, 1e-4
 # Of the polynomial: degree 5 for two states and an input, 3 for three and one. Higher powers of states that are far off
 # grow too fast.
