@@ -11,6 +11,7 @@ from observers.factors import Factors
 from observers.network import MLP
 from observers.polynomial import degree_of, monomials
 
+_MOST_TERMS = 1000
 _LARGEST = 1e12  # of a window and of a level of noise, whose squares and quotients by dt then stay finite
 
 
@@ -22,8 +23,8 @@ class Flow:
 
         s_next = s + polynomial @ m([s, v]) + gain * mlp([s, v]),
 
-    where m are the monomials of states and inputs up to a degree (:func:`observers.polynomial.monomials`). Of a motion
-    that is nearly one of these, the network has little left to say.
+    where m are the monomials of scaled states and inputs up to a degree (:func:`observers.polynomial.monomials`). Of a
+    motion that is nearly a polynomial, the network has little left to say.
 
     All variances below are of scaled states, or of outputs in their own units.
 
@@ -84,10 +85,11 @@ class Flow:
             raise ArtifactError(f"a flow of {nx} states and {nu} inputs needs as many of its network's inputs")
         of_states = ("x_offset", "x_scale", "gain", "low", "high", "error", "process_noise")
         check_shapes(self, dict.fromkeys(of_states, (nx,)))
-        if self.polynomial.ndim != 2 or len(self.polynomial) != nx or not degree_of(self.polynomial.shape[1], nx + nu):
+        shape = self.polynomial.shape
+        if len(shape) != 2 or shape[0] != nx or shape[1] > _MOST_TERMS or not degree_of(shape[1], nx + nu):
             raise ArtifactError(
-                f"the polynomial of a flow has shape {self.polynomial.shape}, which is of no degree for {nx} states "
-                f"and {nu} inputs"
+                f"the polynomial of a flow has shape {shape}, which is of no degree for {nx} states and {nu} inputs, or "
+                f"has more than {_MOST_TERMS} terms"
             )
         if self.least_measurement_noise.ndim != 1:
             raise ArtifactError("least_measurement_noise must have shape (ny,)")

@@ -42,7 +42,10 @@ def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
         newest = list(range(len(before), len(before) + len(made)))
         before += [t for t, _ in made]
         by += [j for _, j in made]
-    return np.array(before), np.array(by)
+    found = np.array(before), np.array(by)
+    for each in found:
+        each.flags.writeable = False  # it is everybody's
+    return found
 
 
 def monomials(q: np.ndarray, degree: int) -> np.ndarray:
@@ -58,7 +61,8 @@ def monomials(q: np.ndarray, degree: int) -> np.ndarray:
     Returns
     -------
     ndarray, shape (..., terms)
-        1, the variables, their products of two, and so on.
+        1, the variables, their products of two, and so on; of each degree in the order of
+        :func:`itertools.combinations_with_replacement`.
     """
     variables = q.shape[-1]
     before, by = table(variables, degree)

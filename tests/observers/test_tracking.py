@@ -329,6 +329,7 @@ def test_what_does_not_fit_is_refused(make_artifact):
         ("least_process_noise", 1e200),
         ("polynomial", np.zeros((2, 4))),  # two states have 1, 3, 6, 10 monomials, and so on
         ("polynomial", np.zeros((2, 1))),
+        ("polynomial", np.zeros((2, 1081))),  # of degree 45, which is beyond all measure
         ("polynomial", np.zeros((1, 4))),
         ("gain", np.ones(3)),
         ("least_measurement_noise", np.zeros(1)),

@@ -1,4 +1,4 @@
-"""The system's motion over one sample as a network: its data, and what its training minimises."""
+"""The system's motion over one sample, as a polynomial and a network: its data, and what its training minimises."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,12 +27,12 @@ PAIRS = 400_000
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
 DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
-# Neurons in each hidden layer: the fewer ones where the polynomial alone is usually off by less than that part of a
-# state's standard deviation.
-NARROW, WIDE, LITTLE = 16, 32, 1e-4
-# Of the polynomial: degree 5 for two states and an input, 3 for three and one. Higher powers of states that are far off
-# grow too fast.
-MOST_TERMS, HIGHEST_DEGREE = 60, 5
+# A polynomial of higher degree is taken where it alone is usually off by less than that part of a state's standard
+# deviation. The network then has little to say, and that near the motions. Elsewhere it would have to make up for powers
+# that grow without end: then it is a wide one, beside a linear fit.
+LITTLE = 1e-4
+NARROW, WIDE = 16, 32  # neurons in each hidden layer
+MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
@@ -132,7 +132,7 @@ class FlowProblem(nn.Module):
     u_scale : ndarray, shape (nu,)
         Of the inputs.
     degree : int
-        Of the polynomial.
+        Of the polynomial, if it leaves little; else it is 1.
     device : torch.device
         Where the network is trained.
 
@@ -148,10 +148,11 @@ class FlowProblem(nn.Module):
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)
         change = increments.change / increments.x_scale
-        terms = monomials(inputs, degree)
-        self.polynomial = np.linalg.lstsq(terms, change, rcond=None)[0].T
-        left = change - terms @ self.polynomial.T
-        width = WIDE if np.median(np.abs(left), axis=0).max() > LITTLE else NARROW
+        self.polynomial, left = _fitted(inputs, change, degree)
+        little = np.median(np.abs(left), axis=0).max() < LITTLE
+        if not little and degree > 1:
+            self.polynomial, left = _fitted(inputs, change, 1)
+        width = NARROW if little else WIDE
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
         self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=DEPTH, activation="tanh").to(device)
@@ -177,8 +178,15 @@ class FlowProblem(nn.Module):
         return {"loss": loss, "error": loss.detach().sqrt()}
 
 
+def _fitted(inputs: np.ndarray, change: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """A polynomial by least squares, (nx, terms), and what it leaves."""
+    terms = monomials(inputs, degree)
+    polynomial = np.linalg.lstsq(terms, change, rcond=None)[0].T
+    return polynomial, change - terms @ polynomial.T
+
+
 def largest_degree(variables: int) -> int:
-    """Find the degree of a polynomial that costs no more than the network beside it.
+    """Find the degree of polynomials that are tried.
 
     Parameters
     ----------
@@ -188,7 +196,7 @@ def largest_degree(variables: int) -> int:
     Returns
     -------
     int
-        The highest up to 5 of which there are at most 60 terms, or 1.
+        The highest up to 5 of which there are at most 60 terms; 1 where there is none.
     """
     return max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
 
@@ -219,7 +227,7 @@ def fit_flow(
     u_scale : ndarray, shape (nu,)
         Of the inputs.
     degree : int
-        Of the polynomial.
+        Of the polynomial, if it leaves little; else it is 1.
     steps : int
         Batches.
     seed : int
