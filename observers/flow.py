@@ -88,8 +88,8 @@ class Flow:
         shape = self.polynomial.shape
         if len(shape) != 2 or shape[0] != nx or shape[1] > _MOST_TERMS or not degree_of(shape[1], nx + nu):
             raise ArtifactError(
-                f"the polynomial of a flow has shape {shape}, which is of no degree for {nx} states and {nu} inputs, or "
-                f"has more than {_MOST_TERMS} terms"
+                f"the polynomial of a flow has shape {shape}, which is of no degree for {nx} states and {nu} inputs, "
+                f"or has more than {_MOST_TERMS} terms"
             )
         if self.least_measurement_noise.ndim != 1:
             raise ArtifactError("least_measurement_noise must have shape (ny,)")

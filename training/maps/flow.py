@@ -28,8 +28,8 @@ NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
 DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
 # A polynomial of higher degree is taken where it alone is usually off by less than that part of a state's standard
-# deviation. The network then has little to say, and that near the motions. Elsewhere it would have to make up for powers
-# that grow without end: then it is a wide one, beside a linear fit.
+# deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
+# then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
 NARROW, WIDE = 16, 32  # neurons in each hidden layer
 MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
