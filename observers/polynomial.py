@@ -49,7 +49,7 @@ def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def monomials(q: np.ndarray, degree: int) -> np.ndarray:
-    """Evaluate them.
+    """Evaluate them, of degree 1 at least.
 
     Parameters
     ----------
@@ -65,13 +65,19 @@ def monomials(q: np.ndarray, degree: int) -> np.ndarray:
         :func:`itertools.combinations_with_replacement`.
     """
     variables = q.shape[-1]
-    before, by = table(variables, degree)
-    terms = np.empty((*q.shape[:-1], len(before)))
-    terms[..., 0] = 1.0
-    for k in range(1, degree + 1):
-        new = slice(count(variables, k - 1), count(variables, k))
-        np.multiply(terms[..., before[new]], q[..., by[new]], out=terms[..., new])
+    terms = np.empty((*q.shape[:-1], count(variables, degree)))
+    terms[..., 0], terms[..., 1 : 1 + variables] = 1.0, q
+    for new, before, by in _products(variables, degree):
+        np.multiply(terms.take(before, -1), q.take(by, -1), out=terms[..., new])
     return terms
+
+
+@functools.cache
+def _products(variables: int, degree: int) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+    """Where the monomials of each degree from 2 on lie, and what they are made of."""
+    before, by = table(variables, degree)
+    ends = [count(variables, k) for k in range(1, degree + 1)]
+    return [(slice(*span), before[slice(*span)], by[slice(*span)]) for span in itertools.pairwise(ends)]
 
 
 __all__ = ["count", "degree_of", "monomials", "table"]
