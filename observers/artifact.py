@@ -42,9 +42,8 @@ _FLOW_ARRAYS = (
     "x_offset",
     "x_scale",
     "u_scale",
-    "bias",
     "gain",
-    "linear",
+    "polynomial",
     "low",
     "high",
     "error",
@@ -627,6 +626,9 @@ def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
 
 
 def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -> Flow:
+    if "flow.polynomial" not in tensors and "flow.linear" in tensors:  # as it was before there were other degrees
+        bias, linear = tensors["flow.bias"], tensors["flow.linear"]
+        tensors = {**tensors, "flow.polynomial": np.concatenate([bias[:, None], linear], axis=1)}
     arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
     factors: dict[str, Any] = {
         kind: Factors(*(tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS))

@@ -14,11 +14,14 @@ import numpy as np
 
 from observers.compiled import _kernels
 from observers.flow import Flow
+from observers.polynomial import count as monomials
+from observers.polynomial import table
 from observers.unscented import Gaussian
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-_LOW, _HIGH, _BIAS, _GAIN, _NOISE, _OFFSET, _SCALE, _LINEAR = range(8)  # columns of the table of states
+_LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE = range(6)  # columns of the table of states
+_BLOCK = 64  # points that go through the polynomial at a time
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 _ALL = np.ones(1, dtype=bool)
 
@@ -51,13 +54,17 @@ class CompiledTracker:
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
         low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
-        states = _packed(low, high, flow.bias, flow.gain, q, flow.x_offset, flow.x_scale, flow.linear)
+        states = _packed(low, high, flow.gain, q, flow.x_offset, flow.x_scale)
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
-        one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C))
-        self._one = functools.partial(one, states, outputs, scale, network.packed, network.widths, network.between)
-        self._enter, self._leave = functools.partial(enter, states, scale), functools.partial(leave, states, outputs)
+        one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
+        polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # four terms are added at a time
+        polynomial[:, : flow.polynomial.shape[1]] = flow.polynomial
+        of_network = network.packed, network.widths, network.between
+        self._one = functools.partial(one, states, outputs, scale, polynomial, *of_network)
+        self._enter = functools.partial(enter, states, scale, polynomial)
+        self._leave = functools.partial(leave, states, outputs)
         self._take = functools.partial(take, states)
 
     def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
@@ -83,11 +90,11 @@ class CompiledTracker:
         if len(y) == 1:
             self._one(u, y, _ALL if rows is None else rows, state, expected)
             return expected
-        moved = np.empty((len(y), self._points, self._nx))
-        inputs = np.empty((*moved.shape[:2], self._nx + u.shape[1]), np.float32)
+        moved = np.empty((self._nx, len(y) * self._points))
+        inputs = np.empty((moved.shape[1], self._nx + u.shape[1]), np.float32)
         self._enter(u, state, inputs, moved)
-        h = self._network.batch(inputs.reshape(-1, inputs.shape[-1])).reshape(moved.shape)
-        self._leave(h, moved, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, expected)
+        taken = np.ones(len(y), dtype=bool) if rows is None else rows
+        self._leave(self._network.batch(inputs), moved, y, taken, state, expected)
         return expected
 
     def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:
@@ -120,13 +127,14 @@ def _inlined(function: _F) -> _F:
 
 
 @functools.cache
-def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
+def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
     """The kernels of :class:`CompiledTracker`."""
     import numba
 
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     evaluate, count, far = _kernels(activation)[1], 2 * nx + 1, math.sqrt(3.0)
     central, others, entries = (3 - nx) / 3 + 2.0, 1 / 6, nx * nx  # weights of the points in covariances
+    (earlier, by), terms = table(nx + nu, degree), monomials(nx + nu, degree)
 
     @_inlined
     def within(states: np.ndarray, i: int, s: float) -> float:
@@ -140,14 +148,16 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
         row: np.ndarray,
         u: np.ndarray,
         L: np.ndarray,
+        points: np.ndarray,
         inputs: np.ndarray,
-        moved: np.ndarray,
     ) -> None:
-        """The sigma points of a row, as the network is given them, and where they go without it."""
-        points = moved  # in which they are drawn, (2 nx + 1, nx); NaN where there is no Cholesky factor
+        """The sigma points of a row, before rows of scaled inputs, (nx + nu, 2 nx + 1), and as the network has them.
+
+        NaN where there is no Cholesky factor.
+        """
         for i in range(nx):
             for p in range(count):
-                points[p, i] = row[i]
+                points[i, p] = row[i]
             for j in range(i + 1):
                 entry = row[nx + nx * i + j]
                 for k in range(j):
@@ -156,24 +166,46 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
                     L[i, j] = entry / L[j, j]
                 else:
                     L[i, j] = math.sqrt(entry) if entry > 0.0 else np.nan
-                points[1 + j, i] += far * L[i, j]
-                points[1 + nx + j, i] -= far * L[i, j]
+                points[i, 1 + j] += far * L[i, j]
+                points[i, 1 + nx + j] -= far * L[i, j]
         for p in range(count):
             for i in range(nx):
-                points[p, i] = within(states, i, points[p, i])
-                inputs[p, i] = points[p, i]
+                points[i, p] = within(states, i, points[i, p])
+                inputs[p, i] = points[i, p]
             for j in range(nu):
-                inputs[p, nx + j] = u[j] * scale[j]
-        for p in range(count):
+                points[nx + j, p] = inputs[p, nx + j] = u[j] * scale[j]
+
+    @_inlined
+    def multiply(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> None:
+        for p in range(len(product)):
+            product[p] = a[p] * b[p]
+
+    @_inlined
+    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
+        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+        for p in range(len(total)):
+            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+
+    @_inlined
+    def along(polynomial: np.ndarray, points: np.ndarray, block: int, moved: np.ndarray) -> None:
+        """Where points go by the polynomial, (nx, n). A block of them stays in the cache, its loops are vectors."""
+        signals, total = np.zeros((nx + nu, block)), np.empty(block)
+        products = np.zeros((polynomial.shape[1], block))
+        products[0] = 1.0
+        for first in range(0, points.shape[1], block):
+            size = min(block, points.shape[1] - first)
+            for j in range(nx + nu):
+                for p in range(size):
+                    signals[j, p] = points[j, first + p]
+            for t in range(1, terms):
+                multiply(products[earlier[t]], signals[by[t]], products[t])
             for i in range(nx):
-                total = points[p, i] + states[i, _BIAS]
-                for j in range(nu):
-                    total += states[i, _LINEAR + nx + j] * (u[j] * scale[j])
-                for j in range(nx):
-                    total += states[i, _LINEAR + j] * points[p, j]
-                L[0, i] = total  # the factor is no longer needed
-            for i in range(nx):
-                moved[p, i] = L[0, i]
+                total[:] = signals[i]
+                for t in range(0, polynomial.shape[1], 4):
+                    add_four(polynomial[i, t : t + 4], products[t : t + 4], total)
+                for p in range(size):
+                    moved[i, first + p] = total[p]
 
     @_inlined
     def after(
@@ -192,16 +224,16 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
         for i in range(nx):
             total = 0.0
             for p in range(count):
-                moved[p, i] += states[i, _GAIN] * h[p, i]
-                total += moved[p, i]
-            mean = (total + (2 * (3 - nx) - 1) * moved[0, i]) / 6
+                moved[i, p] += states[i, _GAIN] * h[p, i]
+                total += moved[i, p]
+            mean = (total + (2 * (3 - nx) - 1) * moved[i, 0]) / 6
             for p in range(count):
-                moved[p, i] -= mean
+                moved[i, p] -= mean
             found[i] = mean
             for j in range(i + 1):
-                entry = central * moved[0, i] * moved[0, j]
+                entry = central * moved[i, 0] * moved[j, 0]
                 for p in range(1, count):
-                    entry += others * moved[p, i] * moved[p, j]
+                    entry += others * moved[i, p] * moved[j, p]
                 found[nx + nx * i + j] = entry
             found[nx + nx * i + i] += states[i, _NOISE]
         for k in range(ny):
@@ -248,6 +280,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
         states: np.ndarray,
         outputs: np.ndarray,
         scale: np.ndarray,
+        polynomial: np.ndarray,
         packed: np.ndarray,
         widths: np.ndarray,
         between: np.ndarray,
@@ -257,9 +290,11 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
         state: np.ndarray,
         expected: np.ndarray,
     ) -> None:
-        L, moved, found, across = np.empty((nx, nx)), np.empty((count, nx)), np.empty(nx + entries), np.empty(nx)
+        L, found, across = np.empty((nx, nx)), np.empty(nx + entries), np.empty(nx)
+        points, moved = np.empty((nx + nu, count)), np.empty((nx, count))
         inputs, h = np.empty((count, nx + nu), np.float32), np.empty((count, nx), np.float32)
-        before(states, scale, state[0], u[0], L, inputs, moved)
+        before(states, scale, state[0], u[0], L, points, inputs)
+        along(polynomial, points, count, moved)
         for p in range(count):
             evaluate(inputs[p], packed, widths, between, h[p])
         after(states, outputs, h, moved, y[0], rows[0], found, across, state[0], expected[0])
@@ -268,14 +303,18 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     def enter(
         states: np.ndarray,
         scale: np.ndarray,
+        polynomial: np.ndarray,
         u: np.ndarray,
         state: np.ndarray,
         inputs: np.ndarray,
         moved: np.ndarray,
     ) -> None:
         L = np.empty((nx, nx))
+        points = np.empty((nx + nu, len(inputs)))
         for row in range(len(state)):
-            before(states, scale, state[row], u[row], L, inputs[row], moved[row])
+            own = slice(row * count, (row + 1) * count)
+            before(states, scale, state[row], u[row], L, points[:, own], inputs[own])
+        along(polynomial, points, _BLOCK, moved)
 
     @compiled
     def leave(
@@ -290,7 +329,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int) -> tuple[Any, ...]:
     ) -> None:
         found, across = np.empty(nx + entries), np.empty(nx)
         for row in range(len(state)):
-            after(states, outputs, h[row], moved[row], y[row], rows[row], found, across, state[row], expected[row])
+            own = slice(row * count, (row + 1) * count)
+            after(states, outputs, h[own], moved[:, own], y[row], rows[row], found, across, state[row], expected[row])
 
     @compiled
     def take(

@@ -1,5 +1,6 @@
 """Where a state is a sample later, as it was learned, and how sure of that an observer may be."""
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,9 @@ from observers.checks import is_finite
 from observers.errors import ArtifactError, check_shapes
 from observers.factors import Factors
 from observers.network import MLP
+from observers.polynomial import degree_of, monomials
 
+_MOST_TERMS = 1000
 _LARGEST = 1e12  # of a window and of a level of noise, whose squares and quotients by dt then stay finite
 
 
@@ -18,7 +21,10 @@ class Flow:
 
     Scaled states are s = (x - x_offset) / x_scale, and scaled inputs v = u / u_scale. A sample later
 
-        s_next = s + bias + linear @ [s, v] + gain * mlp([s, v]).
+        s_next = s + polynomial @ m([s, v]) + gain * mlp([s, v]),
+
+    where m are the monomials of scaled states and inputs up to a degree (:func:`observers.polynomial.monomials`). Of a
+    motion that is nearly a polynomial, the network has little left to say.
 
     All variances below are of scaled states, or of outputs in their own units.
 
@@ -30,10 +36,10 @@ class Flow:
         Scaling of the states.
     u_scale : ndarray, shape (nu,)
         Scaling of the inputs.
-    bias, gain : ndarray, shape (nx,)
+    gain : ndarray, shape (nx,)
         As above.
-    linear : ndarray, shape (nx, nx + nu)
-        As above.
+    polynomial : ndarray, shape (nx, terms)
+        As above; how many terms there are says the degree.
     low, high : ndarray, shape (nx,)
         Bounds of the motion, in units of the states, at which estimates are cut.
     error : ndarray, shape (nx,)
@@ -61,9 +67,8 @@ class Flow:
     x_offset: np.ndarray
     x_scale: np.ndarray
     u_scale: np.ndarray
-    bias: np.ndarray
     gain: np.ndarray
-    linear: np.ndarray
+    polynomial: np.ndarray
     low: np.ndarray
     high: np.ndarray
     error: np.ndarray
@@ -78,8 +83,14 @@ class Flow:
         nx, nu = self.nx, self.nu
         if self.u_scale.ndim != 1 or nx + nu != self.mlp.inputs:
             raise ArtifactError(f"a flow of {nx} states and {nu} inputs needs as many of its network's inputs")
-        of_states = ("x_offset", "x_scale", "bias", "gain", "low", "high", "error", "process_noise")
-        check_shapes(self, {**dict.fromkeys(of_states, (nx,)), "linear": (nx, nx + nu)})
+        of_states = ("x_offset", "x_scale", "gain", "low", "high", "error", "process_noise")
+        check_shapes(self, dict.fromkeys(of_states, (nx,)))
+        shape = self.polynomial.shape
+        if len(shape) != 2 or shape[0] != nx or shape[1] > _MOST_TERMS or not degree_of(shape[1], nx + nu):
+            raise ArtifactError(
+                f"the polynomial of a flow has shape {shape}, which is of no degree for {nx} states and {nu} inputs, "
+                f"or has more than {_MOST_TERMS} terms"
+            )
         if self.least_measurement_noise.ndim != 1:
             raise ArtifactError("least_measurement_noise must have shape (ny,)")
         for name in ("x_scale", "u_scale", "least_measurement_noise"):
@@ -105,6 +116,11 @@ class Flow:
         """Number of inputs."""
         return len(self.u_scale)
 
+    @functools.cached_property
+    def degree(self) -> int:
+        """Degree of the polynomial."""
+        return degree_of(self.polynomial.shape[1], self.nx + self.nu) or 0
+
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Evaluate.
 
@@ -126,7 +142,9 @@ class Flow:
         """The same of scaled states (..., nx) and scaled inputs (..., nu), which may be the same for many of them."""
         inputs = np.empty((*s.shape[:-1], s.shape[-1] + v.shape[-1]))
         inputs[..., : s.shape[-1]], inputs[..., s.shape[-1] :] = s, v
-        return np.asarray(s + self.bias + inputs @ self.linear.T + self.gain * self.mlp(inputs))
+        change = monomials(inputs, self.degree) @ self.polynomial.T
+        change += self.gain * self.mlp(inputs)
+        return np.asarray(s + change)
 
     def variances(
         self, measurement_noise: float | tuple[float, ...], process_noise: float

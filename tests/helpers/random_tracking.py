@@ -8,12 +8,13 @@ from error_bars import with_error_bars
 from random_artifacts import random_artifact
 
 from observers import MLP, Factors, Flow
+from observers.polynomial import count
 
 JUMPS = (600, 605)  # samples that no motion explains
 
 
 def a_flow(nx, nu, ny, seed=0, process=None):
-    """A damped rotation, bent a little by a network."""
+    """A damped rotation, bent a little by a cubic and a network."""
     rng, factors = np.random.default_rng(seed), np.array([[[2.0, 1.0], [1.5, 0.7]], [[2.5, 1.5], [1.0, 0.9]]])
     sizes = (nx + nu, 13, 11, nx)
     mlp = MLP(
@@ -23,14 +24,14 @@ def a_flow(nx, nu, ny, seed=0, process=None):
     )
     turn = rng.normal(size=(nx, nx))
     linear = np.hstack([0.05 * (turn - turn.T) - 0.02 * np.eye(nx), 0.1 * rng.normal(size=(nx, nu))])
+    bent = 1e-4 * rng.normal(size=(nx, count(nx + nu, 3) - count(nx + nu, 1)))
     return Flow(
         mlp=mlp,
         x_offset=rng.normal(size=nx),
         x_scale=rng.uniform(0.5, 2.0, nx),
         u_scale=rng.uniform(0.5, 2.0, nu),
-        bias=0.01 * rng.normal(size=nx),
         gain=0.02 * rng.uniform(0.5, 1.0, nx),
-        linear=linear,
+        polynomial=np.column_stack([0.01 * rng.normal(size=nx), linear, bent]),
         low=np.full(nx, -8.0),
         high=np.full(nx, 8.0),
         error=np.full(nx, 2e-3),

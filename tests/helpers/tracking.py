@@ -30,9 +30,8 @@ def exact_flow(dt=DT, ny=1, factors=None, x_scale=(2.0, 0.5)):
         x_offset=x_offset,
         x_scale=x_scale,
         u_scale=u_scale,
-        bias=(Phi - np.eye(2)) @ x_offset / x_scale,
         gain=np.ones(2),
-        linear=linear,
+        polynomial=np.column_stack([(Phi - np.eye(2)) @ x_offset / x_scale, linear]),
         low=np.array([-30.0, -30.0]),
         high=np.array([30.0, 30.0]),
         error=np.zeros(2),
@@ -76,7 +75,7 @@ def tracking_observer(outputs=C, **options):
     """The observer with the exact flow, without input."""
     artifact, flow = plain_observer(outputs), exact_flow(ny=len(outputs), **options)
     mlp = MLP([np.zeros((4, 2)), np.zeros((2, 4))], [np.zeros(4), np.zeros(2)], "tanh")
-    return replace(artifact, flow=replace(flow, mlp=mlp, u_scale=np.zeros(0), linear=flow.linear[:, :2]))
+    return replace(artifact, flow=replace(flow, mlp=mlp, u_scale=np.zeros(0), polynomial=flow.polynomial[:, :3]))
 
 
 class KalmanFilter:

@@ -6,6 +6,7 @@ import shutil
 
 import numpy as np
 import pytest
+from random_tracking import tracking
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
@@ -112,6 +113,20 @@ def test_files_from_before_reverse_duffing_had_parameters(make_artifact, tmp_pat
         old.check("reverse_duffing", {"a": 1.0, "b": 1.1}, **its)
     dataclasses.replace(make_artifact("lorenz"), parameters={}).save(path)
     assert Artifact.read(path).parameters == {}
+
+
+def test_flows_from_before_they_were_polynomials(tmp_path):
+    artifact = tracking()
+    linear = dataclasses.replace(artifact.flow, polynomial=artifact.flow.polynomial[:, : 1 + artifact.nx + artifact.nu])
+    path = tmp_path / "before.safetensors"
+    dataclasses.replace(artifact, flow=linear).save(path)
+
+    def as_before(tensors, meta):
+        polynomial = tensors.pop("flow.polynomial")
+        tensors["flow.bias"], tensors["flow.linear"] = polynomial[:, 0].copy(), polynomial[:, 1:].copy()
+
+    rewrite(path, as_before)
+    np.testing.assert_array_equal(Artifact.read(path).flow.polynomial, linear.polynomial)
 
 
 def test_forward_map(make_artifact):

@@ -219,7 +219,7 @@ def test_a_run_compiles_nothing_in_its_midst():
     artifact = tracking(2)
     compiled_tracker._tracking.cache_clear()
     observer = KKLObserver(artifact, 0.1, compiled=True)
-    kernels = compiled_tracker._tracking(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny)
+    kernels = compiled_tracker._tracking(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny, 3)
     assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 0, 1]
     frozen, y = np.array([0.2]), np.array([0.1, 0.2])
     frozen.flags.writeable = False

@@ -327,7 +327,10 @@ def test_what_does_not_fit_is_refused(make_artifact):
         ("window", np.nan),
         ("window", 1e308),
         ("least_process_noise", 1e200),
-        ("linear", np.zeros((2, 3))),
+        ("polynomial", np.zeros((2, 4))),  # two states have 1, 3, 6, 10 monomials, and so on
+        ("polynomial", np.zeros((2, 1))),
+        ("polynomial", np.zeros((2, 1081))),  # of degree 45, which is beyond all measure
+        ("polynomial", np.zeros((1, 4))),
         ("gain", np.ones(3)),
         ("least_measurement_noise", np.zeros(1)),
     ):

@@ -12,7 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
-from training.maps.flow import draw_increments, fit_flow, usual_error
+from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_error
 from training.maps.regions import LEVELS, Regions, distances_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -39,10 +39,11 @@ def learn_tracking(
 ) -> Artifact:
     """Teach an observer to track: to carry its estimate on by the system's motion, which is learned here.
 
-    T_inv and its error bars stay as they are. A small network learns how states change over a sample, on simulated
-    ones about the system's motions. An unscented Kalman filter on that flow is what :class:`observers.KKLObserver`
-    then runs beside z. Its covariances are calibrated on further motions, so that regions of 90 % hold 90 % of the
-    errors, or up to 92 % where a few are far off, and so are the limits of the monitor, if there are any.
+    T_inv and its error bars stay as they are. A polynomial and a small network learn how states change over a sample,
+    on simulated ones about the system's motions. An unscented Kalman filter on that flow is what
+    :class:`observers.KKLObserver` then runs beside z. Its covariances are calibrated on further motions, so that
+    regions of 90 % hold 90 % of the errors, or up to 92 % where a few are far off, and so are the limits of the
+    monitor, if there are any.
 
     Parameters
     ----------
@@ -167,6 +168,7 @@ def _learned(
     flow = fit_flow(
         increments,
         u_scale,
+        degree=largest_degree(artifact.nx + nu),
         steps=steps,
         seed=seed,
         progress=progress,

@@ -12,6 +12,7 @@ import numpy as np
 
 from observers.flow import Flow
 from observers.network import MLP
+from observers.polynomial import table
 from observers.spread import LARGEST_LOG, Spread
 from observers.tracker import supervision
 from training.export import c_templates, c_tracker_templates
@@ -42,8 +43,10 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
     least = map(number, flow.least_measurement_noise)
     R = [f"SQUARE(LARGER({macro}, {each}))" for macro, each in zip(macros, least, strict=True)]
     parts = ["\n/* The flow: how scaled states move over a sample. */\n"]
-    names = ("x_offset", "x_scale", *(["u_scale"] if flow.nu else []), "bias", "gain", "linear")
+    names = ("x_offset", "x_scale", *(["u_scale"] if flow.nu else []), "gain", "polynomial")
     parts += [array("double", f"flow_{name}", getattr(flow, name)) for name in names]
+    for name, each in zip(("earlier", "by"), table(flow.nx + flow.nu, flow.degree), strict=True):
+        parts.append(array("unsigned short", f"flow_{name}", each))
     parts += network_arrays("flow", flow.mlp)
     parts += [
         "\n/* The Kalman filter: bounds, outputs, and variances of what is added to states and outputs. */\n",
@@ -81,6 +84,7 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
             **words,
             **network_words("flow", flow.mlp),
             inputs=nx + flow.nu,
+            terms=flow.polynomial.shape[1],
             count=2 * nx + 1,
             far=number(math.sqrt(3.0)),
             central_mean=number((3 - nx) / 3),

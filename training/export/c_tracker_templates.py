@@ -63,16 +63,21 @@ static double within(double s, size_t i)
     return s > high[i] ? high[i] : s;
 }}
 
-/* Scaled states, behind which lie scaled inputs, a sample later. */
+/* Scaled states, behind which lie scaled inputs, a sample later: by a polynomial, whose monomials are each an earlier
+   one times one of these, and a network. */
 static void flow(const double in[{inputs}], double next[{nx}])
 {{
     real a[{width}], b[{width}];
+    double monomials[{terms}];
+    monomials[0] = 1.0;
+    for (size_t t = 1; t < {terms}; t++)
+        monomials[t] = monomials[flow_earlier[t]] * in[flow_by[t]];
     for (size_t i = 0; i < {inputs}; i++)
         a[i] = (real)in[i];
 {layers}    for (size_t i = 0; i < {nx}; i++) {{
-        next[i] = in[i] + flow_bias[i] + flow_gain[i] * {last}[i];
-        for (size_t j = 0; j < {inputs}; j++)
-            next[i] += flow_linear[i][j] * in[j];
+        next[i] = in[i] + flow_gain[i] * {last}[i];
+        for (size_t t = 0; t < {terms}; t++)
+            next[i] += flow_polynomial[i][t] * monomials[t];
     }}
 }}
 

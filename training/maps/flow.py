@@ -1,4 +1,4 @@
-"""The system's motion over one sample as a network: its data, and what its training minimises."""
+"""The system's motion over one sample, as a polynomial and a network: its data, and what its training minimises."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,6 +10,7 @@ from torch import nn
 from kkl_gym.simulate import simulate
 from kkl_gym.system import System
 from observers import Factors, Flow
+from observers.polynomial import count, monomials
 from training.maps.networks import Network, tensor
 from training.maps.optimise import optimise_at_once
 from training.progress import ProgressBars
@@ -25,7 +26,13 @@ PAIRS = 400_000
 # most of them near and some far. That a tracker does not leave the motions it is the near ones that decide.
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
-WIDTH, DEPTH, BATCH, LEARNING_RATE = 32, 2, 1024, 3e-3
+DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
+# A polynomial of higher degree is taken where it alone is usually off by less than that part of a state's standard
+# deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
+# then it is a wide one, beside a linear fit.
+LITTLE = 1e-4
+NARROW, WIDE = 16, 32  # neurons in each hidden layer
+MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
@@ -116,7 +123,7 @@ def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndar
 
 
 class FlowProblem(nn.Module):
-    """The network of :class:`observers.Flow`, on what a linear fit leaves of the increments.
+    """The network of :class:`observers.Flow`, on what a polynomial leaves of the increments.
 
     Parameters
     ----------
@@ -124,38 +131,36 @@ class FlowProblem(nn.Module):
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
-    width, depth : int
-        Neurons in each hidden layer, and number of these.
-    batch : int
-        Samples in a batch.
+    degree : int
+        Of the polynomial, if it leaves little; else it is 1.
     device : torch.device
         Where the network is trained.
 
     Attributes
     ----------
-    bias, linear : ndarray, shapes (nx,) and (nx, nx + nu)
-        The linear fit, of scaled increments.
+    polynomial : ndarray, shape (nx, terms)
+        The polynomial, of scaled increments, by least squares.
     gain : ndarray, shape (nx,)
         Scale of what it leaves.
     """
 
-    def __init__(
-        self, increments: Increments, u_scale: np.ndarray, *, width: int, depth: int, batch: int, device: torch.device
-    ) -> None:
+    def __init__(self, increments: Increments, u_scale: np.ndarray, *, degree: int, device: torch.device) -> None:
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)
         change = increments.change / increments.x_scale
-        found = np.linalg.lstsq(np.column_stack([inputs, np.ones(len(inputs))]), change, rcond=None)[0]
-        self.linear, self.bias = found[:-1].T, found[-1]
-        left = change - inputs @ self.linear.T - self.bias
+        self.polynomial, left = _fitted(inputs, change, degree)
+        little = np.median(np.abs(left), axis=0).max() < LITTLE
+        if not little and degree > 1:
+            self.polynomial, left = _fitted(inputs, change, 1)
+        width = NARROW if little else WIDE
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
-        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=depth, activation="tanh").to(device)
-        self._batch, self._inputs, self._left = batch, tensor(inputs, device), tensor(left, device)
+        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=DEPTH, activation="tanh").to(device)
+        self._inputs, self._left = tensor(inputs, device), tensor(left, device)
         self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, relative to what the linear fit leaves of each sample.
+        """Mean square error of a batch, relative to what the polynomial leaves of each sample.
 
         Parameters
         ----------
@@ -167,10 +172,33 @@ class FlowProblem(nn.Module):
         dict of str to Tensor
             "loss", and "error", its root.
         """
-        rows = torch.randint(len(self._inputs), (self._batch,), generator=generator, device=self._inputs.device)
+        rows = torch.randint(len(self._inputs), (BATCH,), generator=generator, device=self._inputs.device)
         square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
         loss = (self._weight[rows] * square).mean()
         return {"loss": loss, "error": loss.detach().sqrt()}
+
+
+def _fitted(inputs: np.ndarray, change: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """A polynomial by least squares, (nx, terms), and what it leaves."""
+    terms = monomials(inputs, degree)
+    polynomial = np.linalg.lstsq(terms, change, rcond=None)[0].T
+    return polynomial, change - terms @ polynomial.T
+
+
+def largest_degree(variables: int) -> int:
+    """Find the degree of polynomials that are tried.
+
+    Parameters
+    ----------
+    variables : int
+        States and inputs.
+
+    Returns
+    -------
+    int
+        The highest up to 5 of which there are at most 60 terms; 1 where there is none.
+    """
+    return max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
 
 
 def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
@@ -183,6 +211,7 @@ def fit_flow(
     increments: Increments,
     u_scale: np.ndarray,
     *,
+    degree: int,
     steps: int,
     seed: int,
     progress: ProgressBars,
@@ -197,6 +226,8 @@ def fit_flow(
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
+    degree : int
+        Of the polynomial, if it leaves little; else it is 1.
     steps : int
         Batches.
     seed : int
@@ -214,7 +245,7 @@ def fit_flow(
         One that has no error, and no factors yet.
     """
     device = device or torch.device("cpu")
-    problem = FlowProblem(increments, u_scale, width=WIDTH, depth=DEPTH, batch=BATCH, device=device)
+    problem = FlowProblem(increments, u_scale, degree=degree, device=device)
     optimise_at_once(
         "flow", problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed
     )
@@ -223,9 +254,8 @@ def fit_flow(
         x_offset=increments.x_offset,
         x_scale=increments.x_scale,
         u_scale=u_scale,
-        bias=problem.bias,
         gain=problem.gain,
-        linear=problem.linear,
+        polynomial=problem.polynomial,
         error=np.zeros(len(increments.x_scale)),
         factors=Factors(np.zeros(1), np.zeros(1), np.ones((1, 1))),
         **of_plant,

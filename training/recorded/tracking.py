@@ -26,6 +26,9 @@ OUTLIER = 6.0  # standard deviations of what is left, by its median
 # What is assumed at least: of the flow's error in parts of what states change by over a sample, and of measurement
 # noise in standard deviations of the outputs. A filter that trusts its model wholly stops listening.
 LEAST_ERROR, LEAST_NOISE = 0.01, 1e-4
+# Of the flow's polynomial. Of recorded states some lie alone, where higher powers are anything; and a motion that jumps
+# now and then, as at a contact, is no polynomial's.
+DEGREE = 1
 WINDOW = 10  # samples at least over which innovations are averaged
 
 
@@ -41,9 +44,9 @@ def learn_recorded_tracking(
 ) -> Artifact:
     """Teach an observer from recorded states to track: to carry its estimate on by a motion that is learned here.
 
-    T_inv and its error bars stay as they are. A small network learns how the states change from one recorded sample to
-    the next. What it is usually off by on the records that were held out counts as noise of the motion. The rest is as
-    :func:`training.evaluation.tracking.learn_tracking` has it.
+    T_inv and its error bars stay as they are. A small network, beside a linear fit, learns how the states change from
+    one recorded sample to the next. What it is usually off by on the records that were held out counts as noise of the
+    motion. The rest is as :func:`training.evaluation.tracking.learn_tracking` has it.
 
     A tracker compares each sample with what it expects. So the measured signals have to be among the hidden ones, or
     be sums of them; an artifact that says so already, by its C, is taken at its word.
@@ -96,6 +99,7 @@ def learn_recorded_tracking(
         flow = fit_flow(
             learned,
             np.where(u_scale > 0, u_scale, 1.0),
+            degree=DEGREE,
             steps=steps,
             seed=seed,
             progress=progress,

@@ -22,6 +22,7 @@ from training.export.onnx_graph import onnx_model
 from training.export.step_file import write_step
 from training.guided import GuidedKalmanFilter
 from training.maps import flow, regions
+from training.progress import progress_bars
 from training.trajectories.controllers import linear_quadratic
 from training.trajectories.noise import draw_process_noise
 
@@ -133,6 +134,40 @@ def test_a_policy_needs_an_observer_that_knows_of_inputs():
         for each, policy in zip(rng, (None, lambda x: -x[..., :1]), strict=True)
     )
     np.testing.assert_array_equal(alone.change, under.change)
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_a_motion_that_is_a_polynomial_is_found_exactly(bent):
+    """In units of which none is 1. Where a polynomial leaves much, it is linear, and the network a wide one."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2000, 2)) * (3.0, 0.2) + (1.0, -0.5)
+    u = rng.uniform(-4, 4, (2000, 1))
+    change = np.column_stack([0.1 * x[:, 1] - 0.01 * x[:, 0] ** 3, 0.02 * u[:, 0] + 0.05 * x[:, 0] * x[:, 1]])
+    change += bent * 0.01 * np.sin(9 * x)
+    increments = flow.Increments(x, u, change, x.mean(0), x.std(0))
+    with progress_bars(None) as progress:
+        found = flow.fit_flow(
+            increments,
+            np.array([4.0]),
+            degree=3,
+            steps=1,
+            seed=0,
+            progress=progress,
+            low=np.full(2, -20.0),
+            high=np.full(2, 20.0),
+            process_noise=np.zeros(2),
+            least_process_noise=1.0,
+            least_measurement_noise=np.ones(1),
+            window=1.0,
+        )
+    assert found.degree == (1 if bent else 3)
+    assert found.mlp.weights[0].shape == (32 if bent else 16, 3)
+    if not bent:
+        assert np.abs(found(x, u) - x - change).max() < 1e-12
+
+
+def test_degrees_are_as_high_as_sixty_terms_allow():
+    assert [flow.largest_degree(n) for n in (1, 2, 3, 4, 5, 6, 9, 10, 40)] == [5, 5, 5, 3, 3, 2, 2, 1, 1]
 
 
 def test_inputs_are_learned():

@@ -1,0 +1,83 @@
+"""Monomials of several variables, up to a degree."""
+
+import functools
+import itertools
+import math
+
+import numpy as np
+
+
+def count(variables: int, degree: int) -> int:
+    """How many monomials there are, 1 among them."""
+    return math.comb(variables + degree, degree)
+
+
+def degree_of(terms: int, variables: int) -> int | None:
+    """The degree up to which there are so many monomials; None where there is none."""
+    if variables < 1:
+        return None
+    degree = next(degree for degree in itertools.count() if count(variables, degree) >= terms)
+    return degree if count(variables, degree) == terms else None
+
+
+@functools.cache
+def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """What monomials are made of, in the order of their degrees.
+
+    Parameters
+    ----------
+    variables : int
+        How many.
+    degree : int
+        Of the last monomials.
+
+    Returns
+    -------
+    before, by : ndarray of int, shape (terms,)
+        Each is one that comes before it, times a variable. (The first is 1, for which both are 0.)
+    """
+    before, by, newest = [0], [0], [0]
+    for _ in range(degree):
+        made = [(t, j) for t in newest for j in range(by[t], variables)]  # each once: by variables that do not fall
+        newest = list(range(len(before), len(before) + len(made)))
+        before += [t for t, _ in made]
+        by += [j for _, j in made]
+    found = np.array(before), np.array(by)
+    for each in found:
+        each.flags.writeable = False  # it is everybody's
+    return found
+
+
+def monomials(q: np.ndarray, degree: int) -> np.ndarray:
+    """Evaluate them, of degree 1 at least.
+
+    Parameters
+    ----------
+    q : ndarray, shape (..., variables)
+        Of the variables.
+    degree : int
+        Of the last monomials.
+
+    Returns
+    -------
+    ndarray, shape (..., terms)
+        1, the variables, their products of two, and so on; of each degree in the order of
+        :func:`itertools.combinations_with_replacement`.
+    """
+    variables = q.shape[-1]
+    terms = np.empty((*q.shape[:-1], count(variables, degree)))
+    terms[..., 0], terms[..., 1 : 1 + variables] = 1.0, q
+    for new, before, by in _products(variables, degree):
+        np.multiply(terms.take(before, -1), q.take(by, -1), out=terms[..., new])
+    return terms
+
+
+@functools.cache
+def _products(variables: int, degree: int) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+    """Where the monomials of each degree from 2 on lie, and what they are made of."""
+    before, by = table(variables, degree)
+    ends = [count(variables, k) for k in range(1, degree + 1)]
+    return [(slice(*span), before[slice(*span)], by[slice(*span)]) for span in itertools.pairwise(ends)]
+
+
+__all__ = ["count", "degree_of", "monomials", "table"]
