@@ -51,6 +51,7 @@ AFTER_INTERRUPTION = {
     ("agent", "compare"): "the same command goes on",
 }
 
+WIDE = 140  # columns of what is printed into a file or a pipe, where tables of 80 would be cut
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
 # Modules that an extra of the package brings.
@@ -95,7 +96,7 @@ def main(arguments: list[str] | None = None) -> None:
         try:
             from rich.console import Console
 
-            read(arguments).run(Console())
+            read(arguments).run(Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE))
         except BaseException as error:
             if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
                 hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
