@@ -14,7 +14,6 @@ import numpy as np
 
 from observers.compiled import _kernels
 from observers.flow import Flow
-from observers.polynomial import count as monomials
 from observers.polynomial import table
 from observers.unscented import Gaussian
 
@@ -134,7 +133,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     evaluate, count, far = _kernels(activation)[1], 2 * nx + 1, math.sqrt(3.0)
     central, others, entries = (3 - nx) / 3 + 2.0, 1 / 6, nx * nx  # weights of the points in covariances
-    (earlier, by), terms = table(nx + nu, degree), monomials(nx + nu, degree)
+    earlier, by = table(nx + nu, degree)
+    terms = len(by)
 
     @_inlined
     def within(states: np.ndarray, i: int, s: float) -> float:

@@ -33,16 +33,16 @@ def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
 
     Returns
     -------
-    before, by : ndarray of int, shape (terms,)
-        Each is one that comes before it, times a variable. (The first is 1, for which both are 0.)
+    earlier, by : ndarray of int, shape (terms,)
+        Each is an earlier one times a variable. (The first is 1, for which both are 0.)
     """
-    before, by, newest = [0], [0], [0]
+    earlier, by, newest = [0], [0], [0]
     for _ in range(degree):
         made = [(t, j) for t in newest for j in range(by[t], variables)]  # each once: by variables that do not fall
-        newest = list(range(len(before), len(before) + len(made)))
-        before += [t for t, _ in made]
+        newest = list(range(len(earlier), len(earlier) + len(made)))
+        earlier += [t for t, _ in made]
         by += [j for _, j in made]
-    found = np.array(before), np.array(by)
+    found = np.array(earlier), np.array(by)
     for each in found:
         each.flags.writeable = False  # it is everybody's
     return found
@@ -67,17 +67,17 @@ def monomials(q: np.ndarray, degree: int) -> np.ndarray:
     variables = q.shape[-1]
     terms = np.empty((*q.shape[:-1], count(variables, degree)))
     terms[..., 0], terms[..., 1 : 1 + variables] = 1.0, q
-    for new, before, by in _products(variables, degree):
-        np.multiply(terms.take(before, -1), q.take(by, -1), out=terms[..., new])
+    for new, earlier, by in _products(variables, degree):
+        np.multiply(terms.take(earlier, -1), q.take(by, -1), out=terms[..., new])
     return terms
 
 
 @functools.cache
 def _products(variables: int, degree: int) -> list[tuple[slice, np.ndarray, np.ndarray]]:
     """Where the monomials of each degree from 2 on lie, and what they are made of."""
-    before, by = table(variables, degree)
+    earlier, by = table(variables, degree)
     ends = [count(variables, k) for k in range(1, degree + 1)]
-    return [(slice(*span), before[slice(*span)], by[slice(*span)]) for span in itertools.pairwise(ends)]
+    return [(slice(*span), earlier[slice(*span)], by[slice(*span)]) for span in itertools.pairwise(ends)]
 
 
 __all__ = ["count", "degree_of", "monomials", "table"]

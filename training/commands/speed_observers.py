@@ -53,7 +53,7 @@ def observer_tasks(
 ) -> dict[str, Callable[[], float]]:
     """What steps an observer and extended Kalman filters along the same samples, of motions from X.
 
-    The first half is not timed. There observers that track still ask T_inv at each sample.
+    Of observers the first half is not timed: there those that track may still ask T_inv at each sample.
 
     Parameters
     ----------
@@ -69,9 +69,9 @@ def observer_tasks(
     Returns
     -------
     dict of str to callable
-        CPU seconds for each step of the second half, by name: "KKL"; "KKL, error bars" where the artifact has them; the
-        same followed by ", NumPy" of a single one where Numba is installed; "EKF" of this package, which is for
-        batches; and "EKF of filterpy" where that is installed, one filter for each row.
+        CPU seconds for each step, by name: "KKL"; "KKL, error bars" where the artifact has them; the same followed by
+        ", NumPy" of a single one where Numba is installed; "EKF" of this package, which is for batches; and "EKF of
+        filterpy" where that is installed, one filter for each row.
     """
     rng, n = np.random.default_rng(0), rows or 1
     u = np.array(system.u_max) * rng.uniform(-1, 1, (steps + 1, n, system.nu))

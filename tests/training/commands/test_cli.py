@@ -279,3 +279,19 @@ def test_figures_leave_the_users_matplotlib_alone():
             if path.name != "live.py":  # a window is what pyplot is for
                 assert "pyplot" not in path.read_text(), path
             assert "matplotlib.use" not in path.read_text(), path
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 140), ("100", 100)])
+def test_tables_in_files_are_not_cut_at_80_columns(columns, width, monkeypatch, capsys):
+    widths = []
+
+    class Command:
+        def run(self, console):
+            widths.append(console.width)
+
+    monkeypatch.setattr(training.cli, "read", lambda arguments: Command())
+    monkeypatch.delenv("COLUMNS", raising=False)
+    if columns is not None:
+        monkeypatch.setenv("COLUMNS", columns)
+    main(["speed"])
+    assert widths == [width]
