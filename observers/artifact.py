@@ -620,8 +620,8 @@ def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
     for kind in _FLOW_FACTORS:
         factors = getattr(flow, kind)
         if factors is not None:
-            arrays = {name: np.asarray(getattr(factors, name), dtype=float) for name in _SPREAD_ARRAYS}
-            tensors |= {f"flow.{kind}.{name}": array for name, array in arrays.items()}
+            names = (*_SPREAD_ARRAYS, *(() if factors.doubt is None else ("doubt",)))
+            tensors |= {f"flow.{kind}.{name}": np.asarray(getattr(factors, name), dtype=float) for name in names}
     return {"activation": flow.mlp.activation, **{name: getattr(flow, name) for name in _FLOW_SCALARS}}
 
 
@@ -631,7 +631,9 @@ def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -
         tensors = {**tensors, "flow.polynomial": np.concatenate([bias[:, None], linear], axis=1)}
     arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
     factors: dict[str, Any] = {
-        kind: Factors(*(tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS))
+        kind: Factors(
+            **{name: tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS}, doubt=tensors.get(f"flow.{kind}.doubt")
+        )
         for kind in _FLOW_FACTORS
         if kind == _FLOW_FACTORS[0] or f"flow.{kind}.{_SPREAD_ARRAYS[0]}" in tensors
     }

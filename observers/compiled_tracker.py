@@ -56,7 +56,7 @@ class CompiledTracker:
         states = _packed(low, high, flow.gain, q, flow.x_offset, flow.x_scale)
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
-        self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx + 1
+        self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx
         one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
         polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # four terms are added at a time
         polynomial[:, : flow.polynomial.shape[1]] = flow.polynomial
@@ -131,8 +131,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     import numba
 
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
-    evaluate, count, far = _kernels(activation)[1], 2 * nx + 1, math.sqrt(3.0)
-    central, others, entries = (3 - nx) / 3 + 2.0, 1 / 6, nx * nx  # weights of the points in covariances
+    evaluate, count, far, weight = _kernels(activation)[1], 2 * nx, math.sqrt(nx), 1 / (2 * nx)
+    entries = nx * nx
     earlier, by = table(nx + nu, degree)
     terms = len(by)
 
@@ -151,7 +151,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         points: np.ndarray,
         inputs: np.ndarray,
     ) -> None:
-        """The sigma points of a row, before rows of scaled inputs, (nx + nu, 2 nx + 1), and as the network has them.
+        """The sigma points of a row, before rows of scaled inputs, (nx + nu, 2 nx), and as the network has them.
 
         NaN where there is no Cholesky factor.
         """
@@ -166,8 +166,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
                     L[i, j] = entry / L[j, j]
                 else:
                     L[i, j] = math.sqrt(entry) if entry > 0.0 else np.nan
-                points[i, 1 + j] += far * L[i, j]
-                points[i, 1 + nx + j] -= far * L[i, j]
+                points[i, j] += far * L[i, j]
+                points[i, nx + j] -= far * L[i, j]
         for p in range(count):
             for i in range(nx):
                 points[i, p] = within(states, i, points[i, p])
@@ -226,15 +226,15 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
             for p in range(count):
                 moved[i, p] += states[i, _GAIN] * h[p, i]
                 total += moved[i, p]
-            mean = (total + (2 * (3 - nx) - 1) * moved[i, 0]) / 6
+            mean = weight * total
             for p in range(count):
                 moved[i, p] -= mean
             found[i] = mean
             for j in range(i + 1):
-                entry = central * moved[i, 0] * moved[j, 0]
-                for p in range(1, count):
-                    entry += others * moved[i, p] * moved[j, p]
-                found[nx + nx * i + j] = entry
+                entry = 0.0
+                for p in range(count):
+                    entry += moved[i, p] * moved[j, p]
+                found[nx + nx * i + j] = weight * entry
             found[nx + nx * i + i] += states[i, _NOISE]
         for k in range(ny):
             expected[k] = outputs[k, _MEAN]

@@ -26,16 +26,21 @@ class Factors:
         Seconds since reset, rising from 0.
     factors : ndarray, shape (k, m) or (2, k, m)
         At each of them; two tables are without process noise and with the highest level that the map is told.
+    doubt : ndarray, shape as the factors', optional
+        How far the covariance itself is doubted, from 0, which is meant by default, to 1. What takes its place so far
+        is up to who asks; :class:`observers.tracker.Tracker` does.
 
     Raises
     ------
     ValueError
-        If shapes do not go together, levels or ages do not rise from 0, or a factor is not positive.
+        If shapes do not go together, levels or ages do not rise from 0, a factor is not positive, or a doubt is not
+        within 0 and 1.
     """
 
     levels: np.ndarray
     ages: np.ndarray
     factors: np.ndarray
+    doubt: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("levels", "ages"):
@@ -50,6 +55,12 @@ class Factors:
             )
         if not ((self.factors > 0) & (self.factors <= _LARGEST)).all():
             raise ValueError(f"factors must be positive and at most {_LARGEST:g}, got {shown(self.factors)}")
+        if self.doubt is None:
+            return
+        if self.doubt.shape != self.factors.shape:
+            raise ValueError(f"doubt of shape {self.doubt.shape} does not fit factors of shape {self.factors.shape}")
+        if not ((self.doubt >= 0) & (self.doubt <= 1)).all():
+            raise ValueError(f"doubt must be within 0 and 1, got {shown(self.doubt)}")
 
     def log_roots(self, measurement_noise: float, process_noise: float) -> np.ndarray:
         """Logarithms of the factors' square roots at each age.
@@ -64,7 +75,14 @@ class Factors:
         ndarray, shape (m,)
             What logarithms of standard deviations rise by.
         """
-        tables = np.log(self.factors) / 2
+        return self._by_age(np.log(self.factors) / 2, measurement_noise, process_noise)
+
+    def doubts(self, measurement_noise: float, process_noise: float) -> np.ndarray:
+        """How far the covariance is doubted at each age, shape (m,), at levels as :meth:`log_roots` takes them."""
+        doubt = np.zeros_like(self.factors) if self.doubt is None else self.doubt
+        return self._by_age(doubt, measurement_noise, process_noise)
+
+    def _by_age(self, tables: np.ndarray, measurement_noise: float, process_noise: float) -> np.ndarray:
         if tables.ndim == 3:
             share = min(process_noise, 1.0)
             tables = (1.0 - share) * tables[0] + share * tables[1]

@@ -3,6 +3,7 @@
 import copy
 import functools
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,22 @@ KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scale
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample
 
 
+@dataclass(frozen=True)
+class _Calibrated:
+    """Of covariances at levels of noise: ages in samples, logarithms of the factors' roots there, and doubts."""
+
+    ages: np.ndarray
+    logs: np.ndarray
+    doubts: np.ndarray
+    units: np.ndarray  # products of the states' scales, (nx, nx)
+
+    @functools.cached_property
+    def settled(self) -> np.ndarray:
+        """What P of scaled states, (nx, nx), is multiplied with behind the last age."""
+        doubt = self.doubts[-1] * (1 - np.eye(len(self.units)))
+        return np.asarray(self.units * math.exp(2 * self.logs[-1]) * (1 - doubt))
+
+
 class Tracker:
     """An unscented Kalman filter on a learned flow, for a batch of rows.
 
@@ -30,6 +47,12 @@ class Tracker:
     tracker is lost: where the mean square of its innovations, over the window, is beyond chance for the levels of noise
     told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
     surer than so soon after a reset as the window is long.
+
+    What it says of its own errors is not the filter's covariance P alone, which is now and then far too small. P is
+    doubted, at each level of noise and age as far as that made errors likelier in calibration: (1 - doubt) P + doubt M.
+    Within the window M is what T_inv says of these errors. That is its own covariance, and the square of what the two
+    estimates differ by. Later T_inv is not asked, and M is the diagonal of P: a filter on a motion that contracts is
+    too sure of what it takes to go together. A factor then makes regions hold what they should.
 
     Parameters
     ----------
@@ -64,12 +87,13 @@ class Tracker:
         self._units = flow.x_scale[:, None] * flow.x_scale
         self._window, self._share, self._limit = supervision(flow, self._dt)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
-        self._log_roots, self._free_log_roots = (  # of factors, by age in samples
-            (each.ages / self._dt, each.log_roots(*shares))
+        self._calibrated, self._free_calibrated = (
+            _Calibrated(each.ages / self._dt, each.log_roots(*shares), each.doubts(*shares), self._units)
             for each in (flow.factors, flow.free_factors or flow.factors)
         )
         self._batch: tuple[int, ...]
         self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
+        self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
 
     @property
     def _x(self) -> np.ndarray:
@@ -101,14 +125,36 @@ class Tracker:
         """Covariances of the estimates' errors, (..., nx, nx), beside z, (..., size), at ages in samples."""
         nz = len(self._artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
         if not self._batch:  # a single sample: every call of numpy would be felt
-            ages, logs = self._log_roots if any(z[nz:].tolist()) else self._free_log_roots
-            log = logs[-1] if age >= ages[-1] else np.interp(age, ages, logs)
-            return self._P[0] * (self._units * math.exp(2 * log))
-        acted = z[..., nz:].any(-1)
-        logs = np.where(acted, np.interp(age, *self._log_roots), np.interp(age, *self._free_log_roots))
-        factors = np.exp(2 * logs)
+            calibrated = self._calibrated if any(z[nz:].tolist()) else self._free_calibrated
+            if age >= calibrated.ages[-1] and age >= self._window:
+                return np.asarray(self._P[0] * calibrated.settled)
+            log, doubt = (np.interp(age, calibrated.ages, each) for each in (calibrated.logs, calibrated.doubts))
+            P = self._P[0] * self._units
+            if doubt:
+                P += doubt * (self._in_doubt(z[None], P[None], np.array([age]))[0] - P)
+            return P * math.exp(2 * log)
+        acted, age = z[..., nz:].any(-1).ravel(), np.broadcast_to(age, self._batch).ravel()
+        logs, doubts = (
+            np.where(
+                acted, *(np.interp(age, of.ages, getattr(of, name)) for of in (self._calibrated, self._free_calibrated))
+            )
+            for name in ("logs", "doubts")
+        )
         P = self._P * self._units
-        return P.reshape(*self._batch, *P.shape[1:]) * factors[..., None, None]
+        if doubts.any():
+            P += doubts[:, None, None] * (self._in_doubt(z.reshape(-1, z.shape[-1]), P, age) - P)
+        P *= np.exp(2 * logs)[:, None, None]
+        return P.reshape(*self._batch, *P.shape[1:])
+
+    def _in_doubt(self, z: np.ndarray, P: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """What else may be said of the errors at z, (n, size), beside covariances (n, nx, nx), at ages in samples."""
+        other = P * np.eye(self._flow.nx)
+        soon = (age < self._window) & ~self._known
+        if soon.any():
+            x, covariance = self._said(z[soon], age[soon])
+            apart = x - (self._flow.x_offset + self._flow.x_scale * self._x[soon])
+            other[soon] = covariance + apart[:, :, None] * apart[:, None, :]
+        return other
 
     def reset(self, z: np.ndarray, age: np.ndarray | float, x0: np.ndarray | None = None) -> None:
         """Begin with what T_inv says of z, (..., size), at ages in samples, or with states that are known."""
@@ -120,6 +166,7 @@ class Tracker:
             self._begin(*self._said(z.reshape(-1, z.shape[-1]), np.broadcast_to(age, self._batch).ravel()))
         else:
             self._begin(*self._said_of_one(z, float(age)))
+        self._known = np.full(len(self._state), x0 is not None)
 
     def restart(self, rows: np.ndarray, z: np.ndarray, age: float, x0: np.ndarray | None = None) -> None:
         """Begin anew in some rows (...,), with what T_inv says of their z, (k, size), or with their known states."""
@@ -129,6 +176,8 @@ class Tracker:
         begun.reset(z, age, x0)
         self._state = self._state.copy()  # others may look at what there was
         self._state[where] = begun._state
+        self._known = self._known.copy()
+        self._known[where] = begun._known
 
     def copied(self) -> "Tracker":
         """Another that stands where this one does, and goes its own way."""
@@ -141,6 +190,7 @@ class Tracker:
         self._batch = other._batch
         self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units)
         self._mean_square[:] = other._mean_square
+        self._known = other._known
 
     def warm_up(self, z: np.ndarray) -> None:
         """Make the machine code for single samples now, by one of z, (size,), that is forgotten."""

@@ -1,12 +1,13 @@
 """Gaussians through functions that are not linear, by sigma points, for a batch of them.
 
-The points are van der Merwe's scaled ones with alpha = 1, beta = 2 and kappa = 3 - nx: the mean, and the mean +-
-sqrt(3) times each column of the covariance's Cholesky factor (Wan and van der Merwe, 2000). They are drawn anew for
-outputs that are not linear.
+The points are the mean +- sqrt(nx + kappa) times each column of the covariance's Cholesky factor, and the mean itself
+where it has a weight (Wan and van der Merwe, 2000, with alpha = 1). They are drawn anew for outputs that are not
+linear.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,7 +17,60 @@ Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx)."""
 
 
-def predicted(x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.ndarray], Q: np.ndarray) -> Gaussian:
+@dataclass(frozen=True)
+class Points:
+    """How sigma points are chosen; by default as in the cubature Kalman filter (Arasaratnam and Haykin, 2009).
+
+    That has no point in the middle, and all weigh the same.
+
+    Parameters
+    ----------
+    kappa : float
+        How much farther out than sqrt(nx) they are, as above. It is also what the mean weighs, in points.
+    beta : float
+        What the mean weighs more in covariances, in multiples of all points together.
+    """
+
+    kappa: float = 0.0
+    beta: float = 0.0
+
+    def weights(self, nx: int) -> tuple[float, float, float]:
+        """What the mean weighs in means and in covariances, and each other point in both."""
+        middle = self.kappa / (nx + self.kappa)
+        return middle, middle + self.beta, 1 / (2 * (nx + self.kappa))
+
+    def of(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
+        """Those of means (n, nx) and covariances (n, nx, nx): (points, n, nx); NaN where these are none."""
+        columns = math.sqrt(x.shape[-1] + self.kappa) * factor(P).transpose(2, 0, 1)
+        return np.concatenate([*([x[None]] if self._middle else []), x + columns, x - columns])
+
+    def moments(self, moved: np.ndarray, nx: int) -> Gaussian:
+        """Mean (n, k) of points (points, n, k), and what these differ from it by."""
+        middle, _, other = self.weights(nx)
+        mean = other * moved[1:].sum(0) + middle * moved[0] if self._middle else other * moved.sum(0)
+        return mean, moved - mean
+
+    def products(self, a: np.ndarray, b: np.ndarray, nx: int) -> np.ndarray:
+        """Sum over points of outer products of (points, n, k) and (points, n, l), as (n, k, l)."""
+        _, middle, other = self.weights(nx)
+        weighted = other * a
+        if self._middle:
+            weighted[0] *= middle / other
+        products: np.ndarray = weighted.transpose(1, 2, 0) @ b.transpose(1, 0, 2)
+        return products
+
+    @property
+    def _middle(self) -> bool:
+        """Whether the mean is one of them."""
+        return bool(self.kappa or self.beta)
+
+
+CUBATURE = Points()
+
+
+def predicted(
+    x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.ndarray], Q: np.ndarray, points: Points = CUBATURE
+) -> Gaussian:
     """Move a batch of Gaussians.
 
     Parameters
@@ -24,21 +78,30 @@ def predicted(x: np.ndarray, P: np.ndarray, *, move: Callable[[np.ndarray], np.n
     x, P : ndarray, shapes (n, nx) and (n, nx, nx)
         Means and covariances.
     move : callable
-        Takes points (2 nx + 1, n, nx) to where they are later.
+        Takes sigma points (points, n, nx) to where they are later.
     Q : ndarray, shape (nx, nx)
         Covariance of what is added on the way.
+    points : Points
+        How they are chosen.
 
     Returns
     -------
     tuple of ndarray
         Means and covariances later; NaN where a covariance was none.
     """
-    mean, spread = _moments(move(sigma_points(x, P)))
-    return mean, _products(spread, spread) + Q
+    nx = x.shape[-1]
+    mean, spread = points.moments(move(points.of(x, P)), nx)
+    return mean, points.products(spread, spread, nx) + Q
 
 
 def corrected(
-    x: np.ndarray, P: np.ndarray, y: np.ndarray, *, output: Callable[[np.ndarray], np.ndarray], R: np.ndarray
+    x: np.ndarray,
+    P: np.ndarray,
+    y: np.ndarray,
+    *,
+    output: Callable[[np.ndarray], np.ndarray],
+    R: np.ndarray,
+    points: Points = CUBATURE,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Condition a batch of Gaussians on samples.
 
@@ -49,9 +112,11 @@ def corrected(
     y : ndarray, shape (n, ny)
         Samples; NaN where they are missing, which corrects nothing.
     output : callable
-        h: points (2 nx + 1, n, nx) to outputs (2 nx + 1, n, ny).
+        h: sigma points (points, n, nx) to outputs (points, n, ny).
     R : ndarray, shape (ny, ny)
         Covariance of the noise on the samples.
+    points : Points
+        How they are chosen.
 
     Returns
     -------
@@ -60,12 +125,12 @@ def corrected(
     nis : ndarray, shape (n,)
         Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
     """
-    expected, S, across = transformed(x, P, function=output)
+    expected, S, across = transformed(x, P, function=output, points=points)
     return conditioned(x, P, y - expected, S + R, across)
 
 
 def transformed(
-    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray]
+    x: np.ndarray, P: np.ndarray, *, function: Callable[[np.ndarray], np.ndarray], points: Points = CUBATURE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a function makes of a batch of Gaussians.
 
@@ -74,16 +139,18 @@ def transformed(
     x, P : ndarray, shapes (n, nx) and (n, nx, nx)
         Means and covariances.
     function : callable
-        Takes points (2 nx + 1, n, nx) to (2 nx + 1, n, k).
+        Takes sigma points (points, n, nx) to (points, n, k).
+    points : Points
+        How they are chosen.
 
     Returns
     -------
     tuple of ndarray, shapes (n, k), (n, k, k) and (n, nx, k)
         Means, covariances, and covariances of the states with them; NaN where a covariance was none.
     """
-    points = sigma_points(x, P)
-    mean, spread = _moments(function(points))
-    return mean, _products(spread, spread), _products(points - x, spread)
+    nx, at = x.shape[-1], points.of(x, P)
+    mean, spread = points.moments(function(at), nx)
+    return mean, points.products(spread, spread, nx), points.products(at - x, spread, nx)
 
 
 def conditioned(
@@ -118,12 +185,6 @@ def conditioned(
     return x + change[..., -1], P - change[..., :-1], nis
 
 
-def sigma_points(x: np.ndarray, P: np.ndarray) -> np.ndarray:
-    """Sigma points (2 nx + 1, n, nx) of means (n, nx) and covariances (n, nx, nx); NaN where these are none."""
-    columns = math.sqrt(3.0) * factor(P).transpose(2, 0, 1)
-    return np.concatenate([x[None], x + columns, x - columns])
-
-
 def factor(P: np.ndarray) -> np.ndarray:
     """Cholesky factors (n, nx, nx) of covariances; NaN where one is not positive definite or not finite."""
     try:
@@ -137,20 +198,4 @@ def factor(P: np.ndarray) -> np.ndarray:
     return found
 
 
-def _moments(points: np.ndarray) -> Gaussian:
-    """Weighted mean (n, k) of transformed points (2 nx + 1, n, k), and what the points differ from it by."""
-    nx = len(points) // 2
-    mean = (3 - nx) / 3 * points[0] + points[1:].sum(0) / 6
-    return mean, points - mean
-
-
-def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Weighted sum over points of outer products of (2 nx + 1, n, k) and (2 nx + 1, n, l), as (n, k, l)."""
-    nx = len(a) // 2
-    weighted = a / 6
-    weighted[0] *= 6 * ((3 - nx) / 3 + 2.0)
-    products: np.ndarray = weighted.transpose(1, 2, 0) @ b.transpose(1, 0, 2)
-    return products
-
-
-__all__ = ["conditioned", "corrected", "factor", "predicted", "sigma_points", "transformed"]
+__all__ = ["CUBATURE", "Points", "conditioned", "corrected", "factor", "predicted", "transformed"]

@@ -250,8 +250,9 @@ class ExtendedKalmanFilter(KalmanFilter):
 class UnscentedKalmanFilter(KalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000), see :mod:`observers.unscented`.
 
-    A filter starts anew if its corrected mean leaves the system's declared bounds, or if its covariance is no longer
-    positive definite. Parameters are those of :class:`KalmanFilter`.
+    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. A filter starts anew if
+    its corrected mean leaves the system's declared bounds, or if its covariance is no longer positive definite.
+    Parameters are those of :class:`KalmanFilter`.
     """
 
     def _predicted(self, u: np.ndarray) -> Gaussian:
@@ -261,7 +262,7 @@ class UnscentedKalmanFilter(KalmanFilter):
             return moved.T.reshape(points.shape)
 
         with np.errstate(over="ignore", invalid="ignore"):
-            return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt)
+            return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt, points=self._points)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
@@ -273,4 +274,8 @@ class UnscentedKalmanFilter(KalmanFilter):
         return x, P, nis
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        return unscented.corrected(x, P, y, output=self._system.output, R=self._R)
+        return unscented.corrected(x, P, y, output=self._system.output, R=self._R, points=self._points)
+
+    @property
+    def _points(self) -> unscented.Points:
+        return unscented.Points(kappa=3.0 - self._system.nx, beta=2.0)

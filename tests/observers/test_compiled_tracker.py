@@ -180,7 +180,7 @@ def test_steps_of_other_sizes(nx, nu, ny):
         y[::3, 0], y[::4] = np.nan, np.nan
         none = np.arange(n) % 10 == 5  # is a covariance there
         P[none] *= -1.0
-        v = np.tile(u / flow.u_scale, (2 * nx + 1, 1))
+        v = np.tile(u / flow.u_scale, (2 * nx, 1))
 
         def move(s):
             return flow.scaled(np.clip(s, low, high).reshape(-1, nx), v).reshape(s.shape)  # noqa: B023

@@ -13,7 +13,7 @@ from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
 from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_error
-from training.maps.regions import LEVELS, Regions, distances_along, level_of
+from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
@@ -132,9 +132,10 @@ def learn_tracking(
     return tracking
 
 
-def _with_tables(factors: Factors, tables: list[np.ndarray]) -> Factors:
-    """Factors with a table for each level of process noise, or the only one."""
-    return dataclasses.replace(factors, factors=np.array(tables) if len(tables) > 1 else tables[0])
+def _with_tables(factors: Factors, tables: list[tuple[np.ndarray, np.ndarray]]) -> Factors:
+    """With factors and doubts for each level of process noise, or the only one."""
+    found, doubts = (np.array(each) if len(tables) > 1 else each[0] for each in zip(*tables, strict=True))
+    return dataclasses.replace(factors, factors=found, doubt=doubts)
 
 
 def _tell(report: Callable[[float], object], begun: int, done: int) -> None:
@@ -192,23 +193,21 @@ def _factors(
     regions: Regions,
     rng: np.random.Generator,
     report: Callable[[int], object],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Factors (levels, knots) from the errors of an observer that tracks, along runs of a level of process noise.
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Factors and doubts (levels, knots) of an observer that tracks, along runs of a level of process noise.
 
     Those of motions on which an input has acted, and of others; the same where the observer knows of no inputs, or
     inputs act on all motions.
     """
     x, u = runs
-    clean, distances = system.output(x), list[np.ndarray]()
+    clean, errors = system.output(x), list[Errors]()
     for done, share in enumerate(LEVELS, 1):
         level = level_of(artifact, share)
         y = clean + np.asarray(level) * rng.standard_normal(clean.shape)
-        distances.append(
-            distances_along(artifact, x, y, u, level=level, process_noise=process_noise, ages=regions.ages)
-        )
+        errors.append(errors_along(artifact, x, y, u, level=level, process_noise=process_noise, ages=regions.ages))
         report(done)
     acted = np.maximum.accumulate((u != 0).any(-1), axis=0)
     driven = np.concatenate([np.zeros_like(acted[:1]), acted])[regions.ages]
     if not artifact.nu or driven[-1].all():  # under a policy no motion stays free, and later ages would have no factors
-        return (regions.factors(distances, np.ones_like(driven), lenient=True),) * 2
-    return regions.factors(distances, driven, lenient=True), regions.factors(distances, ~driven, lenient=True)
+        return (regions.factors_and_doubts(errors, np.ones_like(driven)),) * 2
+    return regions.factors_and_doubts(errors, driven), regions.factors_and_doubts(errors, ~driven)

@@ -81,7 +81,7 @@ static void flow(const double in[{inputs}], double next[{nx}])
     }}
 }}
 
-/* Estimate and covariance a sample later: of the mean, and the mean +- sqrt(3) times each column of P's factor. */
+/* Estimate and covariance a sample later: of the mean +- sqrt(nx) times each column of P's factor. */
 static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P[{nx}][{nx}])
 {{
     double L[{nx}][{nx}], in[{inputs}], points[{count}][{nx}];
@@ -99,23 +99,23 @@ static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P
 {scaled_inputs}    for (size_t p = 0; p < {count}; p++) {{
         for (size_t i = 0; i < {nx}; i++) {{
             double s = observer->x[i];
-            if (p > 0 && i >= (p - 1) / 2)
-                s += (p % 2 ? {far} : -{far}) * L[i][(p - 1) / 2];
+            if (i >= p / 2)
+                s += (p % 2 ? -{far} : {far}) * L[i][p / 2];
             in[i] = within(s, i);
         }}
         flow(in, points[p]);
     }}
     for (size_t i = 0; i < {nx}; i++) {{
-        x[i] = {central_mean} * points[0][i];
-        for (size_t p = 1; p < {count}; p++)
-            x[i] += points[p][i] / 6.0;
+        x[i] = 0.0;
+        for (size_t p = 0; p < {count}; p++)
+            x[i] += points[p][i] / {count}.0;
         for (size_t p = 0; p < {count}; p++)
             points[p][i] -= x[i];
         for (size_t j = 0; j <= i; j++) {{
             double sum = 0.0;
-            for (size_t p = 1; p < {count}; p++)
+            for (size_t p = 0; p < {count}; p++)
                 sum += points[p][i] * points[p][j];
-            P[i][j] = P[j][i] = sum / 6.0 + {central} * points[0][i] * points[0][j];
+            P[i][j] = P[j][i] = sum / {count}.0;
         }}
         P[i][i] += Q[i];
     }}

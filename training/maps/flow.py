@@ -31,7 +31,7 @@ DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
 # deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
 # then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
-NARROW, WIDE = 16, 32  # neurons in each hidden layer
+NARROW, WIDE = 8, 32  # neurons in each hidden layer
 MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative

@@ -1,6 +1,8 @@
 """Factors by which regions of 90 % hold 90 % of an observer's errors, at each age and level of noise."""
 
-from collections.abc import Sequence
+import copy
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +16,26 @@ LEVELS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 FIRST = (0, 1, 3, 8)  # ages in samples at which factors are found
 AGES = (0.15, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)  # the same in seconds, at the pace of the shipped systems
 LENIENT = 0.92  # share that regions of 90 % may hold, where fewer would leave the mean NEES above what it should be
+DOUBTS = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)  # of covariances, which are tried
 FEWEST = 50  # errors from which a quantile is taken
 PER_AGE = 6  # samples of each run about each age: at a single one all motions may be in the same phase
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of an observer that tracks, and what it says of them.
+
+    Parameters
+    ----------
+    error : ndarray, shape (ages, n, nx)
+        States less estimates.
+    covariance, in_doubt : ndarray, shape (ages, n, nx, nx)
+        Its covariances with a doubt of 0 and of 1, as :class:`observers.tracker.Tracker` has it.
+    """
+
+    error: np.ndarray
+    covariance: np.ndarray
+    in_doubt: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -55,7 +75,7 @@ class Regions:
         """Shape of a table of factors."""
         return len(LEVELS), len(self.knots)
 
-    def factors(self, distances: list[np.ndarray], group: np.ndarray, *, lenient: bool = False) -> np.ndarray:
+    def factors(self, distances: list[np.ndarray], group: np.ndarray) -> np.ndarray:
         """Find factors from errors.
 
         Parameters
@@ -64,9 +84,6 @@ class Regions:
             Squared distances of errors in units of their covariance, for each of ``LEVELS``, at :attr:`ages`.
         group : ndarray of bool, shape (ages, n)
             Which of them count.
-        lenient : bool
-            Whether regions of 90 % may hold up to 92 %, as far as that brings the mean squared distance to nx: for
-            errors whose tails are longer than those of a normal distribution.
 
         Returns
         -------
@@ -78,21 +95,66 @@ class Regions:
         ValueError
             If hardly any count.
         """
-        rows, inside = [np.isin(self.ages, window) for window in self._windows()], chi_square(COVERAGE, self.nx)
-        factors = np.empty(self.tables)
-        for i, distance in enumerate(distances):
-            for j, row in enumerate(rows):
-                found = distance[row][group[row]]
-                if len(found) < FEWEST:  # as of driven motions at the first sample: those of the next age count
-                    factors[i, j] = np.nan
-                    continue
-                edge, most = np.quantile(found, (COVERAGE, LENIENT), method="weibull")
-                factors[i, j] = np.clip(inside * found.mean() / self.nx, edge, most) if lenient else edge
-            known = np.isfinite(factors[i])
-            if not known.any():
-                raise ValueError("hardly any motion is of the kind that error bars are for; simulate more trajectories")
-            factors[i] = np.interp(np.arange(len(rows)), np.flatnonzero(known), factors[i, known])
-        return np.clip(factors / inside, 1e-6, 1e6)
+        return self._table(group, lambda i, cell: [self._factor(distances[i][cell])])[..., 0]
+
+    def factors_and_doubts(self, errors: list["Errors"], group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Find how far covariances are to be doubted, by Gaussian likelihood, and factors.
+
+        These are lenient: regions of 90 % may hold up to 92 %, as far as that brings the mean squared distance to nx.
+        A tracker's errors have longer tails than a normal distribution's.
+
+        Parameters
+        ----------
+        errors : list of Errors
+            For each of ``LEVELS``, at :attr:`ages`.
+        group : ndarray of bool, shape (ages, n)
+            Which of them count.
+
+        Returns
+        -------
+        factors, doubts : ndarray, shape (levels, knots)
+            Of both.
+
+        Raises
+        ------
+        ValueError
+            If hardly any count.
+        """
+        found = self._table(group, lambda i, cell: self._likeliest(errors[i], cell))
+        return found[..., 0], found[..., 1]
+
+    def _table(self, group: np.ndarray, found: Callable[[int, np.ndarray], Sequence[float]]) -> np.ndarray:
+        """What is found of the errors about each knot at each level, (levels, knots, ...).
+
+        As of driven motions at the first sample there may be too few: those of the next age count.
+        """
+        cells = [group & np.isin(self.ages, window)[:, None] for window in self._windows()]
+        enough = np.flatnonzero([cell.sum() >= FEWEST for cell in cells])
+        if not len(enough):
+            raise ValueError("hardly any motion is of the kind that error bars are for; simulate more trajectories")
+        tables = []
+        for level in range(len(LEVELS)):
+            columns = np.array([found(level, cells[knot]) for knot in enough]).T
+            tables.append([np.interp(np.arange(len(cells)), enough, column) for column in columns])
+        return np.moveaxis(np.array(tables), 1, -1)
+
+    def _factor(self, distances: np.ndarray, *, lenient: bool = False) -> float:
+        edge, most = np.quantile(distances, (COVERAGE, LENIENT), method="weibull")
+        inside = chi_square(COVERAGE, self.nx)
+        factor = np.clip(inside * distances.mean() / self.nx, edge, most) if lenient else edge
+        return float(np.clip(factor / inside, 1e-6, 1e6))
+
+    def _likeliest(self, errors: "Errors", cell: np.ndarray) -> tuple[float, float]:
+        """The factor and the doubt with which errors of a cell are likeliest."""
+        error, P, other = errors.error[cell], errors.covariance[cell], errors.in_doubt[cell]
+        tried = []
+        for doubt in DOUBTS:
+            mixed = P + doubt * (other - P)
+            distances = squared_distance(error, mixed)
+            factor = self._factor(distances, lenient=True)
+            surprise = distances.mean() / factor + np.linalg.slogdet(mixed)[1].mean() + self.nx * np.log(factor)
+            tried.append((surprise, factor, doubt))
+        return min(tried)[1:]
 
     def _windows(self) -> list[np.ndarray]:
         """Ages in samples that stand for each of the knots: those about it, and all behind the last."""
@@ -142,14 +204,61 @@ def distances_along(
         Squared distances of the errors in units of the covariance.
     """
     observer = KKLObserver(artifact, level, process_noise=process_noise)
-    observer.reset(y[0])
+    return np.array(
+        [squared_distance(x[k] - observer.decode(), observer.covariance) for k in _at(observer, y, u, ages)]
+    )
+
+
+def errors_along(
+    artifact: Artifact,
+    x: np.ndarray,
+    y: np.ndarray,
+    u: np.ndarray,
+    *,
+    level: float | tuple[float, ...],
+    process_noise: float | None = None,
+    ages: np.ndarray,
+) -> Errors:
+    """Run an observer that tracks, with factors of 1, from its reset on.
+
+    Parameters
+    ----------
+    artifact, x, y, u, level, process_noise, ages
+        As for :func:`distances_along`.
+
+    Returns
+    -------
+    Errors
+        At these ages.
+    """
+    observer, doubting = KKLObserver(artifact, level, process_noise=process_noise), _in_doubt(artifact)
     found = []
+    for k in _at(observer, y, u, ages):
+        other = copy.copy(observer)
+        other.replace(doubting)
+        found.append((x[k] - observer.decode(), observer.covariance, other.covariance))
+    return Errors(*map(np.array, zip(*found, strict=True)))
+
+
+def _in_doubt(artifact: Artifact) -> Artifact:
+    """The same with a doubt of 1 everywhere."""
+    flow = artifact.require_flow()
+    return dataclasses.replace(
+        artifact,
+        flow=dataclasses.replace(
+            flow, factors=dataclasses.replace(flow.factors, doubt=np.ones_like(flow.factors.factors)), free_factors=None
+        ),
+    )
+
+
+def _at(observer: KKLObserver, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -> Iterator[int]:
+    """Run an observer, and stop at some ages, whose samples are yielded."""
+    observer.reset(y[0])
     for k in range(int(ages[-1]) + 1):
         if k:
-            observer.advance(y[k], u[k - 1] if artifact.nu else None)
+            observer.advance(y[k], u[k - 1] if observer.artifact.nu else None)
         if k in ages:
-            found.append(squared_distance(x[k] - observer.decode(), observer.covariance))
-    return np.array(found)
+            yield k
 
 
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:

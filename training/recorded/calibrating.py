@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from observers import Artifact
-from training.maps.regions import FEWEST, LEVELS, Regions, distances_along, level_of
+from training.maps.regions import FEWEST, LEVELS, Regions, distances_along, errors_along, level_of
 from training.recorded.config import config_of
 from training.recorded.preparing import check_plant, file_of, fingerprints, split
 from training.recorded.windows import samples_as_old
@@ -72,6 +73,9 @@ def _as_trained(artifact: Artifact, records: Sequence[Record]) -> list[Record]:
             )
     order = list(there)
     return sorted(records, key=lambda record: order.index(file_of(record)))
+
+
+Found = TypeVar("Found")
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,6 @@ def factors_along(
     regions: Regions,
     *,
     rng: np.random.Generator,
-    lenient: bool = False,
     report: Callable[[float], object] | None = None,
 ) -> np.ndarray:
     """Find factors for an observer's covariances.
@@ -189,8 +192,6 @@ def factors_along(
         Where they are looked at.
     rng : numpy.random.Generator
         Of the noise that is added to the samples.
-    lenient : bool
-        As :meth:`training.maps.regions.Regions.factors` takes it.
     report : callable, optional
         Told which share is done.
 
@@ -204,14 +205,67 @@ def factors_along(
     ValueError
         If there are too few errors.
     """
-    distances = list[np.ndarray]()
+    return regions.factors(_along(distances_along, artifact, runs, regions, rng, report), _known(runs, regions))
+
+
+def factors_and_doubts_along(
+    artifact: Artifact,
+    runs: Stretches,
+    regions: Regions,
+    *,
+    rng: np.random.Generator,
+    report: Callable[[float], object] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find factors and doubts for the covariances of an observer that tracks.
+
+    Parameters
+    ----------
+    artifact, runs, regions, rng, report
+        As for :func:`factors_along`.
+
+    Returns
+    -------
+    factors, doubts : ndarray, shape (levels, knots)
+        Of both.
+
+    Raises
+    ------
+    ValueError
+        As there.
+    """
+    return regions.factors_and_doubts(_along(errors_along, artifact, runs, regions, rng, report), _known(runs, regions))
+
+
+def _along(
+    look: Callable[..., Found],
+    artifact: Artifact,
+    runs: Stretches,
+    regions: Regions,
+    rng: np.random.Generator,
+    report: Callable[[float], object] | None,
+) -> list[Found]:
+    """What a function finds of an observer along runs at each level of noise."""
+    found = []
     for done, share in enumerate(LEVELS, 1):
         level = level_of(artifact, share)
         y = runs.y + np.asarray(level) * rng.standard_normal(runs.y.shape)
-        distances.append(distances_along(artifact, runs.x, y, runs.u, level=level, ages=regions.ages))
+        found.append(look(artifact, runs.x, y, runs.u, level=level, ages=regions.ages))
         if report is not None:
             report(done / len(LEVELS))
-    return regions.factors(distances, np.isfinite(runs.x[regions.ages]).all(-1), lenient=lenient)
+    return found
 
 
-__all__ = ["Stretches", "factors_along", "parted", "regions_of", "require_enough", "stretches"]
+def _known(runs: Stretches, regions: Regions) -> np.ndarray:
+    """Where states are known, (ages, n)."""
+    return np.asarray(np.isfinite(runs.x[regions.ages]).all(-1))
+
+
+__all__ = [
+    "Stretches",
+    "factors_along",
+    "factors_and_doubts_along",
+    "parted",
+    "regions_of",
+    "require_enough",
+    "stretches",
+]

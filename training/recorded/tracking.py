@@ -12,7 +12,7 @@ from observers.checks import integer
 from training.maps.flow import OF_MEDIAN, PAIRS, Increments, fit_flow, usual_error
 from training.maps.regions import LEVELS
 from training.progress import ProgressBars, progress_bars
-from training.recorded.calibrating import factors_along, parted, regions_of, stretches
+from training.recorded.calibrating import factors_and_doubts_along, parted, regions_of, stretches
 from training.recorded.config import RecordedConfig, config_of, signal_rate
 from training.records import Record, pieces
 from training.seeds import Stream, generator
@@ -118,10 +118,9 @@ def learn_recorded_tracking(
         flow = dataclasses.replace(flow, error=np.maximum(usual_error(flow, judged), least), factors=ones)
         tracking = dataclasses.replace(artifact, C=C, flow=flow)
         with progress.phase("calibrating the error bars") as report:
-            factors = factors_along(tracking, runs, regions, rng=rng, lenient=True, report=report)
-    return dataclasses.replace(
-        tracking, flow=dataclasses.replace(flow, factors=dataclasses.replace(ones, factors=factors))
-    )
+            factors, doubt = factors_and_doubts_along(tracking, runs, regions, rng=rng, report=report)
+    found = dataclasses.replace(ones, factors=factors, doubt=doubt)
+    return dataclasses.replace(tracking, flow=dataclasses.replace(flow, factors=found))
 
 
 def increments_of(artifact: Artifact, records: Sequence[Record], rng: np.random.Generator) -> Increments:
