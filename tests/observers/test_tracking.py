@@ -241,6 +241,64 @@ def test_factors_make_covariances_larger():
     np.testing.assert_array_equal(wide.decode(), plain.decode())
 
 
+def doubting(doubt, factor=1.0):
+    """Factors with a doubt, at all levels and ages."""
+    return Factors(np.zeros(1), np.zeros(1), np.full((1, 1), factor), np.full((1, 1), doubt))
+
+
+def test_a_covariance_in_doubt_says_less_of_what_goes_together():
+    (plain, *_), (doubts, *_) = settled(), settled(factors=doubting(0.2, 3.0))
+    apart = 1.0 - 0.2 * (1.0 - np.eye(2))
+    np.testing.assert_allclose(doubts.covariance, 3.0 * apart * plain.covariance, rtol=1e-9)
+    np.testing.assert_array_equal(doubts.decode(), plain.decode())
+
+
+@pytest.mark.parametrize("doubt", [0.1, 1.0])
+def test_soon_after_a_start_t_inv_is_asked_what_errors_there_may_be(doubt):
+    (_, y), artifact = runs(), tracking_observer(factors=doubting(doubt))
+    batch, sure, plain = (KKLObserver(each, LEVEL) for each in (artifact, tracking_observer(), plain_observer()))
+    single, window = KKLObserver(artifact, LEVEL), round(artifact.flow.window / DT)
+    for k in range(window + 5):
+        for observer in (batch, sure, plain):
+            observer.step(y[k]) if k else observer.reset(y[k])
+        single.step(y[k, 1]) if k else single.reset(y[k, 1])
+        apart = plain.decode() - sure.decode()
+        said = plain.covariance + apart[:, :, None] * apart[:, None, :]
+        other = said if k < window else sure.covariance * np.eye(2)
+        np.testing.assert_allclose(batch.covariance, (1 - doubt) * sure.covariance + doubt * other, rtol=1e-9)
+        np.testing.assert_allclose(single.covariance, batch.covariance[1], rtol=1e-9)
+        np.testing.assert_array_equal(batch.decode_covariance(np.array([True, False, True])), batch.covariance[::2])
+    batch.restart(y[k][:1], [False, True, False])
+    np.testing.assert_allclose(batch.std[1], [STD, STD])
+    np.testing.assert_allclose(batch.covariance[::2], sure.covariance[::2] * (1 - doubt * (1 - np.eye(2))), rtol=1e-9)
+
+
+@pytest.mark.parametrize("t_is_there", [True, False])
+def test_nobody_asks_t_inv_of_a_start_that_is_known(t_is_there):
+    artifact = tracking_observer(factors=doubting(0.3))
+    artifact = artifact if t_is_there else dataclasses.replace(artifact, forward=None)
+    observer, (x, y) = KKLObserver(artifact, LEVEL), runs()
+    observer.reset(y[0], x[0])
+    assert (observer.std < 0.01).all()
+    observer.step(y[1])
+    copied = copy.copy(observer)
+    assert (copied.std < 0.1).all()
+    observer.restart(y[1][:1], [True, False, False])
+    assert (observer.std[0] > 0.2).all()
+    assert (observer.std[1:] < 0.1).all()
+    observer.restart(y[1][:1], [True, False, False], x[1][:1])
+    assert (observer.std < 0.1).all()
+    observer.reset(y[0])
+    assert (observer.std > 0.2).all()
+
+
+def test_doubts_make_sense():
+    ages, ones = np.zeros(1), np.ones((1, 1))
+    for doubt in (-ones, 1.1 * ones, np.nan * ones, np.ones(1), np.ones((2, 1, 1))):
+        with pytest.raises(ValueError, match="doubt"):
+            Factors(ages, ages, ones, doubt)
+
+
 def test_factors_of_free_motion_hold_until_an_input_acts():
     one, four = (Factors(np.zeros(1), np.zeros(1), np.full((1, 1), value)) for value in (1.0, 4.0))
     artifact = tracking_observer(factors=one)
@@ -294,13 +352,16 @@ def test_bad_samples_change_nothing():
 
 
 def test_files_hold_it(tmp_path):
-    path, artifact = tmp_path / "map.safetensors", tracking_observer()
+    path, artifact = tmp_path / "map.safetensors", tracking_observer(factors=doubting(0.25))
     artifact.save(path)
     with safe_open(path, "np") as file:
         assert json.loads(file.metadata()["kkl-gym"])["format"] == 6
     _, y = runs(steps=30)
     again = KKLObserver(Artifact.read(path), LEVEL).estimate(y)
     np.testing.assert_allclose(again, KKLObserver(artifact, LEVEL).estimate(y), rtol=1e-6)
+    np.testing.assert_array_equal(Artifact.read(path).flow.factors.doubt, [[0.25]])
+    tracking_observer().save(path)
+    assert Artifact.read(path).flow.factors.doubt is None
     plain_observer().save(path)
     assert Artifact.read(path).flow is None
 

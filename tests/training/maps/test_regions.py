@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from training.maps import regions
-from training.maps.regions import Regions
+from training.maps.regions import Errors, Regions, squared_distance
 
 
 @pytest.fixture
@@ -14,8 +14,23 @@ def one_level(monkeypatch):
     return Regions(np.array([0, 5]), 20, 2)
 
 
-def found(where, distance, **options):
-    return where.factors([distance], np.ones(distance.shape, dtype=bool), **options)
+def found(where, distance):
+    return where.factors([distance], np.ones(distance.shape, dtype=bool))
+
+
+def doubted(where, errors):
+    return where.factors_and_doubts([errors], np.ones(errors.error.shape[:2], dtype=bool))
+
+
+def gaussian(where, scale=1.0, outliers=0.0, thin=1.0):
+    """Errors whose covariance is said too small by a factor, some of them far off; all, along a diagonal and across."""
+    rng = np.random.default_rng(0)
+    shape = (len(where.ages), 20_000)
+    root = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2) * np.sqrt([1.0, thin])
+    error = np.sqrt(scale) * rng.standard_normal((*shape, 2)) @ root.T
+    error[rng.random(shape) < outliers] *= np.sqrt(50.0)
+    P = np.broadcast_to(root @ root.T, (*shape, 2, 2))
+    return Errors(error, P, P * np.eye(2))
 
 
 def drawn(where, scale=1.0, outliers=0.0):
@@ -26,25 +41,63 @@ def drawn(where, scale=1.0, outliers=0.0):
 
 
 def test_gaussian_errors_say_what_covariances_lack(one_level):
-    for options in ({}, {"lenient": True}):
-        np.testing.assert_allclose(found(one_level, drawn(one_level, 3.0), **options), 3.0, rtol=0.02)
+    np.testing.assert_allclose(found(one_level, drawn(one_level, 3.0)), 3.0, rtol=0.02)
+    factors, doubts = doubted(one_level, gaussian(one_level, 3.0))
+    np.testing.assert_allclose(factors, 3.0, rtol=0.02)
+    assert not doubts.any()
 
 
 def test_long_tails_may_widen_regions_to_92_percent(one_level):
-    distance = drawn(one_level, outliers=0.02)
-    strict, lenient = found(one_level, distance), found(one_level, distance, lenient=True)
+    errors = gaussian(one_level, outliers=0.02)
+    distance = squared_distance(errors.error, errors.covariance)
+    strict, lenient = found(one_level, distance), doubted(one_level, errors)[0]
     edge = chi2.ppf(0.9, one_level.nx)
     assert np.mean(distance / strict[0, -1] < edge) == pytest.approx(0.9, abs=0.005)
     assert np.mean(distance / lenient[0, -1] < edge) == pytest.approx(0.92, abs=0.005)
 
 
 def test_leniency_goes_no_farther_than_the_mean_asks(one_level):
-    distance = drawn(one_level, outliers=0.002)
-    lenient = found(one_level, distance, lenient=True)
+    errors = gaussian(one_level, outliers=0.002)
+    distance = squared_distance(errors.error, errors.covariance)
+    lenient, _ = doubted(one_level, errors)
     assert (found(one_level, distance) < lenient).all()
     assert np.mean(distance) / lenient[0, -1] == pytest.approx(one_level.nx, rel=0.03)
 
 
 def test_short_tails_leave_the_factor(one_level):
-    distance = np.minimum(drawn(one_level), chi2.ppf(0.95, one_level.nx))
-    np.testing.assert_array_equal(found(one_level, distance, lenient=True), found(one_level, distance))
+    errors = gaussian(one_level)
+    distance = squared_distance(errors.error, errors.covariance)
+    errors.error[distance > chi2.ppf(0.95, one_level.nx)] = 0.0
+    distance = squared_distance(errors.error, errors.covariance)
+    np.testing.assert_array_equal(doubted(one_level, errors)[0], found(one_level, distance))
+
+
+def test_what_goes_together_less_than_is_said_is_doubted(one_level):
+    """A covariance that is thin, of errors that are not: now and then they are far off across it."""
+    errors = gaussian(one_level, thin=1e-4)
+    rng = np.random.default_rng(1)
+    apart = rng.random(errors.error.shape[:2]) < 0.03
+    errors.error[apart] = rng.standard_normal((apart.sum(), one_level.nx))
+    factors, doubts = doubted(one_level, errors)
+    assert (doubts > 0).all()
+    certain = found(one_level, squared_distance(errors.error, errors.covariance))
+    mixed = errors.covariance + doubts[0, -1] * (errors.in_doubt - errors.covariance)
+    before, after = (
+        np.mean(squared_distance(errors.error, covariance)) / factor
+        for covariance, factor in ((errors.covariance, certain[0, -1]), (mixed, factors[0, -1]))
+    )
+    assert before > 10 * one_level.nx
+    assert after < 3 * one_level.nx
+    assert np.mean(squared_distance(errors.error, mixed) / factors[0, -1] < chi2.ppf(0.9, 2)) == pytest.approx(
+        0.91, abs=0.015
+    )
+
+
+def test_errors_of_too_few_motions_are_those_of_neighbours(one_level):
+    errors = gaussian(one_level, 3.0)
+    group = np.ones(errors.error.shape[:2], dtype=bool)
+    group[one_level.ages < 3] = False  # those about the first knot
+    factors, _ = one_level.factors_and_doubts([errors], group)
+    np.testing.assert_array_equal(factors[0, 0], factors[0, 1])
+    with pytest.raises(ValueError, match="hardly any motion"):
+        one_level.factors_and_doubts([errors], np.zeros_like(group))
