@@ -4,7 +4,7 @@ VERSION := $(filter-out 3,$(patsubst python%,%,$(notdir $(PYTHON))))
 VENV := .venv$(if $(VERSION),-$(VERSION))
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
-CLOSED := reverse_duffing van_der_pol
+STATIC := $(SYSTEMS:%=%-static)
 
 .PHONY: demo install test test-coverage test-slow test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
@@ -41,7 +41,8 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Into runs/; those with error bars, which ship, into runs/errorbars, and those that track into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
+# NAME, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
 maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \
@@ -49,30 +50,25 @@ maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; 
 		$(BIN)/kkl-gym tracking runs/errorbars/$$system.safetensors || exit 1; \
 		$(BIN)/kkl-gym train $$system --size small --resume || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
-	for system in $(CLOSED); do \
-		$(BIN)/kkl-gym train $$system --closed-loop --threads 2 --resume || exit 1; \
-		$(BIN)/kkl-gym errorbars runs/$$system-closed-loop/$$system-closed-loop.safetensors --policy controller \
-			|| exit 1; done
 
 results: $(VENV)/ready  ## the accuracy in the README and in docs/
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) $(SYSTEMS:%=%-spinn) $(CLOSED:%=%-closed-loop) \
-		--csv docs/results/accuracy.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system $$system-spinn --noise 0.05 0.1 0.2 1 \
+	$(BIN)/kkl-gym evaluate $(STATIC) $(SYSTEMS:%=%-spinn) --csv docs/results/accuracy.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-static $$system-spinn --noise 0.05 0.1 0.2 1 \
 		--csv docs/results/noise_levels/$$system.csv || exit 1; done
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system --calibration --ekf \
-		--csv runs/error_bars/$$system.csv || exit 1; done
+	for map in $(STATIC); do $(BIN)/kkl-gym evaluate $$map --calibration --ekf \
+		--csv runs/error_bars/$$map.csv || exit 1; done
 	mkdir -p docs/results/error_bars
-	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/error_bars
+	cp $(STATIC:%=runs/error_bars/%.csv) docs/results/error_bars
 	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
 	mkdir -p docs/results/tracking
-	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
-	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
-	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-tracking) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system-tracking --calibration \
-		--csv runs/error_bars/$$system-tracking.csv || exit 1; done
-	for system in $(SYSTEMS); do cp runs/error_bars/$$system-tracking.csv docs/results/tracking/ || exit 1; done
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
-	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/plant-error.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
+	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
+	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system --calibration \
+		--csv runs/error_bars/$$system.csv || exit 1; done
+	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/tracking
+	$(BIN)/kkl-gym evaluate $(STATIC) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
+	$(BIN)/kkl-gym evaluate $(STATIC) --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures
 
 figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes
@@ -94,7 +90,7 @@ ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumabl
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
 	$(MAKE) figures
 
-CERTIFIED := $(SYSTEMS) $(SYSTEMS:%=%-spinn)
+CERTIFIED := $(STATIC) $(SYSTEMS:%=%-spinn)
 
 certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 	$(BIN)/kkl-gym certify $(CERTIFIED)
@@ -107,11 +103,9 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
 	$(BIN)/kkl-gym agent compare
-	$(BIN)/kkl-gym agent compare --systems $(CLOSED) --information x_hat_std --no-more-noise
-	$(BIN)/kkl-gym agent compare --information state x_hat --observers $(SYSTEMS:%=%-tracking) --out runs/agents/tracking
+	$(BIN)/kkl-gym agent compare --systems reverse_duffing van_der_pol --information x_hat_std --no-more-noise
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
-	cp runs/agents/tracking/results.csv docs/results/agents/tracking.csv
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
 		training/agents/shipped/$$system.safetensors || exit 1; done
 	cp runs/agents/comparison/jobs/van_der_pol-0.5/y/0/agent.safetensors training/agents/shipped/van_der_pol-y.safetensors

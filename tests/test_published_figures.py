@@ -19,7 +19,7 @@ def text(value):
 def test_the_readmes_table_is_the_benchmarks():
     found = pd.read_csv(RESULTS / "benchmark" / "results.csv")
     medians = found[found.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
-    ours = "shipped", "shipped-tracking", "ekf"
+    ours = "shipped-static", "shipped", "ekf"
     columns = [(0.0, ours), (0.5, ours), (0.5, ("default-wrong", "ekf-wrong"))]
     readme = (ROOT / "README.md").read_text()
     for system, label in zip(SYSTEMS, LABELS, strict=True):

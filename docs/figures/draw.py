@@ -138,7 +138,8 @@ def draw_bands(path: Path, *, episode: demo.Episode, width: np.ndarray) -> None:
 
 def noise_levels() -> Draw:
     """Errors by level of noise, of the maps that ship and of some of the benchmark's observers."""
-    files = [RESULTS / "accuracy.csv", *(RESULTS / "noise_levels" / f"{name}.csv" for name in SYSTEMS)]
+    files = [RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"]
+    files += [RESULTS / "noise_levels" / f"{name}.csv" for name in SYSTEMS]
     ours = pd.concat(map(pd.read_csv, files))
     rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
     return partial(draw_noise_levels, ours=ours, rivals=rivals)
@@ -151,18 +152,22 @@ def draw_noise_levels(path: Path, *, ours: pd.DataFrame, rivals: pd.DataFrame) -
     with drawing(path, 10, 3.2) as figure:
         axes = figure.subplots(1, len(SYSTEMS), sharey=True)
         for ax, name in zip(axes, SYSTEMS, strict=True):
-            for observer, color, label in ((name, ESTIMATE, "kkl-gym default"), (f"{name}-spinn", TARGET, "SPINN")):
-                ax.plot(medians[observer], "o-", color=color, label=label)
+            for observer, line, color, label in (
+                (name, "o-", ESTIMATE, "kkl-gym default"),
+                (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
+                (f"{name}-spinn", "o-", TARGET, "SPINN"),
+            ):
+                ax.plot(medians[observer], line, color=color, label=label)
             for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
                 if (name, method) in others.index:
                     ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
-            levels = medians[name].index
+            levels = medians[f"{name}-static"].index
             ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
             ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
             ax.minorticks_off()
             ax.set(yscale="log", title=name.replace("_", " "), xlabel="noise on each sample of y")
         axes[0].set_ylabel("median SMAPE in %")
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2 + len(RIVALS))
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3 + len(RIVALS))
 
 
 def errors_over_time(trajectories: int = 100, duration: float | None = None) -> Draw:
@@ -214,7 +219,7 @@ def tracking(trajectories: int = 100, duration: float | None = None) -> Draw:
         system, dt = kind(), Artifact.read(resolve(name)).filter.dt
         runs = unseen_trajectories(system, dt, n=trajectories, duration=duration or system.duration, seed=0)
         how = {"measurement_noise": LEVELS[-1], "seed": 0}
-        x_hats = [estimates_of(Artifact.read(resolve(one)), system, runs, **how) for one in (name, f"{name}-tracking")]
+        x_hats = [estimates_of(Artifact.read(resolve(one)), system, runs, **how) for one in (f"{name}-static", name)]
         x_hats.append(kalman_estimates(system, runs, dt, **how))
         found[name] = [np.median(percentage_error(runs.x, x_hat), axis=1) for x_hat in x_hats]
     return partial(draw_tracking, found=found, dt=dt)
@@ -260,7 +265,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
         lambda path: sizes.draw(path, *map(pd.read_csv, (RESULTS / "sizes").glob("*.csv")))
     ),
     "results/error_bars/van_der_pol.png": lambda: partial(
-        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol.csv")
+        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-static.csv")
     ),
 }
 

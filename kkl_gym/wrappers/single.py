@@ -82,8 +82,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Whether to keep the score, see :attr:`observers.KKLObserver.score`.
     known_start : bool
         Whether the observer is told the true state ``info["x"]`` at reset, and only there. It then has no transient.
-        Maps with a forward map T can use it, ``observer="SYSTEM-spinn"``, and those that track, ``"SYSTEM-tracking"``
-        or one from rollouts that was taught to.
+        Maps that track can use it, as the default ones, and those with a forward map T, ``observer="SYSTEM-spinn"``.
     uncertainty : bool
         Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
         ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with error bars, which

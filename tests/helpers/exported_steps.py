@@ -7,11 +7,14 @@ import pytest
 
 import kkl_gym
 from kkl_gym.simulate import simulate
-from observers import MLP, KKLObserver, shipped
+from observers import MLP, Artifact, KKLObserver, shipped
 from observers.decoder import Decoder
+from observers.names import resolve
 from training.export import Exported
 
-UNTRACKED = sorted(name for name in set(shipped().values()) if "-tracking" not in name)  # what all formats take
+UNTRACKED = sorted(
+    name for name in set(shipped().values()) if Artifact.read(resolve(name)).flow is None
+)  # what all formats take
 _ACTIVE = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}
 
 

@@ -454,7 +454,7 @@ def test_a_copy_made_before_reset_goes_its_own_way():
 
 
 def test_a_copy_has_a_monitor_of_its_own():
-    observer = load("van_der_pol-tracking", monitor=True)
+    observer = load("van_der_pol", monitor=True)
     observer.reset(np.array([1.0]))
     for _ in range(300):
         observer.step(np.array([1.0]))

@@ -26,7 +26,7 @@ from training.progress import ProgressBars, progress_bars
 
 REFERENCE = "Pendulum-v1"
 VECTOR_REFERENCE = "CartPole-v1"
-OTHERS = (SMALL, "tracking")  # kinds of maps that ship beside the default ones
+OTHERS = (SMALL, "static")  # kinds of maps that ship beside the default ones
 
 
 @dataclass(frozen=True)

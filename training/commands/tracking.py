@@ -31,7 +31,7 @@ class Tracking(Teaching):
     trajectories: int = 1600
     """Number of motions on which covariances are calibrated."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
-    """The file to write; by default one of the map's own name in runs/tracking, with -tracking behind it."""
+    """The file to write; by default one of the map's own name in runs/tracking."""
 
     def run(self, console: Console) -> Artifact:
         """Learn and write.
@@ -55,7 +55,7 @@ class Tracking(Teaching):
         from training.recorded.tracking import learn_recorded_tracking
 
         name = re.sub(r"-v\d+$", "", resolve(self.observer).stem)
-        out = Path(f"runs/tracking/{name}-tracking.safetensors") if self.out is None else self.out
+        out = Path(f"runs/tracking/{name}.safetensors") if self.out is None else self.out
         return self.taught(
             out,
             console,

@@ -115,7 +115,7 @@ class Exported:
         if self.artifact.flow is not None:
             raise ArtifactError(
                 f"{self.source} tracks, which --format c alone can export. For others export the map that it was made "
-                "from (kkl-gym tracking leaves it as it is), which is T_inv alone"
+                "from, which is T_inv alone: of those that ship NAME-static"
             )
 
     def _check_range(self) -> None:

@@ -27,7 +27,7 @@ from training.methods.dmf import DMF, DMFNoise
 from training.methods.gru import GRU
 from training.methods.kalman import EKF, UKF, Guided, UntunedEKF, WrongEKF
 from training.methods.kalmannet import KalmanNet
-from training.methods.kkl import SPINN, Default, Shipped, ShippedSPINN, ShippedTracking, WrongDefault, WrongSPINN
+from training.methods.kkl import SPINN, Default, Shipped, ShippedSPINN, ShippedStatic, WrongDefault, WrongSPINN
 from training.methods.node import NODE, NODENoise
 from training.methods.rkn import RKN
 
@@ -76,7 +76,7 @@ ABLATION: dict[str, type[Method[Any]]] = {
 }
 
 # Those that need a map that ships for the system, and are in no table unless they are named.
-AS_SHIPPED: dict[str, type[Method[Any]]] = {cls.name: cls for cls in (Shipped, ShippedSPINN, ShippedTracking, Guided)}
+AS_SHIPPED: dict[str, type[Method[Any]]] = {cls.name: cls for cls in (Shipped, ShippedSPINN, ShippedStatic, Guided)}
 
 
 def get_method(name: str) -> Method[Any]:

@@ -133,12 +133,12 @@ class ShippedSPINN(Shipped):
     suffix: ClassVar[str] = "-spinn"
 
 
-class ShippedTracking(Shipped):
-    """The maps that ship and track, likewise: ``kkl-gym benchmark --methods training.methods.kkl:ShippedTracking``."""
+class ShippedStatic(Shipped):
+    """T_inv alone, likewise: ``kkl-gym benchmark --methods training.methods.kkl:ShippedStatic``."""
 
-    name: ClassVar[str] = "shipped-tracking"
-    label: ClassVar[str] = "kkl-gym tracking, as shipped"
-    suffix: ClassVar[str] = "-tracking"
+    name: ClassVar[str] = "shipped-static"
+    label: ClassVar[str] = "kkl-gym, T_inv alone, as shipped"
+    suffix: ClassVar[str] = "-static"
 
 
 class SPINN(KKLMethod):

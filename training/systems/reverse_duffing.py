@@ -48,6 +48,5 @@ PROFILE = Profile(
     # Marginally stable: whoever does not know the state cannot take energy out.
     task=ControlTask("reverse_duffing", period=0.1),
     algorithm="sac",
-    agent_observer="reverse_duffing-closed-loop",  # fitted in closed loop, which helped with earlier maps
     printed={"spinn": 1.96, "ae": 55.4, "dmf": 46.2, "node": 159.8},
 )

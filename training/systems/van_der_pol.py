@@ -31,7 +31,6 @@ PROFILE = Profile(
     fault_deadline=8.9,  # a period
     # The target is unstable. Starts keep to |x1| < 3: beyond it a slow manifold holds the motion, whatever one does.
     task=ControlTask("van_der_pol", start_box=((-3, 3), (-6, 6))),
-    agent_observer="van_der_pol-closed-loop",  # fitted in closed loop, which helped with earlier maps
     second_noise=0.2,
     printed={"spinn": 0.35, "ae": 200.0, "dmf": 98.2, "node": 11.9},
 )

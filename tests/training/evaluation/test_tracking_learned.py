@@ -230,7 +230,7 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
     )
     plain_observer().save(source)
     found = Tracking(str(source), steps=2, trajectories=50).run(console)
-    written = Artifact.read(tmp_path / "runs/tracking/map-tracking.safetensors")
+    written = Artifact.read(tmp_path / "runs/tracking/map.safetensors")
     np.testing.assert_array_equal(written.flow.factors.factors, found.flow.factors.factors)
     y = np.random.default_rng(0).normal(size=(20, 2, 1))
     assert not np.allclose(KKLObserver(written, 0.2).estimate(y), KKLObserver(plain_observer(), 0.2).estimate(y))

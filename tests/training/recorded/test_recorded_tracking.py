@@ -221,4 +221,4 @@ def test_commands(plain, tmp_path, monkeypatch):
     ErrorBars("spring.safetensors", steps=20, records=data).run(quiet)
     found = Tracking("runs/errorbars/spring.safetensors", steps=20, records=data).run(quiet)
     np.testing.assert_allclose(found.C, [[1.0, 0.0]], atol=1e-5)
-    assert Artifact.read(tmp_path / "runs/tracking/spring-tracking.safetensors").flow is not None
+    assert Artifact.read(tmp_path / "runs/tracking/spring.safetensors").flow is not None

@@ -183,7 +183,10 @@ def certify(
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     if artifact.flow is not None:
-        raise ValueError("the bounds are those of T_inv(z), and this observer tracks: certify the map it was made from")
+        raise ValueError(
+            "the bounds are those of T_inv(z), and this observer tracks: certify the map that it was made from, of "
+            "those that ship NAME-static"
+        )
     process_noise = system.process_noise if process_noise is None else process_noise
     for what, value in (("process_noise", process_noise), ("psi", 0.0 if psi is None else psi)):
         if not 0 <= value < math.inf:
