@@ -61,7 +61,7 @@ def test_lorenz_serves_noise_up_to_three_and_the_others_up_to_one():
 @pytest.mark.parametrize("name", NAMES)
 def test_small_maps_are_small_and_nearly_as_good(name):
     """On 30 runs of 20 s; `kkl-gym evaluate` says it for more."""
-    large, small = (observers.load(which, 0.5, process_noise=0.0) for which in (name, f"{name}-small"))
+    large, small = (observers.load(which, 0.5, process_noise=0.0) for which in (f"{name}-static", f"{name}-small"))
     system = get_system(name)
     small.artifact.check(name, system.parameters, dt=0.01, ny=system.ny, nu=system.nu)
     for inverse in ("inverse", "free_inverse"):

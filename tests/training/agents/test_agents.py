@@ -71,8 +71,8 @@ def test_equal_seeds_give_equal_agents(learned, tmp_path):
 def test_a_saved_agent_plays_the_same(learned):
     agent, folder = learned
     read = Agent.read(folder / "agent.safetensors")
-    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-closed-loop-v2")
-    assert read.fingerprint == fingerprint("van_der_pol-closed-loop")
+    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v2")
+    assert read.fingerprint == fingerprint("van_der_pol")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
     episodes = [play(one.make(4), one, steps=TASK.steps, seed=0) for one in (agent, read)]
@@ -144,7 +144,7 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         find("nothing")
 
 
-@pytest.mark.parametrize("name", ["van_der_pol-closed-loop-v2", "lorenz-v2"])
+@pytest.mark.parametrize("name", ["van_der_pol-static-v2", "lorenz-v2"])
 def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
     """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
     with safe_open(resolve(name), framework="numpy") as opened:

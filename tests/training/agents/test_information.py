@@ -102,9 +102,8 @@ def test_z_is_what_the_network_sees_from_its_value_at_the_target():
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_agents_act_on_maps_fitted_in_closed_loop_where_that_helped(name):
-    fitted_in_closed_loop = "-closed-loop" if name in ("reverse_duffing", "van_der_pol") else ""
-    assert observer_of(get_system(name)) == f"{name}{fitted_in_closed_loop}"
+def test_agents_act_on_the_default_maps(name):
+    assert observer_of(get_system(name)) == name
 
 
 def test_no_observer_ships_for_a_system_of_ones_own():

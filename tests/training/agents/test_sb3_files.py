@@ -23,8 +23,7 @@ def test_there_and_back(name, tmp_path):
     obs = np.random.default_rng(0).normal(size=(50, agent.network.inputs)).astype(np.float32)
     np.testing.assert_allclose(played.predict(obs, deterministic=True)[0], agent(obs), atol=1e-5)
     back = tmp_path / "agent.safetensors"
-    options = [] if agent.observer.endswith("closed-loop-v2") else ["--observer", agent.observer]
-    main(["agent", "import", str(path), name, "--out", str(back), *options])
+    main(["agent", "import", str(path), name, "--out", str(back), "--observer", agent.observer])
     again = Agent.read(back)
     assert (again.task, again.observer, again.fingerprint) == (agent.task, agent.observer, agent.fingerprint)
     assert again.network.activation == agent.network.activation

@@ -80,9 +80,9 @@ def test_speed_measures_every_environment(capsys):
     """The printed times, of a single turn, are those that the ratios are made of."""
     ratios = Speed(steps=20, turns=1, num_envs=8, vector_steps=5).run(Console(width=200))
     parts = {"": "", "x_hat": ", x_hat", "bars": ", x_hat, error bars", "z": ", z"}
-    parts |= {kind: f", x_hat, {kind}" for kind in ("small", "tracking")}
+    parts |= {kind: f", x_hat, {kind}" for kind in ("small", "static")}
     names = {what: {f"{env}{part}" for env in kkl_gym.ENV_IDS.values()} for what, part in parts.items()}
-    single = {"Pendulum-v1"} | names[""] | names["x_hat"] | names["bars"] | names["small"] | names["tracking"]
+    single = {"Pendulum-v1"} | names[""] | names["x_hat"] | names["bars"] | names["small"] | names["static"]
     batched = {"CartPole-v1"} | (single - {"Pendulum-v1"}) | names["z"]
     assert set(ratios) == single | {f"{name}, 8 rows" for name in batched}
     assert (ratios["Pendulum-v1"], ratios["CartPole-v1, 8 rows"]) == (1.0, 1.0)

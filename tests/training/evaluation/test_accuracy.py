@@ -12,7 +12,7 @@ from observers.names import resolve
 from training.config import Config, current_names
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape
-from training.presets import CLOSED_LOOP, SMALL_WIDTH, preset
+from training.presets import SMALL_WIDTH, preset
 
 # Medians over 100 unseen runs of 50 s, in percent, that the default maps promise. The paper's SMAPE over all steps from
 # X: without noise, at sigma_v = 0.5, and (first 5 s left out) driven by random steps and sines; and component-wise,
@@ -83,7 +83,7 @@ def test_shipped_maps_are_what_the_preset_makes(name):
     artifact = observers.load(name).artifact
     kind = name.removeprefix(artifact.system).rpartition("-v")[0]
     pipeline = "spinn" if kind == "-spinn" else "input-aware"
-    changes = {"-small": {"width": SMALL_WIDTH}, "-closed-loop": {"closed_loop_trajectories": CLOSED_LOOP}}
+    changes = {"-small": {"width": SMALL_WIDTH}}
     settings = preset(get_system(artifact.system), pipeline, "fast", changes=changes.get(kind))
     made, config = current_names(artifact.training), json.loads(json.dumps(asdict(settings)))
     later = {
@@ -108,12 +108,3 @@ def test_coasting_runs_as_a_model_of_the_system(name, seconds, error):
         x_hat = observer.step(None)
     relative = np.linalg.norm(x_hat - runs.x[-1], axis=-1) / np.linalg.norm(runs.x[-1], axis=-1)
     assert np.median(relative) < error
-
-
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
-def test_maps_fitted_in_closed_loop(name):
-    system, runs = get_system(name), unseen_trajectories(get_system(name), 0.01, n=100, duration=50.0, seed=0)
-    fitted = observers.Artifact.read(resolve(f"{name}-closed-loop"))
-    assert fitted.training["closed_loop_trajectories"] == 2000
-    assert np.median(errors(fitted, system, runs, measurement_noise=0.0, seed=0).full) <= 0.2
-    assert np.median(errors(fitted, system, runs, measurement_noise=0.5, seed=0).full) <= 3.6

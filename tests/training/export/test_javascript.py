@@ -54,7 +54,7 @@ def test_every_kind_of_map(options, make_artifact, tmp_path):
     assert apart(exported, x_hat, y, u) < 1e-10
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz"])
+@pytest.mark.parametrize("name", ["reverse_duffing-static", "van_der_pol-static", "rossler-static", "lorenz-static"])
 def test_what_ships_with_its_monitor(name, tmp_path):
     exported = Exported.read(name)
     artifact = exported.artifact
@@ -74,11 +74,11 @@ def test_what_ships_with_its_monitor(name, tmp_path):
 
 
 def test_samples_that_are_missing(tmp_path):
-    exported = Exported.read("van_der_pol")
+    exported = Exported.read("van_der_pol-static")
     y, u = motion(exported.artifact, 600)
     y[300:350] = np.nan
     found = np.array(replayed(exported, tmp_path, y, u)["x_hat"])
-    observer = load("van_der_pol")
+    observer = load("van_der_pol-static")
     x_hat = [observer.reset(y[0]), *(observer.step(None if np.isnan(a).any() else a, b) for a, b in zip(y[1:], u))]
     assert (abs(found - x_hat) / exported.artifact.inverse.x_scale).max() < 1e-4
 

@@ -66,7 +66,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
 
 @pytest.mark.parametrize(
     "name",
-    ["van_der_pol", *(pytest.param(name, marks=pytest.mark.slow) for name in UNTRACKED)],
+    ["van_der_pol-static", *(pytest.param(name, marks=pytest.mark.slow) for name in UNTRACKED)],
 )
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 5e-5), ("double", 5e-9)])
 def test_what_ships(name, precision, tolerance):
@@ -84,9 +84,9 @@ def test_rows_have_levels_of_their_own_and_begin_anew(make_artifact, tmp_path):
         z, x_hat = runner.step(z=z, y=y[k - 1], u=u[k - 1], y_next=y[k], age=age)
     np.testing.assert_allclose(x_hat[0], in_doubles(exported, y, u)[-1, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(x_hat[1], in_doubles(exported, y[10:], u[10:])[-1, 1], rtol=0, atol=1e-9)
-    runner.exported = Exported.read("lorenz", measurement_noise=7 - 4.5)  # beyond what this map is told: 1
+    runner.exported = Exported.read("lorenz-static", measurement_noise=7 - 4.5)  # beyond what this map is told: 1
     beyond = runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))[1]
-    runner.exported = Exported.read("lorenz", measurement_noise=1.0)
+    runner.exported = Exported.read("lorenz-static", measurement_noise=1.0)
     assert np.array_equal(beyond, runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))[1])
 
 
@@ -98,11 +98,12 @@ def test_an_input_that_is_no_number_is_not_taken_for_none(make_artifact, tmp_pat
 
 
 def test_what_is_said_of_it():
-    model = onnx_model(Exported.read("van_der_pol"))
+    model = onnx_model(Exported.read("van_der_pol-static"))
     said = {entry.key: entry.value for entry in model.metadata_props}
-    assert said["name"] == said["system"] == "van_der_pol"
-    assert said["artifact"] == "van_der_pol-v2.safetensors"
-    assert said["sha256"] == checksum(resolve("van_der_pol"), ArtifactError)
+    assert said["name"] == "van_der_pol_static"
+    assert said["system"] == "van_der_pol"
+    assert said["artifact"] == "van_der_pol-static-v2.safetensors"
+    assert said["sha256"] == checksum(resolve("van_der_pol-static"), ArtifactError)
     read = {name: json.loads(said[name]) for name in ("parameters", "dt", "y", "u", "x_hat", "measurement_noise")}
     assert read == {"parameters": {"mu": 3.0}, "dt": 0.01, "y": ["y"], "u": ["u"], "x_hat": ["x1", "x2"],
                     "measurement_noise": [0.5]}  # fmt: skip
