@@ -538,10 +538,10 @@ class KKLObserver:
         """
         self.artifact.require_spread()
         if self._tracker is not None:
-            self._moment(rows)  # or what is wrong
-            assert self._z is not None
+            if self._z is None:
+                raise RuntimeError("call reset(y0) before the observer is used")
             covariance = self._tracker.covariance(self._z, self._age)
-            return covariance if rows is None else covariance[np.asarray(rows)]
+            return covariance if rows is None else covariance[bool_array("rows", rows, self._z.shape[:-1])]
         self._asked = True
         if rows is None and self._parts is not None:
             return self._states.covariance(self._parts)

@@ -3,7 +3,6 @@
 import copy
 import functools
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
+from observers.factors import Factors
 from observers.flow import Flow
 from observers.sparse import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
@@ -22,20 +22,29 @@ KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scale
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample
 
 
-@dataclass(frozen=True)
 class _Calibrated:
-    """Of covariances at levels of noise: ages in samples, logarithms of the factors' roots there, and doubts."""
+    """What covariances of scaled states become at levels of noise, by the age in samples."""
 
-    ages: np.ndarray
-    logs: np.ndarray
-    doubts: np.ndarray
-    units: np.ndarray  # products of the states' scales, (nx, nx)
+    def __init__(self, factors: Factors, shares: tuple[float, float], dt: float, units: np.ndarray) -> None:
+        self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
+        self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
+        self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
-    @functools.cached_property
-    def settled(self) -> np.ndarray:
-        """What P of scaled states, (nx, nx), is multiplied with behind the last age."""
-        doubt = self.doubts[-1] * (1 - np.eye(len(self.units)))
-        return np.asarray(self.units * math.exp(2 * self.logs[-1]) * (1 - doubt))
+    def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Factors and doubts, (n,)."""
+        return np.exp(2 * np.interp(age, self._ages, self._logs)), np.interp(age, self._ages, self._doubts)
+
+    def scales(self, factor: np.ndarray, doubt: np.ndarray) -> np.ndarray:
+        """What is multiplied with covariances (n, nx, nx) where T_inv is not asked, entry by entry."""
+        weights = np.column_stack([factor, factor * (1.0 - doubt)])
+        return np.asarray(weights @ self._parts.reshape(2, -1)).reshape(-1, *self._parts.shape[1:])
+
+    def scale(self, age: float) -> np.ndarray:
+        """The same of a single sample."""
+        age = min(age, self._ages[-1])
+        if age not in self._scales:
+            self._scales[age] = self.scales(*self.at(np.array([age])))[0]
+        return self._scales[age]
 
 
 class Tracker:
@@ -88,7 +97,7 @@ class Tracker:
         self._window, self._share, self._limit = supervision(flow, self._dt)
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._calibrated, self._free_calibrated = (
-            _Calibrated(each.ages / self._dt, each.log_roots(*shares), each.doubts(*shares), self._units)
+            _Calibrated(each, shares, self._dt, self._units)
             for each in (flow.factors, flow.free_factors or flow.factors)
         )
         self._batch: tuple[int, ...]
@@ -126,35 +135,38 @@ class Tracker:
         nz = len(self._artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
         if not self._batch:  # a single sample: every call of numpy would be felt
             calibrated = self._calibrated if any(z[nz:].tolist()) else self._free_calibrated
-            if age >= calibrated.ages[-1] and age >= self._window:
-                return np.asarray(self._P[0] * calibrated.settled)
-            log, doubt = (np.interp(age, calibrated.ages, each) for each in (calibrated.logs, calibrated.doubts))
-            P = self._P[0] * self._units
-            if doubt:
-                P += doubt * (self._in_doubt(z[None], P[None], np.array([age]))[0] - P)
-            return P * math.exp(2 * log)
-        acted, age = z[..., nz:].any(-1).ravel(), np.broadcast_to(age, self._batch).ravel()
-        logs, doubts = (
-            np.where(
-                acted, *(np.interp(age, of.ages, getattr(of, name)) for of in (self._calibrated, self._free_calibrated))
-            )
-            for name in ("logs", "doubts")
-        )
-        P = self._P * self._units
-        if doubts.any():
-            P += doubts[:, None, None] * (self._in_doubt(z.reshape(-1, z.shape[-1]), P, age) - P)
-        P *= np.exp(2 * logs)[:, None, None]
-        return P.reshape(*self._batch, *P.shape[1:])
-
-    def _in_doubt(self, z: np.ndarray, P: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """What else may be said of the errors at z, (n, size), beside covariances (n, nx, nx), at ages in samples."""
-        other = P * np.eye(self._flow.nx)
+            if age >= self._window or self._known[0]:
+                return np.asarray(
+                    self._state[0, self._flow.nx : -1].reshape(self._units.shape) * calibrated.scale(float(age))
+                )
+            return self._soon(z[None], np.array([age]), *calibrated.at(np.array([age])))[0]
+        age = np.broadcast_to(age, self._batch).ravel()
+        z = z.reshape(len(age), z.shape[-1])
+        factor, doubt = self._calibrated.at(age)
+        free = ~_acted(z[:, nz:])
+        if free.any():
+            factor[free], doubt[free] = self._free_calibrated.at(age[free])
+        P = self._P * self._calibrated.scales(factor, doubt)
         soon = (age < self._window) & ~self._known
         if soon.any():
-            x, covariance = self._said(z[soon], age[soon])
-            apart = x - (self._flow.x_offset + self._flow.x_scale * self._x[soon])
-            other[soon] = covariance + apart[:, :, None] * apart[:, None, :]
-        return other
+            P[soon] = self._soon(z[soon], age[soon], factor[soon], doubt[soon], soon)
+        return P.reshape(*self._batch, *P.shape[1:])
+
+    def _soon(
+        self,
+        z: np.ndarray,
+        age: np.ndarray,
+        factor: np.ndarray,
+        doubt: np.ndarray,
+        rows: np.ndarray | slice = slice(None),
+    ) -> np.ndarray:
+        """Covariances within the window, (k, nx, nx), of which T_inv is asked."""
+        x, said = self._said(z, age)
+        apart = x - (self._flow.x_offset + self._flow.x_scale * self._x[rows])
+        P = self._P[rows] * self._units
+        P += doubt[:, None, None] * (said + apart[:, :, None] * apart[:, None, :] - P)
+        P *= factor[:, None, None]
+        return P
 
     def reset(self, z: np.ndarray, age: np.ndarray | float, x0: np.ndarray | None = None) -> None:
         """Begin with what T_inv says of z, (..., size), at ages in samples, or with states that are known."""
@@ -320,6 +332,14 @@ class Tracker:
             return CompiledTracker(self._flow, C, variances=self._variances, share=self._share)
         except ImportError:
             return None
+
+
+def _acted(z_u: np.ndarray) -> np.ndarray:
+    """Whether an input has acted, (n,), by the filter's states of inputs (n, size): mostly the first column tells."""
+    acted = np.asarray(z_u[:, :1].any(-1))
+    if not acted.all():
+        acted[~acted] = z_u[~acted].any(-1)
+    return acted
 
 
 def _mean_square(P: np.ndarray) -> np.ndarray:

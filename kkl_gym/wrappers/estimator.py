@@ -1,5 +1,6 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -164,9 +165,10 @@ class KKLEstimator:
         if known_start:
             artifact.require_known_start()  # an error now, not at the first reset
         self._require_error_bars(artifact, estimate)
+        self.estimate = estimate
+        artifact = self._asked(artifact)
         noise = plant.measurement_noise if measurement_noise is None else measurement_noise
         self.observer = KKLObserver(artifact, noise, process_noise=plant.process_noise, monitor=monitor)
-        self.estimate = estimate
         self._blind = self.observer.artifact.nu == 0 and system.nu > 0
         self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
         if uncertainty:
@@ -200,7 +202,13 @@ class KKLEstimator:
         if self._known_start:
             artifact.require_known_start()
         self._require_error_bars(artifact, self.estimate)
-        self.observer.replace(artifact)
+        self.observer.replace(self._asked(artifact))
+
+    def _asked(self, artifact: Artifact) -> Artifact:
+        """The artifact without a flow where only z is shown: nobody asks for the estimate that it would carry on."""
+        if self.estimate == "x" or self._monitor or self._known_start:
+            return artifact
+        return dataclasses.replace(artifact, flow=None)
 
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it.
