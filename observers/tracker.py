@@ -28,6 +28,7 @@ class _Calibrated:
     def __init__(self, factors: Factors, shares: tuple[float, float], dt: float, units: np.ndarray) -> None:
         self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
         self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
+        self._last = float(self._ages[-1])
         self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
     def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +42,7 @@ class _Calibrated:
 
     def scale(self, age: float) -> np.ndarray:
         """The same of a single sample."""
-        age = min(age, self._ages[-1])
+        age = min(age, self._last)
         if age not in self._scales:
             self._scales[age] = self.scales(*self.at(np.array([age])))[0]
         return self._scales[age]

@@ -262,7 +262,7 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     ),
     "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
     "results/sizes/sizes.png": lambda: (
-        lambda path: sizes.draw(path, *map(pd.read_csv, (RESULTS / "sizes").glob("*.csv")))
+        lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
     ),
     "results/error_bars/van_der_pol.png": lambda: partial(
         coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-static.csv")
