@@ -144,7 +144,7 @@ def test_wrong_settings_are_said_in_a_line_each():
         ("stable_baselines3", ["agent", "train", "lorenz"], "agents"),
         ("PIL", ["agent", "evaluate", "lorenz"], "plots"),
         ("matplotlib", ["demo", "--duration", "0.1"], "plots"),
-        ("onnx", ["export", "lorenz", "--format", "onnx"], "onnx"),
+        ("onnx", ["export", "lorenz-static", "--format", "onnx"], "onnx"),
     ],
 )
 def test_the_extra_that_brings_a_missing_module_is_named(missing, arguments, extra):
