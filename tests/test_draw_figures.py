@@ -69,7 +69,7 @@ TINY = {
     "error bars": lambda: DRAW["error_bars"](duration=1.5),
     "noise levels": DRAW["noise_levels"],
     "faults": lambda: partial(faults.draw, found=results("faults/faults.csv", slice(None, None, 50))),
-    "coverage": lambda: partial(coverage.draw, rows=results("error_bars/van_der_pol.csv")),
+    "coverage": lambda: partial(coverage.draw, rows=results("error_bars/van_der_pol-static.csv")),
     "curves": lambda: partial(draw_curves, found=results("environments/curves.csv", slice(None, None, 10))),
     "scores": DRAW["FIGURES"]["results/agents/scores.png"],
 }

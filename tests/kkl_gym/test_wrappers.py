@@ -115,6 +115,18 @@ def test_known_starts_need_a_map_with_T(saved):
     assert KKLObservation(KKLEnv("lorenz"), "lorenz-spinn", known_start=True).observer.artifact.forward is not None
 
 
+def test_where_z_is_shown_nobody_tracks():
+    def tracks(**options):
+        env = KKLObservation(KKLEnv("lorenz"), **options)
+        env.reset(seed=0)
+        return env.observer.artifact.flow is not None
+
+    assert tracks()
+    assert not tracks(estimate="z")
+    assert tracks(estimate="z", monitor=True)
+    assert tracks(estimate="z", known_start=True)
+
+
 def test_the_environment_is_left_as_it_was(saved):
     bare, env = gym.make("KKLRossler-v0"), wrapped(saved, "rossler")
     x0, x1 = bare.reset(seed=2)[1]["x"], env.reset(seed=2)[1]["x"]

@@ -161,7 +161,7 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent):
             window=1.0,
         )
     assert found.degree == (1 if bent else 3)
-    assert found.mlp.weights[0].shape == (32 if bent else 16, 3)
+    assert found.mlp.weights[0].shape == (32 if bent else 8, 3)
     if not bent:
         assert np.abs(found(x, u) - x - change).max() < 1e-12
 
