@@ -354,12 +354,16 @@ class Artifact:
         Raises
         ------
         ArtifactError
-            If there is neither; the message says which maps have T.
+            If there is neither; the message says which maps have one.
         """
         if self.flow is None and self.signals is not None:
             self.require_flow()
-        elif self.flow is None:
-            self.require_forward()
+        elif self.flow is None and self.forward is None:
+            raise ArtifactError(
+                f"this map for {self.system!r} can begin at no known state: it holds neither a forward map T nor a flow; "
+                "take one that does, such as SYSTEM or SYSTEM-spinn of those that ship, or make one by kkl-gym tracking, "
+                "or by kkl-gym train SYSTEM --pipeline spinn"
+            )
 
     def require_spread(self) -> Spread:
         """Return the error bars of T_inv.

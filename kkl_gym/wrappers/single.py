@@ -52,7 +52,8 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     and not clipped. With ``monitor`` it gains ``score`` too, an array of shape (), above 1 where the samples do not fit
     the estimates (a faulty sensor, states that the map was not made for).
 
-    With ``estimate="z"`` the network is not evaluated, unless there is a monitor. There is then no ``x_hat``, and
+    With ``estimate="z"`` the network is not evaluated, and nothing tracks (:attr:`observer` holds no flow), unless
+    there is a monitor or the start is known. There is then no ``x_hat``, and
     :meth:`render` shows no estimate.
 
     Any other environment needs an observer from its rollouts (``kkl-gym record`` and ``kkl-gym train``, or

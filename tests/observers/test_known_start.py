@@ -166,7 +166,7 @@ def test_a_refused_start_changes_nothing(x0, match, make_artifact):
 
 def test_artifacts_without_T_say_where_to_get_one(make_artifact):
     observer = KKLObserver(make_artifact())
-    with pytest.raises(ValueError, match=r"'van_der_pol' holds no forward map T; .* SYSTEM-spinn"):
+    with pytest.raises(ValueError, match=r"'van_der_pol' can begin at no known state: .* SYSTEM-spinn"):
         observer.reset([0.5], [0.1, 0.2])
     with pytest.raises(RuntimeError, match="reset"):
         _ = observer.z  # it was not reset

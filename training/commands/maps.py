@@ -23,7 +23,9 @@ class Maps:
     def run(self, console: Console) -> None:
         """Print a row for each file."""
         names = shipped()
-        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, caption="–: not told", caption_justify="left")
+        table = Table(
+            box=SIMPLE_HEAD, show_edge=False, padding=0, caption="*: tracks; –: not told", caption_justify="left"
+        )
         table.add_column("map", min_width=max(map(len, names)))  # which wraps between words only
         table.add_column("pipeline", no_wrap=True)
         for column in ("inputs", "modes", "measurement\nnoise up to", "process\nnoise\nup to", "MB"):
@@ -35,7 +37,7 @@ class Maps:
             told = artifact.inverse.features
             table.add_row(
                 file + "".join(f" ({name})" for name in newest),
-                str(current_names(artifact.training).get("pipeline", "–")),
+                str(current_names(artifact.training).get("pipeline", "–")) + ("" if artifact.flow is None else "*"),
                 str(artifact.nu),
                 str(len(artifact.filter.A)),
                 f"{artifact.inverse.measurement_noise_max:g}" if "measurement_noise" in told else "–",

@@ -78,7 +78,7 @@ def learn_error_bars(
     if artifact.flow is not None:
         raise ValueError(
             "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
-            "it was made from, then teach that to track"
+            "it was made from (of those that ship NAME-static), then teach that to track"
         )
     if steps < 1 or trajectories < 100 or seed < 0:
         raise ValueError(

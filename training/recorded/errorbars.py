@@ -65,7 +65,7 @@ def learn_recorded_error_bars(
     if artifact.flow is not None:
         raise ValueError(
             "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
-            "it was made from, then teach that to track"
+            "it was made from (of those that ship NAME-static), then teach that to track"
         )
     integer("steps", steps, 1)
     integer("seed", seed, 0)
