@@ -360,9 +360,9 @@ class Artifact:
             self.require_flow()
         elif self.flow is None and self.forward is None:
             raise ArtifactError(
-                f"this map for {self.system!r} can begin at no known state: it holds neither a forward map T nor a flow; "
-                "take one that does, such as SYSTEM or SYSTEM-spinn of those that ship, or make one by kkl-gym tracking, "
-                "or by kkl-gym train SYSTEM --pipeline spinn"
+                f"this map for {self.system!r} can begin at no known state: it holds no forward map T and no flow; "
+                "take one that does, as SYSTEM and SYSTEM-spinn of those that ship, or make one by kkl-gym tracking or "
+                "kkl-gym train SYSTEM --pipeline spinn"
             )
 
     def require_spread(self) -> Spread:
