@@ -140,7 +140,7 @@ class Tracker:
                 return np.asarray(
                     self._state[0, self._flow.nx : -1].reshape(self._units.shape) * calibrated.scale(float(age))
                 )
-            return self._soon(z[None], np.array([age]), *calibrated.at(np.array([age])))[0]
+            return self._soon(self._said_of_one(z, float(age)), *calibrated.at(np.array([age])))[0]
         age = np.broadcast_to(age, self._batch).ravel()
         z = z.reshape(len(age), z.shape[-1])
         factor, doubt = self._calibrated.at(age)
@@ -150,22 +150,17 @@ class Tracker:
         P = self._P * self._calibrated.scales(factor, doubt)
         soon = (age < self._window) & ~self._known
         if soon.any():
-            P[soon] = self._soon(z[soon], age[soon], factor[soon], doubt[soon], soon)
+            P[soon] = self._soon(self._said(z[soon], age[soon]), factor[soon], doubt[soon], soon)
         return P.reshape(*self._batch, *P.shape[1:])
 
     def _soon(
-        self,
-        z: np.ndarray,
-        age: np.ndarray,
-        factor: np.ndarray,
-        doubt: np.ndarray,
-        rows: np.ndarray | slice = slice(None),
+        self, said: Gaussian, factor: np.ndarray, doubt: np.ndarray, rows: np.ndarray | slice = slice(None)
     ) -> np.ndarray:
-        """Covariances within the window, (k, nx, nx), of which T_inv is asked."""
-        x, said = self._said(z, age)
+        """Covariances within the window, (k, nx, nx), beside what T_inv says."""
+        x, covariance = said
         apart = x - (self._flow.x_offset + self._flow.x_scale * self._x[rows])
         P = self._P[rows] * self._units
-        P += doubt[:, None, None] * (said + apart[:, :, None] * apart[:, None, :] - P)
+        P += doubt[:, None, None] * (covariance + apart[:, :, None] * apart[:, None, :] - P)
         P *= factor[:, None, None]
         return P
 
