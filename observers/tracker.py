@@ -135,7 +135,8 @@ class Tracker:
         """Covariances of the estimates' errors, (..., nx, nx), beside z, (..., size), at ages in samples."""
         nz = len(self._artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
         if not self._batch:  # a single sample: every call of numpy would be felt
-            calibrated = self._calibrated if any(z[nz:].tolist()) else self._free_calibrated
+            acted = len(z) > nz and (z[nz] != 0.0 or any(z[nz:].tolist()))
+            calibrated = self._calibrated if acted else self._free_calibrated
             if age >= self._window or self._known[0]:
                 return np.asarray(
                     self._state[0, self._flow.nx : -1].reshape(self._units.shape) * calibrated.scale(float(age))
