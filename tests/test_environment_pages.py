@@ -21,7 +21,8 @@ def page(name):
 
 @cache
 def medians():
-    found = pd.read_csv(DOCS / "results" / "accuracy.csv")
+    files = DOCS / "results" / "accuracy.csv", DOCS / "results" / "tracking" / "accuracy.csv"
+    found = pd.concat(map(pd.read_csv, files))
     return found[~found.driven].groupby(["observer", "starts", "measurement_noise"]).smape.median()
 
 
