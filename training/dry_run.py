@@ -13,8 +13,12 @@ from training.config import Config
 from training.pipeline import Result, shares, train
 from training.trajectories.record import CHUNK, recording_ages
 
-FEW, MORE = 10, 50  # batches of the two short runs whose difference is timed
-RUNS = 2
+RUNS = 3  # one to warm up, and two whose difference is timed
+FEW = 2  # batches in each stage of the first two
+CPU_SECONDS = (
+    8.0  # of each stage of the last: a batch takes a millisecond on a GPU, and a second with the paper's sizes
+)
+WARM_UP_TRAJECTORIES = 50
 # Arrays that exist at once in the largest stage, as counted in training/pipeline.py: those of states in NumPy and in
 # torch, and those of the filter's states.
 STATES, TORCH_STATES, FILTER_STATES, TORCH_FILTER_STATES = 3, 3, 5, 2
@@ -73,18 +77,26 @@ def estimate(
     ValueError
         As :func:`training.train`.
     """
-    few = _short_run(system, config, batches=FEW, device=device)
+    brief = replace(config, cpu_seconds=None, **_few_batches(config))
+    # What is done for the first time takes longer, on a GPU by seconds.
+    _short_run(system, replace(brief, trajectories=min(WARM_UP_TRAJECTORIES, config.trajectories)), device=device)
     report(1)
-    more = _short_run(system, config, batches=MORE, device=device)
+    few = _short_run(system, brief, device=device)
+    report(2)
+    parts = shares(config, few.artifact.nu)
+    more = _short_run(system, replace(config, cpu_seconds=CPU_SECONDS / min(parts.values())), device=device)
     seconds = {"simulating": few.seconds["simulating"] * max(1.0, config.trajectories / CHUNK)}
     if config.random_features:
         seconds["solving"] = more.seconds["solving"]
-    parts = shares(config, few.artifact.nu)
     for stage in few.losses:
         batches = config.forward_steps if stage == "forward" else config.inverse_steps
-        each = max(0.0, more.seconds[stage] - few.seconds[stage]) / (MORE - FEW)
+        (done, _), (done_later, _) = few.losses[stage][-1], more.losses[stage][-1]
+        if done_later > done:
+            each = max(0.0, more.seconds[stage] - few.seconds[stage]) / (done_later - done)
+        else:
+            each = few.seconds[stage] / done
         limit = math.inf if config.cpu_seconds is None else parts[stage] * config.cpu_seconds
-        seconds[stage] = min(few.seconds[stage] + max(0, batches - FEW) * each, limit)
+        seconds[stage] = min(few.seconds[stage] + (batches - done) * each, limit)
     pairs = config.trajectories * len(recording_ages(max(1, round(config.duration / config.dt)), config.samples))
     size = few.artifact.filter.size
     maps = (few.artifact.inverse, few.artifact.free_inverse, few.artifact.forward)
@@ -97,14 +109,15 @@ def estimate(
     )
 
 
-def _short_run(system: System, config: Config, *, batches: int, device: torch.device | None) -> Result:
-    """The same with few batches, on no more trajectories than are simulated at once."""
+def _few_batches(config: Config) -> dict[str, int]:
+    return {name: min(FEW, getattr(config, name)) for name in ("forward_steps", "inverse_steps")}
+
+
+def _short_run(system: System, config: Config, *, device: torch.device | None) -> Result:
+    """The same on no more trajectories than are simulated at once."""
     short = replace(
         config,
         trajectories=min(CHUNK, config.trajectories),
-        forward_steps=batches if config.forward_steps else 0,
-        inverse_steps=batches,
-        cpu_seconds=None,
         closed_loop_trajectories=min(CHUNK, config.closed_loop_trajectories),
     )
     with TemporaryDirectory() as folder:

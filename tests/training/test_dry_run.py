@@ -17,12 +17,12 @@ def test_times_grow_with_batches_and_trajectories(monkeypatch):
 
     def timed(system, config, folder, *, device):
         result = train(system, config, folder, device=device)
-        batches = {"forward": config.forward_steps, "inverse": config.inverse_steps}
-        seconds = {stage: 2.0 + 0.1 * batches[stage] for stage in result.losses} | {"simulating": 3.0}
+        seconds = {stage: 2.0 + 0.1 * loss[-1][0] for stage, loss in result.losses.items()} | {"simulating": 3.0}
         return Result(result.artifact, result.losses, seconds)
 
     monkeypatch.setattr(training.dry_run, "train", timed)
     monkeypatch.setattr(training.dry_run, "CHUNK", 20)
+    monkeypatch.setattr(training.dry_run, "CPU_SECONDS", 0.2)
     config = toy(Oscillator(), "spinn", trajectories=60, duration=20.0, forward_steps=1000, inverse_steps=4000)
     found = estimate(Oscillator(), config, device=CPU)
     assert {name: round(value, 6) for name, value in found.seconds.items()} == {
@@ -39,19 +39,30 @@ def test_times_grow_with_batches_and_trajectories(monkeypatch):
     assert found.bytes > training.dry_run.PROGRAM
 
 
+def test_batches_that_take_longer_than_the_clock_allows_count_as_they_are(monkeypatch):
+    def timed(system, config, folder, *, device):
+        result = train(system, config, folder, device=device)
+        return Result(result.artifact, {"inverse": [(1, 0.0)]}, {"inverse": 5.0, "simulating": 3.0})
+
+    monkeypatch.setattr(training.dry_run, "train", timed)
+    monkeypatch.setattr(training.dry_run, "CPU_SECONDS", 1e-9)
+    config = toy(Oscillator(), "input-aware", inverse_steps=7)
+    assert estimate(Oscillator(), config, device=CPU).seconds["inverse"] == 35.0
+
+
 def test_few_batches_and_a_limit_of_time_are_taken_as_they_are(monkeypatch):
     def timed(system, config, folder, *, device):
-        assert config.cpu_seconds is None  # a short run must have all its batches
         result = train(system, config, folder, device=device)
-        seconds = {"inverse": 2.0 + 0.1 * config.inverse_steps, "simulating": 3.0, "solving": 7.0}
+        seconds = {"inverse": 2.0 + 0.1 * result.losses["inverse"][-1][0], "simulating": 3.0, "solving": 7.0}
         return Result(result.artifact, {"inverse": result.losses["inverse"]}, seconds)
 
     monkeypatch.setattr(training.dry_run, "train", timed)
+    monkeypatch.setattr(training.dry_run, "CPU_SECONDS", 0.2)
     config = toy(Oscillator(), "spinn", duration=20.0, forward_steps=0, random_features=20, cpu_seconds=40.0)
     long = estimate(Oscillator(), replace(config, inverse_steps=4000), device=CPU).seconds
     short = estimate(Oscillator(), replace(config, inverse_steps=3), device=CPU).seconds
     assert long == {"simulating": 3.0, "solving": 7.0, "inverse": 30.0}  # its part of the limit
-    assert short == {"simulating": 3.0, "solving": 7.0, "inverse": 3.0}
+    assert short == {"simulating": 3.0, "solving": 7.0, "inverse": 2.3}
 
 
 def test_a_dry_run_says_what_the_papers_sizes_take_and_writes_nothing(tmp_path, capsys):
