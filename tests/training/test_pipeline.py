@@ -96,7 +96,7 @@ def test_training_makes_the_error_fall(tmp_path):
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypatch, method, options):
     system = Oscillator()
     config = toy(system, method, duration=20.0, inverse_steps=400, **options)
-    whole = train(system, config, tmp_path / "whole").artifact
+    whole = train(system, config, tmp_path / "whole", device=CPU).artifact
 
     monkeypatch.setattr(checkpoints, "SECONDS", 0.0)
     save, saved = training.maps.optimise._save, []
@@ -109,9 +109,9 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
 
     monkeypatch.setattr(training.maps.optimise, "_save", save_and_stop)
     with pytest.raises(KeyboardInterrupt):
-        train(system, config, tmp_path / "cut")
+        train(system, config, tmp_path / "cut", device=CPU)
     monkeypatch.setattr(training.maps.optimise, "_save", save)
-    resumed = train(system, config, tmp_path / "cut", resume=True)
+    resumed = train(system, config, tmp_path / "cut", resume=True, device=CPU)
     for a, b in zip(whole.inverse.mlp.weights, resumed.artifact.inverse.mlp.weights, strict=True):
         np.testing.assert_array_equal(a, b)
     assert resumed.losses["inverse"][-1][0] == 400
@@ -120,13 +120,13 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(tmp_path, monkeypa
         for a, b in zip(whole.free_inverse.mlp.weights, resumed.artifact.free_inverse.mlp.weights, strict=True):
             np.testing.assert_array_equal(a, b)
     with pytest.raises(ValueError, match="seed = 0 there, 1 here"):
-        train(system, replace(config, seed=1), tmp_path / "cut", resume=True)
+        train(system, replace(config, seed=1), tmp_path / "cut", resume=True, device=CPU)
     with pytest.raises(ValueError, match="--resume"):
-        train(system, config, tmp_path / "cut")
+        train(system, config, tmp_path / "cut", device=CPU)
     checkpoint = tmp_path / "cut" / "inverse.checkpoint.pt"
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):
-        train(system, config, tmp_path / "cut", resume=True)
+        train(system, config, tmp_path / "cut", resume=True, device=CPU)
 
 
 def test_a_run_is_not_resumed_for_another_process_noise(tmp_path):
