@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 import kkl_gym
-from observers.errors import ArtifactError
 from training.export import c_templates, c_tracker_templates
 from training.export.c_map import levels, map_constants, map_functions, process_level
 from training.export.c_text import array, comment, number
@@ -32,11 +31,7 @@ def c_files(exported: Exported) -> dict[str, str]:
     ArtifactError
         If it tracks, and its output is not linear.
     """
-    if exported.artifact.flow is not None and exported.artifact.C is None:
-        raise ArtifactError(
-            f"{exported.source} tracks by an output h(x) that is not linear, and C takes y = C x alone: export the map "
-            "that it was made from (kkl-gym tracking leaves it as it is), which is T_inv alone"
-        )
+    exported.refuse_nonlinear("C")
     name, words = exported.name, _words(exported)
     return {
         f"{name}.h": _header(exported, words),

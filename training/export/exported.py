@@ -114,8 +114,27 @@ class Exported:
         """
         if self.artifact.flow is not None:
             raise ArtifactError(
-                f"{self.source} tracks, which --format c alone can export. For others export the map that it was made "
-                "from, which is T_inv alone: of those that ship NAME-static"
+                f"{self.source} tracks, which --format js cannot export: export the map that it was made from, which "
+                "is T_inv alone. Of those that ship it is NAME-static"
+            )
+
+    def refuse_nonlinear(self, what: str) -> None:
+        """See that it does not track by an output that is not linear.
+
+        Parameters
+        ----------
+        what : str
+            What takes no other.
+
+        Raises
+        ------
+        ArtifactError
+            If it does.
+        """
+        if self.artifact.flow is not None and self.artifact.C is None:
+            raise ArtifactError(
+                f"{self.source} tracks by an output h(x) that is not linear, and {what} takes y = C x alone: export "
+                "the map that it was made from (kkl-gym tracking leaves it as it is), which is T_inv alone"
             )
 
     def _check_range(self) -> None:

@@ -12,37 +12,12 @@ from observers.names import resolve
 from observers.storage import checksum
 from training.export import Exported
 
-onnx = pytest.importorskip("onnx", reason="needs the extra onnx")
-onnxruntime = pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+pytest.importorskip("onnx", reason="needs the extra onnx")
+pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 
-from training.export.onnx_graph import OPSET, onnx_model  # noqa: E402
+from onnx_steps import Runner
 
-
-class Runner:
-    """An exported observer, in a batch."""
-
-    def __init__(self, exported):
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        model = onnx_model(exported).SerializeToString()
-        self.session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-        self.exported, self.types = exported, {one.name: one.type for one in self.session.get_inputs()}
-
-    def step(self, **given):
-        n = len(given["z"])
-        given |= {"measurement_noise": np.tile(self.exported.levels, (n, 1)),
-                  "process_noise": np.full((n, 1), self.exported.process_noise)}  # fmt: skip
-        types = {"tensor(float)": np.float32, "tensor(double)": float}
-        inputs = {name: given[name].astype(types[kind]) for name, kind in self.types.items()}
-        return self.session.run(["z_next", "x_hat"], inputs)
-
-    def along(self, y, u):
-        z, x_hat = np.full((y.shape[1], self.exported.artifact.filter.size), np.nan), []  # of which nothing is known
-        for k in range(len(y)):
-            age = np.full((y.shape[1], 1), k)
-            z, estimate = self.step(z=z, y=y[k - 1], u=u[k - 1], y_next=y[k], age=age)
-            x_hat.append(estimate)
-        return np.array(x_hat)
+from training.export.onnx_graph import OPSET, onnx_model
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-10)])
@@ -81,19 +56,20 @@ def test_rows_have_levels_of_their_own_and_begin_anew(make_artifact, tmp_path):
     z = np.zeros((2, exported.artifact.filter.size))
     for k in range(20):
         age = np.array([[k], [k if k < 10 else k - 10]])
-        z, x_hat = runner.step(z=z, y=y[k - 1], u=u[k - 1], y_next=y[k], age=age)
+        found = runner.step(z=z, y=y[k - 1], u=u[k - 1], y_next=y[k], age=age)
+        z, x_hat = found["z_next"], found["x_hat"]
     np.testing.assert_allclose(x_hat[0], in_doubles(exported, y, u)[-1, 0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(x_hat[1], in_doubles(exported, y[10:], u[10:])[-1, 1], rtol=0, atol=1e-9)
     runner.exported = Exported.read("lorenz-static", measurement_noise=7 - 4.5)  # beyond what this map is told: 1
-    beyond = runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))[1]
+    beyond = runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))["x_hat"]
     runner.exported = Exported.read("lorenz-static", measurement_noise=1.0)
-    assert np.array_equal(beyond, runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))[1])
+    assert np.array_equal(beyond, runner.step(z=z, y=y[0], u=u[0], y_next=y[1], age=np.full((2, 1), 5))["x_hat"])
 
 
 def test_an_input_that_is_no_number_is_not_taken_for_none(make_artifact, tmp_path):
     exported = exported_of(make_artifact(free_inverse=True), tmp_path)
     z, y = np.zeros((1, exported.artifact.filter.size)), np.ones((1, 1))
-    x_hat = Runner(exported).step(z=z, y=y, u=np.full((1, 1), np.nan), y_next=y, age=np.ones((1, 1)))[1]
+    x_hat = Runner(exported).step(z=z, y=y, u=np.full((1, 1), np.nan), y_next=y, age=np.ones((1, 1)))["x_hat"]
     assert np.isnan(x_hat).all()
 
 
