@@ -1,6 +1,6 @@
 """Build the demo in the browser: ``python docs/demo/build.py OUT`` makes a folder that any file server can show.
 
-It holds this folder's page, the module ``kkl_observer.js``, and the constants of T_inv alone of each system as
+It holds this folder's page, the module ``kkl_observer.js``, and the constants of each system's default map as
 ``kkl-gym export --format js`` writes them.
 """
 
@@ -34,7 +34,7 @@ def build(out: Path) -> None:
     (out / "kkl_observer.js").write_text(javascript(), encoding="utf-8")
     described = []
     for name, cls in kkl_gym.SYSTEMS.items():
-        exported, system = Exported.read(f"{name}-static"), cls()
+        exported, system = Exported.read(name), cls()
         write_step(out / f"{name}_step.safetensors", exported)
         described.append(
             {

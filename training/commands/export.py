@@ -20,8 +20,8 @@ class ExportCommand:
 
     All take in a sample and the input before it, and give the filter's next state and the estimate, as
     observers.KKLObserver does. All maps can be exported: those that ship, of your own systems, from records and from
-    rollouts. Those that track need --format c or onnx, and an output that is linear. Missing samples are in JavaScript
-    and, of maps that track, in the others. The monitor is in JavaScript alone.
+    rollouts. Those that track need an output that is linear. Missing samples are in JavaScript and, of maps that
+    track, in the others. The monitor is in JavaScript alone.
 
     --format onnx writes NAME.onnx, which takes a batch of any size. Levels of noise are inputs of it. It needs the
     extra onnx. --format c writes NAME.h and NAME.c, which allocate nothing and need the C library's math.h alone, and

@@ -104,20 +104,6 @@ class Exported:
             exported._check_range()
         return exported
 
-    def refuse_flow(self) -> None:
-        """See that the filter and T_inv are all there is.
-
-        Raises
-        ------
-        ArtifactError
-            If it tracks.
-        """
-        if self.artifact.flow is not None:
-            raise ArtifactError(
-                f"{self.source} tracks, which --format js cannot export: export the map that it was made from, which "
-                "is T_inv alone. Of those that ship it is NAME-static"
-            )
-
     def refuse_nonlinear(self, what: str) -> None:
         """See that it does not track by an output that is not linear.
 

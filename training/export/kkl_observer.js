@@ -73,6 +73,16 @@ function interpolate(x, xs, values) {
   return values[i - 1] + ((x - xs[i - 1]) / (xs[i] - xs[i - 1])) * (values[i] - values[i - 1]);
 }
 
+/** Values of tables by level of noise and age, at each age: between levels, and between none and the most process noise. */
+function byAge(table, { levels, ages }, share, processShare, of = (value) => value) {
+  const count = levels.data.length, m = ages.data.length;
+  const part = table.shape.length === 3 ? Math.min(processShare, 1) : 0;
+  return Float64Array.from(ages.data, (_, j) => {
+    const column = (k) => interpolate(share, levels.data, Array.from(levels.data, (_, i) => of(table.data[(k * count + i) * m + j])));
+    return part ? (1 - part) * column(0) + part * column(1) : column(0);
+  });
+}
+
 /** T_inv: the filter's state, the age and the levels of noise to an estimate. */
 class InverseMap {
   constructor(tensors, prefix, described) {
@@ -105,20 +115,16 @@ class InverseMap {
       this.inputs[at++] = Math.log1p(Math.min(process, this.process_noise_max) / this.process_noise_unit);
     }
     this.ageInput = at;
-    if (this.spread) this.#tellSpread(measured, process, of);
+    if (this.spread) {
+      this.logFactors = byAge(this.spread.factors, this.spread, ...this.shares(measured, process), (factor) => Math.log(factor) / 2);
+    }
   }
 
-  #tellSpread(measured, process, of) {
-    const { levels, ages, factors } = this.spread;
-    const count = levels.data.length, m = ages.data.length;
+  /** Levels in multiples of the highest that the map is told, of the noisiest output. */
+  shares(measured, process) {
     const ends = this.measurement_noise_max;
-    const share = ends == null ? 0 : Math.max(...measured.map((level, i) => level / of(ends, i)));
-    const processShare = factors.shape.length === 3 ? Math.min(process / this.process_noise_max, 1) : 0;
-    this.logFactors = Float64Array.from(ages.data, (_, j) => {
-      const column = (table) =>
-        interpolate(share, levels.data, Array.from(levels.data, (_, k) => Math.log(factors.data[(table * count + k) * m + j]) / 2));
-      return processShare ? (1 - processShare) * column(0) + processShare * column(1) : column(0);
-    });
+    const share = ends == null ? 0 : Math.max(...measured.map((level, i) => level / (Array.isArray(ends) ? ends[i] : ends)));
+    return [share, this.process_noise_max ? process / this.process_noise_max : 0];
   }
 
   read(z, age) {
@@ -143,11 +149,149 @@ class InverseMap {
     const factor = interpolate(age, this.spread.ages.data, this.logFactors);
     const rows = [];
     for (let i = 0, k = nx; i < nx; i++) {
-      const scale = Math.abs(this.x_scale.data[i]) * Math.exp(Math.min(out[i], 100) + factor);
+      const scale = Math.exp(Math.min(out[i], 100) + factor);
       rows.push([...Array.from({ length: i }, () => scale * out[k++]), scale]);
     }
     const entry = (a, b) => a.reduce((sum, value, m) => sum + value * (b[m] ?? 0), 0);
     return rows.map((row) => rows.map((other) => entry(row, other)));
+  }
+}
+
+/** A covariance in units of the states, or in scaled ones. */
+const scaled = (P, scale, power) => P.map((row, i) => row.map((value, j) => value * (scale[i] * scale[j]) ** power));
+
+/** An estimate that goes on with the learned motion of the system, and is corrected by each sample. */
+class Tracker {
+  constructor(tensors, described, C) {
+    Object.assign(this, described);
+    const names = ["x_offset", "x_scale", "u_scale", "gain", "polynomial", "earlier", "by", "low", "high", "error", "process_noise"];
+    for (const name of [...names, "least_measurement_noise"]) this[name] = tensors[`flow.${name}`]?.data ?? [];
+    this.network = new Network(tensors, "flow.", this.activation);
+    this.nx = this.x_offset.length;
+    this.ny = C.shape[0];
+    this.inputs = new Float64Array(this.nx + this.u_scale.length);
+    this.monomials = new Float64Array(this.earlier.length).fill(1);
+    this.C = Array.from({ length: this.ny }, (_, k) => Array.from(this.x_scale, (scale, i) => C.data[k * this.nx + i] * scale));
+    this.mean = this.C.map((_, k) => this.x_offset.reduce((sum, value, i) => sum + C.data[k * this.nx + i] * value, 0));
+    this.factors = ["factors", "free_factors"].map((kind) => {
+      const found = (name) => tensors[`flow.${kind}.${name}`] ?? tensors[`flow.factors.${name}`];
+      return Object.fromEntries(["levels", "ages", "factors", "doubt"].map((name) => [name, found(name)]));
+    });
+  }
+
+  /** What is assumed of noise; measured is a level for each output. */
+  tell(measured, process, shares) {
+    const level = Math.max(process, this.least_process_noise);
+    this.Q = Array.from(this.error, (error, i) => (level * this.process_noise[i]) ** 2 + error ** 2);
+    this.R = measured.map((own, k) => Math.max(own, this.least_measurement_noise[k]) ** 2);
+    this.calibrated = this.factors.map((each) => ({
+      ages: each.ages.data,
+      logs: byAge(each.factors, each, ...shares, Math.log),
+      doubts: byAge(each.doubt, each, ...shares),
+    }));
+  }
+
+  /** Begin with what a map says of z, at an age in samples. */
+  begin(map, z, age) {
+    this.meanSquare = Infinity; // lost as yet
+    this.supervise(map, z, age);
+  }
+
+  get estimate() {
+    return Array.from(this.x, (value, i) => this.x_offset[i] + this.x_scale[i] * value);
+  }
+
+  #within(s) {
+    return s.map((value, i) => Math.min(Math.max(value, this.low[i]), this.high[i]));
+  }
+
+  /** Scaled states a sample later. */
+  #flow(s, v) {
+    const { nx, inputs, monomials, earlier, by, polynomial, gain } = this;
+    inputs.set(s);
+    inputs.set(v, nx);
+    const terms = monomials.length;
+    for (let t = 1; t < terms; t++) monomials[t] = monomials[earlier[t]] * inputs[by[t]];
+    const said = this.network.run(inputs);
+    return s.map((value, i) => {
+      let next = value + gain[i] * said[i];
+      for (let t = 0; t < terms; t++) next += polynomial[i * terms + t] * monomials[t];
+      return next;
+    });
+  }
+
+  /** Estimate and covariance a sample later, of the mean +- sqrt(nx) times each column of P's factor. */
+  #predicted(u) {
+    const { nx, x, P, Q } = this;
+    const L = P.map(() => new Array(nx).fill(0));
+    for (let i = 0; i < nx; i++) {
+      for (let j = 0; j <= i; j++) {
+        let entry = P[i][j];
+        for (let k = 0; k < j; k++) entry -= L[i][k] * L[j][k];
+        L[i][j] = i > j ? entry / L[j][j] : entry > 0 ? Math.sqrt(entry) : NaN; // which spreads, and is noticed in advance
+      }
+    }
+    const v = Array.from(this.u_scale, (scale, j) => u[j] / scale);
+    const points = [];
+    for (let j = 0; j < nx; j++) {
+      for (const far of [Math.sqrt(nx), -Math.sqrt(nx)]) {
+        points.push(this.#flow(this.#within(x.map((value, i) => value + far * L[i][j])), v));
+      }
+    }
+    const average = (of) => points.reduce((sum, point) => sum + of(point), 0) / points.length;
+    const mean = x.map((_, i) => average((point) => point[i]));
+    const spread = P.map((row, i) => row.map((_, j) => average((point) => (point[i] - mean[i]) * (point[j] - mean[j])) + (i === j ? Q[i] : 0)));
+    return [mean, spread];
+  }
+
+  /** Take in a sample, of which outputs may be NaN, after an input; returns it, with what was expected in their place. */
+  advance(y, u, before) {
+    let [x, P] = this.#predicted(u);
+    const expected = this.C.map((row, k) => row.reduce((sum, value, i) => sum + value * x[i], this.mean[k]));
+    const whole = y.map((value, k) => (!Number.isNaN(value) ? value : Number.isFinite(expected[k]) ? expected[k] : before[k]));
+    let squared = 0, seen = 0;
+    for (let k = 0; k < this.ny; k++) {
+      if (Number.isNaN(y[k])) continue;
+      const row = this.C[k];
+      const across = P.map((entries) => entries.reduce((sum, value, j) => sum + value * row[j], 0));
+      const apart = y[k] - row.reduce((sum, value, i) => sum + value * x[i], this.mean[k]);
+      const pivot = row.reduce((sum, value, i) => sum + value * across[i], this.R[k]);
+      squared += apart ** 2 / pivot;
+      seen++;
+      x = x.map((value, i) => value + (across[i] / pivot) * apart);
+      P = P.map((entries, i) => entries.map((value, j) => value - (across[i] / pivot) * across[j]));
+    }
+    if (![...x, ...P.flat()].every(Number.isFinite)) {
+      this.meanSquare = Infinity; // lost
+      return whole;
+    }
+    [this.x, this.P] = [this.#within(x), P];
+    if (seen) this.meanSquare += ((this.share * seen) / this.ny) * (squared / seen - this.meanSquare);
+    return whole;
+  }
+
+  /** Let a map say where to begin, of z at an age in samples: soon after a reset where it is surer, and where all is lost. */
+  supervise(map, z, age) {
+    const lost = !(this.meanSquare <= this.limit); // also where it is no number
+    if (!lost && age >= this.window) return;
+    // What came before it was lost may have misled z: the map is no surer than so soon after a reset.
+    const P = scaled(map.covariance(z, Math.min(age, this.window) * this.dt), this.x_scale, -1);
+    const trace = (matrix) => matrix.reduce((sum, row, i) => sum + row[i], 0);
+    if (!lost && !(trace(P) < trace(this.P))) return;
+    this.x = this.#within(map.mean(z, age * this.dt).map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]));
+    this.P = P;
+    if (lost) this.meanSquare = 1;
+  }
+
+  /** The covariance of the estimate's error; the map is that of free motion until an input acts. */
+  covariance(map, z, age, free) {
+    const { ages, logs, doubts } = this.calibrated[Number(free)];
+    const factor = Math.exp(interpolate(age * this.dt, ages, logs)), doubt = interpolate(age * this.dt, ages, doubts);
+    const P = scaled(this.P, this.x_scale, 1);
+    if (age >= this.window) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
+    const said = map.covariance(z, age * this.dt), estimate = this.estimate;
+    const apart = map.mean(z, age * this.dt).map((value, i) => value - estimate[i]);
+    return P.map((row, i) => row.map((value, j) => factor * (value + doubt * (said[i][j] + apart[i] * apart[j] - value))));
   }
 }
 
@@ -213,6 +357,7 @@ export class Observer {
     const { driven, free } = this.described.maps;
     this.driven = new InverseMap(tensors, "driven.", driven);
     this.free = free && new InverseMap(tensors, "free.", free);
+    this.tracker = this.described.flow ? new Tracker(tensors, { ...this.described.flow, dt: this.dt }, this.C) : null;
     this.tell(this.described.measurement_noise, this.described.process_noise);
   }
 
@@ -225,6 +370,7 @@ export class Observer {
     });
     this.driven.tell(each, processNoise);
     this.free?.tell(each, processNoise);
+    this.tracker?.tell(each, processNoise, this.driven.shares(each, processNoise));
     const { limits } = this.described;
     this.monitor = limits && this.C ? new Monitor(this.tensors, limits, each, this.dt) : null;
   }
@@ -237,7 +383,8 @@ export class Observer {
     this.y = [...y0];
     this.age = 0;
     this.monitor?.reset();
-    return (this.xHat = this.#estimate(this.z, 0));
+    this.tracker?.begin(this.#map(this.z), this.z, 0);
+    return (this.xHat = this.tracker ? this.tracker.estimate : this.#estimate(this.z, 0));
   }
 
   /**
@@ -248,7 +395,9 @@ export class Observer {
   step(y, u = new Array(this.nu).fill(0)) {
     const missing = this.y.map((_, i) => y === null || Number.isNaN(y[i]));
     let now = y;
-    if (missing.includes(true)) {
+    if (this.tracker) {
+      now = this.tracker.advance(missing.map((gap, i) => (gap ? NaN : y[i])), u, this.y);
+    } else if (missing.includes(true)) {
       if (!this.C) throw new Error("this map holds no linear output y = C x to predict with: pass the last sample again");
       const filled = (xHat) => this.y.map((_, i) => (missing[i] ? this.#dot(this.C.data, i, xHat) : y[i]));
       const guess = this.#advanced(filled(this.#estimate(this.z, this.age * this.dt)), u);
@@ -257,7 +406,8 @@ export class Observer {
     this.z = this.#advanced(now, u);
     this.y = [...now];
     this.age++;
-    this.xHat = this.#estimate(this.z, this.age * this.dt);
+    this.tracker?.supervise(this.#map(this.z), this.z, this.age);
+    this.xHat = this.tracker ? this.tracker.estimate : this.#estimate(this.z, this.age * this.dt);
     if (this.monitor && y !== null) {
       this.monitor.update(this.y.map((value, i) => value - this.#dot(this.C.data, i, this.xHat)), missing.map((gap) => !gap));
     }
@@ -272,6 +422,7 @@ export class Observer {
   /** Covariance of the estimate's error, rows of numbers; null where the map holds no error bars. */
   get covariance() {
     const map = this.#map(this.z);
+    if (this.tracker) return this.tracker.covariance(map, this.z, this.age, !this.z.some((value, i) => i >= this.nz && value !== 0));
     return map.spread ? map.covariance(this.z, this.age * this.dt) : null;
   }
 

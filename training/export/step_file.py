@@ -7,7 +7,10 @@ from typing import Any
 import numpy as np
 
 from observers import storage
+from observers.flow import Flow
 from observers.inverse import InverseMap
+from observers.polynomial import table
+from observers.tracker import supervision
 from training.export.exported import Exported
 
 KEY = "kkl_step"  # of the metadata
@@ -15,6 +18,7 @@ _MAP_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _MAP_SCALARS = tuple(
     f"{name}_{end}" for name in ("measurement_noise", "process_noise", "age") for end in ("unit", "max")
 )
+_FLOW_ARRAYS = ("x_offset", "x_scale", "u_scale", "gain", "polynomial", "low", "high", "error", "process_noise")
 _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
 
 
@@ -36,11 +40,11 @@ def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
     Raises
     ------
     ArtifactError
-        If it tracks.
+        If it tracks, and its output is not linear.
     OSError
         If the file cannot be written.
     """
-    exported.refuse_flow()
+    exported.refuse_nonlinear("JavaScript")
     artifact, linear = exported.artifact, exported.artifact.filter
     nz = len(linear.A)
     block = linear.transition[:nz, :nz]
@@ -54,6 +58,8 @@ def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
     described = exported.described | {"maps": {}}
     for label, inverse in exported.maps.items():
         described["maps"][label] = _described_map(tensors, f"{label}.", inverse)
+    if artifact.flow is not None:
+        described["flow"] = _described_flow(tensors, artifact.flow, linear.dt)
     if artifact.C is not None:
         tensors["C"] = np.asarray(artifact.C, dtype=float)
     if artifact.limits is not None:
@@ -72,7 +78,30 @@ def _described_map(tensors: dict[str, np.ndarray], prefix: str, inverse: Inverse
         if np.isfinite(value).all():  # JSON knows no infinity
             described[name] = value
     if inverse.spread is not None:
-        storage.put_mlp(tensors, f"{prefix}spread.", inverse.spread.mlp)
+        storage.put_mlp(tensors, f"{prefix}spread.", inverse.spread.in_units(inverse.x_scale))
         tensors |= {f"{prefix}spread.{name}": getattr(inverse.spread, name) for name in ("levels", "ages", "factors")}
         described["spread"] = {"activation": inverse.spread.mlp.activation}
     return described
+
+
+def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> dict[str, Any]:
+    """Add a flow's arrays, with bounds of scaled states; returns what else there is to say of it."""
+    storage.put_mlp(tensors, "flow.", flow.mlp)
+    arrays = {name: getattr(flow, name) for name in _FLOW_ARRAYS}
+    arrays |= {name: (arrays[name] - flow.x_offset) / flow.x_scale for name in ("low", "high")}
+    arrays["least_measurement_noise"] = flow.least_measurement_noise
+    arrays["earlier"], arrays["by"] = table(flow.nx + flow.nu, flow.degree)
+    for kind, factors in (("factors", flow.factors), ("free_factors", flow.free_factors)):
+        if factors is not None:
+            doubt = np.zeros_like(factors.factors) if factors.doubt is None else factors.doubt
+            of_kind = {"levels": factors.levels, "ages": factors.ages, "factors": factors.factors, "doubt": doubt}
+            arrays |= {f"{kind}.{name}": values for name, values in of_kind.items()}
+    tensors |= {f"flow.{name}": np.asarray(values, dtype=float) for name, values in arrays.items() if values.size}
+    window, share, limit = supervision(flow, dt)
+    return {
+        "activation": flow.mlp.activation,
+        "least_process_noise": flow.least_process_noise,
+        "window": window,
+        "share": share,
+        "limit": limit,
+    }

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from error_bars import with_error_bars
-from exported_steps import apart, exported_of, motion, noise
+from exported_steps import apart, exported_of, motion, noise, stepped
+from random_tracking import signals, tracking
 
-from observers import KKLObserver, Limits, load
+from observers import Expression, KKLObserver, Limits, load
 from training.export import Exported
 from training.export.step_file import javascript, write_step
 
@@ -54,7 +55,7 @@ def test_every_kind_of_map(options, make_artifact, tmp_path):
     assert apart(exported, x_hat, y, u) < 1e-10
 
 
-@pytest.mark.parametrize("name", ["reverse_duffing-static", "van_der_pol-static", "rossler-static", "lorenz-static"])
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "rossler", "lorenz", "rossler-static"])
 def test_what_ships_with_its_monitor(name, tmp_path):
     exported = Exported.read(name)
     artifact = exported.artifact
@@ -73,12 +74,13 @@ def test_what_ships_with_its_monitor(name, tmp_path):
     assert np.allclose(found["score"], score, rtol=1e-3, atol=1e-4)
 
 
-def test_samples_that_are_missing(tmp_path):
-    exported = Exported.read("van_der_pol-static")
+@pytest.mark.parametrize("name", ["van_der_pol", "van_der_pol-static"])
+def test_samples_that_are_missing(name, tmp_path):
+    exported = Exported.read(name)
     y, u = motion(exported.artifact, 600)
     y[300:350] = np.nan
     found = np.array(replayed(exported, tmp_path, y, u)["x_hat"])
-    observer = load("van_der_pol-static")
+    observer = load(name)
     x_hat = [observer.reset(y[0]), *(observer.step(None if np.isnan(a).any() else a, b) for a, b in zip(y[1:], u))]
     assert (abs(found - x_hat) / exported.artifact.inverse.x_scale).max() < 1e-4
 
@@ -116,3 +118,44 @@ def test_error_bars(process, make_artifact, tmp_path):
         observer.step(y[k], u[k - 1]) if k else observer.reset(y[0])
         covariances.append(observer.covariance)
     assert np.allclose(found, covariances, rtol=1e-3, atol=1e-5 * np.abs(covariances).max())
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"inputs": False},
+        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True},
+        {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
+    ],
+)
+def test_maps_that_track(options, tmp_path):
+    exported = exported_of(tracking(**options), tmp_path, precision="double")  # compared with a step in doubles
+    y, u = signals(exported.artifact, 1000)
+    y[700:720] = y[300::7, 0] = np.nan
+    found = replayed(exported, tmp_path, y, u)
+    assert apart(exported, np.array(found["x_hat"]), y, u) < 1e-9
+    lost = [observer._tracker._mean_square[0] == 1.0 for observer in stepped(exported, y, u)]
+    assert any(lost[600:700])
+
+
+def test_error_bars_of_maps_that_track(tmp_path):
+    artifact = tracking(process=True, free_inverse=True)
+    free = replace(artifact.flow.factors, factors=2.0 * artifact.flow.factors.factors)
+    doubtful = replace(artifact.flow.factors, doubt=np.full(free.factors.shape, 0.3))
+    exported = exported_of(
+        replace(artifact, flow=replace(artifact.flow, factors=doubtful, free_factors=free)), tmp_path
+    )
+    y, u = signals(artifact, 200)
+    found = np.array(replayed(exported, tmp_path, y, u, told=(0.7, 0.05))["covariance"])
+    told = replace(exported, measurement_noise=0.7, process_noise=0.05)
+    for k, observer in enumerate(stepped(told, y, u)):
+        expected = observer.covariance
+        assert np.allclose(found[k], expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max()), k
+
+
+def test_outputs_that_are_not_linear_are_refused(tmp_path):
+    curved = replace(tracking(), C=None, h=Expression([["+", ["x", 0], ["x", 1]]]))
+    exported = exported_of(curved, tmp_path)
+    with pytest.raises(ValueError, match="not linear, and JavaScript takes y = C x alone"):
+        write_step(tmp_path / "step.safetensors", exported)
