@@ -77,7 +77,12 @@ def estimate(
     ValueError
         As :func:`training.train`.
     """
-    brief = replace(config, cpu_seconds=None, **_few_batches(config))
+    brief = replace(
+        config,
+        cpu_seconds=None,
+        forward_steps=min(FEW, config.forward_steps),
+        inverse_steps=min(FEW, config.inverse_steps),
+    )
     # What is done for the first time takes longer, on a GPU by seconds.
     _short_run(system, replace(brief, trajectories=min(WARM_UP_TRAJECTORIES, config.trajectories)), device=device)
     report(1)
@@ -107,10 +112,6 @@ def estimate(
         + pairs * (system.nx * (8 * STATES + 4 * TORCH_STATES) + size * (8 * FILTER_STATES + 4 * TORCH_FILTER_STATES)),
         seconds=seconds,
     )
-
-
-def _few_batches(config: Config) -> dict[str, int]:
-    return {name: min(FEW, getattr(config, name)) for name in ("forward_steps", "inverse_steps")}
 
 
 def _short_run(system: System, config: Config, *, device: torch.device | None) -> Result:
