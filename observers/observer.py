@@ -363,7 +363,8 @@ class KKLObserver:
         Parameters
         ----------
         y : array_like, shape (..., ny), or None
-            The sample; None if it is missing. Entries of one of several outputs are NaN where they are missing.
+            The sample; None if it is missing. Of several outputs, and of the rows of a batch, some may be missing: they
+            are NaN.
         u : array_like, shape (..., nu), optional
             The input that led to it, by default zero.
 
@@ -600,7 +601,7 @@ class KKLObserver:
         Parameters
         ----------
         y : array_like, shape (steps, ..., ny)
-            Outputs; the first row is y_0. Entries of one of several outputs are NaN where they are missing.
+            Outputs; the first row is y_0. Later ones are NaN where they are missing.
         u : array_like, shape (steps - 1, ..., nu), optional
             The input held after each row but the last, by default zero. A last row more is ignored.
         x0 : array_like, shape (..., nx), optional
@@ -730,14 +731,15 @@ class KKLObserver:
         of: Callable[["KKLObserver"], np.ndarray],
     ) -> np.ndarray:
         """What is asked of another observer like this one at each sample of a record."""
-        y, _ = self._record(y, u)
+        y, gaps = self._record(y, u)
         other = self._twin()
         other.reset(y[0], x0)
         first = of(other)
         found = np.empty((len(y), *first.shape))
         found[0] = first
         for k in range(1, len(y)):
-            other.advance(y[k], None if u is None else u[k - 1])
+            missing = gaps is not None and gaps[k].all()
+            other.advance(None if missing else y[k], None if u is None else u[k - 1])
             found[k] = of(other)
         return found
 
@@ -765,7 +767,7 @@ class KKLObserver:
             raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
         if all_finite(y):
             return None
-        if ny == 1:
+        if ny == 1 and not batch:
             raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
         gaps = np.isnan(y)
         if not all_finite(np.where(gaps, 0.0, y)):

@@ -42,12 +42,12 @@ COMMANDS = {
 
 # What an interruption may be followed by, by the first words of the command.
 AFTER_INTERRUPTION = {
-    ("train",): "--resume goes on from the last checkpoint",
-    ("identify",): "--resume goes on from the last checkpoint",
-    ("adapt",): "--resume goes on from the last checkpoint",
+    ("train",): "--resume goes on from the last checkpoint, if there is one",
+    ("identify",): "--resume goes on from the last checkpoint, if there is one",
+    ("adapt",): "--resume goes on from the last checkpoint, if there is one",
     ("benchmark",): "the same command goes on",
     ("sizes",): "the same command goes on",
-    ("agent", "train"): "--resume goes on from the last checkpoint",
+    ("agent", "train"): "--resume goes on from the last checkpoint, if there is one",
     ("agent", "compare"): "the same command goes on",
 }
 

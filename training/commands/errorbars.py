@@ -26,7 +26,7 @@ class ErrorBars(Teaching):
     steps: int = 4000
     """Batches for the network, or each of the two where motions without input have a map of their own."""
     trajectories: int = 1000
-    """Number of motions to learn from; to calibrate on there are twice as many."""
+    """Number of motions to learn from, 100 at least; to calibrate on there are twice as many."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """The file to write; by default one of the map's own name in runs/errorbars."""
 

@@ -63,13 +63,16 @@ class Teaching:
         Raises
         ------
         ValueError
-            If the observer cannot be had, or an option makes no sense for it.
+            If the observer cannot be had, is what would be written over, or an option makes no sense for it.
         """
         if out.suffix != ".safetensors":
             raise ValueError(f"out = {out} must end in .safetensors")
         if out.is_dir():
             raise ValueError(f"out = {out} is a folder")
-        artifact = Artifact.read(resolve(self.observer))
+        source = resolve(self.observer)
+        artifact = Artifact.read(source)
+        if out.exists() and out.samefile(source):
+            raise ValueError(f"out = {out} is the map that is taught, which would be lost: name another file")
         with progress_bars(console) as progress:
             settings |= {"seed": self.seed, "console": progress}
             if artifact.signals is None:

@@ -29,7 +29,7 @@ class Tracking(Teaching):
     steps: int = 40_000
     """Batches for the network."""
     trajectories: int = 1600
-    """Number of motions on which covariances are calibrated."""
+    """Number of motions on which covariances are calibrated, 50 at least."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None
     """The file to write; by default one of the map's own name in runs/tracking."""
 
@@ -56,7 +56,7 @@ class Tracking(Teaching):
 
         name = re.sub(r"-v\d+$", "", resolve(self.observer).stem)
         out = Path(f"runs/tracking/{name}.safetensors") if self.out is None else self.out
-        return self.taught(
+        found = self.taught(
             out,
             console,
             from_system=learn_tracking,
@@ -64,3 +64,8 @@ class Tracking(Teaching):
             trajectories=self.trajectories,
             steps=self.steps,
         )
+        if found.signals is None:
+            own = f" --system {self.system}" if self.system else ""
+            line = f"kkl-gym evaluate {self.observer} {out}{own} says what it gains"
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
+        return found

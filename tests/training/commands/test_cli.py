@@ -186,10 +186,13 @@ def test_a_module_of_ones_own_that_is_missing_gets_no_hint(monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint"),
+        (["train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint, if there is one"),
         (["benchmark"], "kkl-gym: interrupted; the same command goes on"),
         (["agent", "compare"], "kkl-gym: interrupted; the same command goes on"),
-        (["agent", "train", "lorenz"], "kkl-gym: interrupted; --resume goes on from the last checkpoint"),
+        (
+            ["agent", "train", "lorenz"],
+            "kkl-gym: interrupted; --resume goes on from the last checkpoint, if there is one",
+        ),
         (["agent", "evaluate", "lorenz"], "kkl-gym: interrupted"),
         (["maps"], "kkl-gym: interrupted"),
     ],
