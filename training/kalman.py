@@ -224,6 +224,7 @@ class ExtendedKalmanFilter(KalmanFilter):
         self._joint = with_sensitivity(system)
         self._outputs = jacobian(system.h, system.nx)
 
+    @np.errstate(over="ignore", invalid="ignore")  # of filters that are lost, which start anew
     def _predicted(self, u: np.ndarray) -> Gaussian:
         n, nx = self.x.shape
         Phi0 = np.broadcast_to(np.eye(nx).reshape(-1, 1), (nx * nx, n))
