@@ -52,8 +52,7 @@ class CompiledTracker:
         network, (q, r) = flow.mlp.compiled, variances
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
-        low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
-        states = _packed(low, high, flow.gain, q, flow.x_offset, flow.x_scale)
+        states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale)
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx

@@ -116,6 +116,11 @@ class Flow:
         """Number of inputs."""
         return len(self.u_scale)
 
+    @property
+    def scaled_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of scaled states, (nx,) each."""
+        return (self.low - self.x_offset) / self.x_scale, (self.high - self.x_offset) / self.x_scale
+
     @functools.cached_property
     def degree(self) -> int:
         """Degree of the polynomial."""

@@ -767,7 +767,7 @@ class KKLObserver:
             raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
         if all_finite(y):
             return None
-        if ny == 1 and not batch:
+        if ny == 1 and not batch and not first:
             raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
         gaps = np.isnan(y)
         if not all_finite(np.where(gaps, 0.0, y)):

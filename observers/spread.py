@@ -54,9 +54,12 @@ class Spread:
         return (math.isqrt(8 * self.mlp.outputs + 1) - 1) // 2
 
     def in_units(self, scale: np.ndarray) -> MLP:
-        """The network with the scale of the states (nx,) in its last biases: the logarithms are of D in their units."""
+        """The network with the scale of the states in its last biases: the logarithms are of D in their units.
+
+        Behind the states there may be parameters, of whose errors nothing is said.
+        """
         *biases, bias = (np.array(each, dtype=float) for each in self.mlp.biases)
-        bias[: self.nx] += np.log(np.maximum(np.abs(scale), np.finfo(float).tiny))
+        bias[: self.nx] += np.log(np.maximum(np.abs(scale[: self.nx]), np.finfo(float).tiny))
         return MLP(self.mlp.weights, [*biases, bias], self.mlp.activation)
 
 

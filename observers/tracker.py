@@ -92,7 +92,7 @@ class Tracker:
         self._flow, self._artifact, self._decoders, self._singly = flow, artifact, decoders, compiled
         self._variances = q, r = flow.variances(measurement_noise, process_noise)
         self._Q, self._R = np.diag(q), np.diag(r)
-        self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
+        self._low, self._high = flow.scaled_bounds
         self._C = None if artifact.C is None else artifact.C * flow.x_scale
         self._units = flow.x_scale[:, None] * flow.x_scale
         self._window, self._share, self._limit = supervision(flow, self._dt)

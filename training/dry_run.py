@@ -84,7 +84,7 @@ def estimate(
         inverse_steps=min(FEW, config.inverse_steps),
     )
     # What is done for the first time takes longer, on a GPU by seconds.
-    _short_run(system, replace(brief, trajectories=min(WARM_UP_TRAJECTORIES, config.trajectories)), device=device)
+    _short_run(system, brief, device=device, most=WARM_UP_TRAJECTORIES)
     report(1)
     few = _short_run(system, brief, device=device)
     report(2)
@@ -114,12 +114,13 @@ def estimate(
     )
 
 
-def _short_run(system: System, config: Config, *, device: torch.device | None) -> Result:
-    """The same on no more trajectories than are simulated at once."""
+def _short_run(system: System, config: Config, *, device: torch.device | None, most: int = 0) -> Result:
+    """The same on so many trajectories at most, by default as many as are simulated at once."""
+    most = most or CHUNK
     short = replace(
         config,
-        trajectories=min(CHUNK, config.trajectories),
-        closed_loop_trajectories=min(CHUNK, config.closed_loop_trajectories),
+        trajectories=min(most, config.trajectories),
+        closed_loop_trajectories=min(most, config.closed_loop_trajectories),
     )
     with TemporaryDirectory() as folder:
         return train(system, short, Path(folder), device=device)

@@ -14,7 +14,7 @@ from training.export import Exported
 
 UNTRACKED = sorted(
     name for name in set(shipped().values()) if Artifact.read(resolve(name)).flow is None
-)  # what all formats take
+)  # a fixed function of z
 _ACTIVE = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}
 
 

@@ -1,6 +1,7 @@
 """``kkl-gym tracking``."""
 
 import re
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -65,7 +66,12 @@ class Tracking(Teaching):
             steps=self.steps,
         )
         if found.signals is None:
-            own = f" --system {self.system}" if self.system else ""
-            line = f"kkl-gym evaluate {self.observer} {out}{own} says what it gains"
-            console.print(line, markup=False, highlight=False, soft_wrap=True)
+            words = [
+                "kkl-gym",
+                "evaluate",
+                self.observer,
+                str(out),
+                *(["--system", self.system] if self.system else []),
+            ]
+            console.print(f"{shlex.join(words)} says what it gains", markup=False, highlight=False, soft_wrap=True)
         return found

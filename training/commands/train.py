@@ -79,7 +79,7 @@ class Train:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where networks are trained; auto takes a GPU if there is one."""
     dry_run: bool = False
-    """Train nothing; say what it would take on this machine, by a few batches of the same sizes."""
+    """Train nothing; say what it would take on this machine, by short runs of the same sizes."""
     data: tyro.conf.OmitArgPrefixes[DataOptions] = field(default_factory=DataOptions)
     """Recorded states, where nobody knows the equations: T_inv is fitted to them, and nothing is simulated."""
     recorded: tyro.conf.OmitArgPrefixes[RecordedSettings] = field(default_factory=dict)
@@ -126,7 +126,7 @@ class Train:
             config = preset(system, self.pipeline, self.preset, changes=changes)
         policy = None if config.policy is None else named_policy(system, config.policy)
         if self.dry_run:
-            with progress_bars(console) as progress, progress.phase("timing a few batches", RUNS) as report:
+            with progress_bars(console) as progress, progress.phase("timing short runs", RUNS) as report:
                 found = estimate(system, config, device=device, report=report)
             console.print(expected(config, found))
             return None

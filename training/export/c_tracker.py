@@ -33,7 +33,7 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
     artifact, measurement, process = exported.artifact, measurement_levels(exported), process_level(exported)
     assert artifact.C is not None
     assert process is not None
-    low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
+    low, high = flow.scaled_bounds
     level = f"LARGER({process.macro}, {number(flow.least_process_noise)})"
     Q = [
         f"SQUARE({level} * {number(each)}) + {number(error**2)}"

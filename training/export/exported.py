@@ -203,7 +203,7 @@ class Exported:
         }
         if self.levels:
             described["measurement_noise"] = list(self.levels)
-        if self.told_process_noise:
+        if self.told_process_noise or self.artifact.flow is not None:
             described["process_noise"] = self.process_noise
         return described
 

@@ -44,7 +44,7 @@ class TrackerNodes:
         self._graph, self._artifact, self._given, self._real = graph, artifact, given, real
         self._flow, self._C = artifact.require_flow(), artifact.C
         flow = self._flow
-        self._low, self._high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
+        self._low, self._high = flow.scaled_bounds
         self._window, self._share, self._limit = supervision(flow, artifact.filter.dt)
         nx, ny = artifact.nx, artifact.ny
         ends = np.cumsum([0, nx, nx * nx, 1, ny])
@@ -194,7 +194,7 @@ class TrackerNodes:
         )
 
     def _finite(self, value: str) -> str:
-        return self._graph("Equal", self._graph("Sub", value, value), self._graph.constant([0.0]))
+        return self._graph("Less", self._graph("Abs", value), self._graph.constant([math.inf]))
 
     def _sum(self, values: list[str]) -> str:
         return values[0] if len(values) == 1 else self._graph("Sum", *values)

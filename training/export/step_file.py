@@ -88,7 +88,7 @@ def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> di
     """Add a flow's arrays, with bounds of scaled states; returns what else there is to say of it."""
     storage.put_mlp(tensors, "flow.", flow.mlp)
     arrays = {name: getattr(flow, name) for name in _FLOW_ARRAYS}
-    arrays |= {name: (arrays[name] - flow.x_offset) / flow.x_scale for name in ("low", "high")}
+    arrays["low"], arrays["high"] = flow.scaled_bounds
     arrays["least_measurement_noise"] = flow.least_measurement_noise
     arrays["earlier"], arrays["by"] = table(flow.nx + flow.nu, flow.degree)
     for kind, factors in (("factors", flow.factors), ("free_factors", flow.free_factors)):

@@ -105,9 +105,12 @@ def test_several_outputs_of_which_one_is_missing(seen, make_artifact, tmp_path):
     assert np.allclose(found["score"], score, rtol=1e-4)
 
 
-@pytest.mark.parametrize("process", [False, True])
-def test_error_bars(process, make_artifact, tmp_path):
-    artifact = with_error_bars(make_artifact(process=process, system="lorenz", free_inverse=True))
+@pytest.mark.parametrize(
+    ("process", "options"),
+    [(False, {"free_inverse": True}), (True, {"free_inverse": True}), (True, {"estimated": True})],
+)
+def test_error_bars(process, options, make_artifact, tmp_path):
+    artifact = with_error_bars(make_artifact(process=process, system="lorenz", **options))
     exported = exported_of(artifact, tmp_path)
     y, u = noise(artifact, 120)
     levels = (0.7, 0.05) if process else (0.7,)
@@ -141,12 +144,14 @@ def test_maps_that_track(options, tmp_path):
 
 def test_error_bars_of_maps_that_track(tmp_path):
     artifact = tracking(process=True, free_inverse=True)
-    free = replace(artifact.flow.factors, factors=2.0 * artifact.flow.factors.factors)
-    doubtful = replace(artifact.flow.factors, doubt=np.full(free.factors.shape, 0.3))
+    factors = artifact.flow.factors
+    free = replace(factors, factors=2.0 * factors.factors, doubt=np.full(factors.factors.shape, 0.1))
+    doubtful = replace(factors, doubt=np.full(factors.factors.shape, 0.3))
     exported = exported_of(
         replace(artifact, flow=replace(artifact.flow, factors=doubtful, free_factors=free)), tmp_path
     )
     y, u = signals(artifact, 200)
+    u[7:] += 0.1  # from within the window on
     found = np.array(replayed(exported, tmp_path, y, u, told=(0.7, 0.05))["covariance"])
     told = replace(exported, measurement_noise=0.7, process_noise=0.05)
     for k, observer in enumerate(stepped(told, y, u)):
@@ -159,3 +164,9 @@ def test_outputs_that_are_not_linear_are_refused(tmp_path):
     exported = exported_of(curved, tmp_path)
     with pytest.raises(ValueError, match="not linear, and JavaScript takes y = C x alone"):
         write_step(tmp_path / "step.safetensors", exported)
+
+
+def test_process_noise_that_t_inv_is_not_told_counts_for_the_filter(tmp_path):
+    exported = exported_of(tracking(), tmp_path, precision="double", process_noise=2.0)
+    y, u = signals(exported.artifact, 200)
+    assert apart(exported, np.array(replayed(exported, tmp_path, y, u)["x_hat"]), y, u) < 1e-9
