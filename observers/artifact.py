@@ -51,6 +51,7 @@ _FLOW_ARRAYS = (
     "least_measurement_noise",
 )
 _FLOW_FACTORS = ("factors", "free_factors")  # of which the second need not be there
+_FLOW_OPTIONAL = "bend"
 _FLOW_SCALARS = ("least_process_noise", "window")
 # Scalars of an inverse map, and what the files call them.
 _SCALARS = {
@@ -620,7 +621,8 @@ def _put_spread(tensors: dict[str, np.ndarray], prefix: str, spread: Spread | No
 def _put_flow(tensors: dict[str, np.ndarray], flow: Flow) -> dict[str, Any]:
     """Add a flow's arrays; returns what describes it."""
     storage.put_mlp(tensors, "flow.", flow.mlp)
-    tensors |= {f"flow.{name}": np.asarray(getattr(flow, name), dtype=float) for name in _FLOW_ARRAYS}
+    names = (*_FLOW_ARRAYS, *(() if flow.bend is None else (_FLOW_OPTIONAL,)))
+    tensors |= {f"flow.{name}": np.asarray(getattr(flow, name), dtype=float) for name in names}
     for kind in _FLOW_FACTORS:
         factors = getattr(flow, kind)
         if factors is not None:
@@ -634,6 +636,7 @@ def _get_flow(tensors: Mapping[str, np.ndarray], described: Mapping[str, Any]) -
         bias, linear = tensors["flow.bias"], tensors["flow.linear"]
         tensors = {**tensors, "flow.polynomial": np.concatenate([bias[:, None], linear], axis=1)}
     arrays: dict[str, Any] = {name: tensors[f"flow.{name}"] for name in _FLOW_ARRAYS}
+    arrays[_FLOW_OPTIONAL] = tensors.get(f"flow.{_FLOW_OPTIONAL}")
     factors: dict[str, Any] = {
         kind: Factors(
             **{name: tensors[f"flow.{kind}.{name}"] for name in _SPREAD_ARRAYS}, doubt=tensors.get(f"flow.{kind}.doubt")

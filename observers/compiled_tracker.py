@@ -19,7 +19,7 @@ from observers.unscented import Gaussian
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-_LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE = range(6)  # columns of the table of states
+_LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
 _BLOCK = 64  # points that go through the polynomial at a time
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 _ALL = np.ones(1, dtype=bool)
@@ -52,7 +52,8 @@ class CompiledTracker:
         network, (q, r) = flow.mlp.compiled, variances
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
-        states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale)
+        bend = np.zeros(flow.nx) if flow.bend is None else flow.bend
+        states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale, bend)
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx
@@ -220,6 +221,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         expected: np.ndarray,
     ) -> None:
         """Moments of where the points of a row go with it, and a sample taken in, one output after another."""
+        distance = 0.0
         for i in range(nx):
             total = 0.0
             for p in range(count):
@@ -229,12 +231,17 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
             for p in range(count):
                 moved[i, p] -= mean
             found[i] = mean
+            distance += (mean - row[i]) * (mean - row[i])
             for j in range(i + 1):
                 entry = 0.0
                 for p in range(count):
                     entry += moved[i, p] * moved[j, p]
                 found[nx + nx * i + j] = weight * entry
             found[nx + nx * i + i] += states[i, _NOISE]
+        for i in range(nx):
+            if states[i, _BEND] > 0.0:  # or infinity times 0 would be no number
+                bent = states[i, _BEND] * distance
+                found[nx + nx * i + i] += bent * bent
         for k in range(ny):
             expected[k] = outputs[k, _MEAN]
             for i in range(nx):

@@ -56,6 +56,9 @@ class Flow:
         What covariances are multiplied with, so that regions of 90 % hold 90 % of the errors.
     free_factors : Factors, optional
         The same as long as no input has acted since reset; by default there is no difference.
+    bend : ndarray, shape (nx,), optional
+        What the flow is off by where the state moves far within a sample: standard deviation beside ``error``, in
+        multiples of the squared distance of scaled states. By default no more than elsewhere.
 
     Raises
     ------
@@ -78,13 +81,14 @@ class Flow:
     window: float
     factors: Factors
     free_factors: Factors | None = None
+    bend: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         nx, nu = self.nx, self.nu
         if self.u_scale.ndim != 1 or nx + nu != self.mlp.inputs:
             raise ArtifactError(f"a flow of {nx} states and {nu} inputs needs as many of its network's inputs")
         of_states = ("x_offset", "x_scale", "gain", "low", "high", "error", "process_noise")
-        check_shapes(self, dict.fromkeys(of_states, (nx,)))
+        check_shapes(self, dict.fromkeys((*of_states, *(() if self.bend is None else ("bend",))), (nx,)))
         shape = self.polynomial.shape
         if len(shape) != 2 or shape[0] != nx or shape[1] > _MOST_TERMS or not degree_of(shape[1], nx + nu):
             raise ArtifactError(
@@ -96,9 +100,10 @@ class Flow:
         for name in ("x_scale", "u_scale", "least_measurement_noise"):
             if not (getattr(self, name) > 0).all():
                 raise ArtifactError(f"{name} of a flow must be positive, got {getattr(self, name)}")
-        for name in ("error", "process_noise"):
-            if not (getattr(self, name) >= 0).all():
-                raise ArtifactError(f"{name} of a flow must not be negative, got {getattr(self, name)}")
+        for name in ("error", "process_noise", "bend"):
+            value = getattr(self, name)
+            if value is not None and not (value >= 0).all():
+                raise ArtifactError(f"{name} of a flow must not be negative, got {value}")
         if not (self.low < self.high).all():
             raise ArtifactError(f"bounds of a flow must go from low to high, got {self.low} and {self.high}")
         for name in ("least_process_noise", "window"):

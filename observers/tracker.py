@@ -245,7 +245,11 @@ class Tracker:
         def move(s: np.ndarray) -> np.ndarray:
             return flow.scaled(self._within(s), v)
 
-        return predicted(self._x, self._P, move=move, Q=self._Q)
+        x, P = predicted(self._x, self._P, move=move, Q=self._Q)
+        if flow.bend is not None:
+            moved = ((x - self._x) ** 2).sum(-1)
+            P = P + (flow.bend * moved[:, None])[:, :, None] ** 2 * np.eye(flow.nx)
+        return x, P
 
     def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""

@@ -43,14 +43,17 @@ def a_flow(nx, nu, ny, seed=0, process=None):
     )
 
 
-def tracking(outputs=1, inputs=True, surer=0.0, **options):
+def tracking(outputs=1, inputs=True, surer=0.0, bend=None, **options):
     """An observer of two states whose T_inv nobody trained, however sure it is, but whose flow is the truth."""
     artifact = with_error_bars(random_artifact(inputs=inputs, outputs=outputs, **options))
     spread = artifact.inverse.spread
     bars = MLP(spread.mlp.weights, [spread.mlp.biases[0], spread.mlp.biases[1] - surer], "tanh")
     artifact = replace(artifact, inverse=replace(artifact.inverse, spread=replace(spread, mlp=bars)))
     C = np.random.default_rng(3).normal(size=(outputs, artifact.nx))
-    return replace(artifact, C=C, flow=a_flow(artifact.nx, artifact.nu, outputs, process=artifact.process_noise_max))
+    flow = a_flow(artifact.nx, artifact.nu, outputs, process=artifact.process_noise_max)
+    return replace(
+        artifact, C=C, flow=replace(flow, bend=None if bend is None else np.linspace(bend, 2 * bend, flow.nx))
+    )
 
 
 def signals(artifact, steps, batch=()):

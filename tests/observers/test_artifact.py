@@ -115,6 +115,14 @@ def test_files_from_before_reverse_duffing_had_parameters(make_artifact, tmp_pat
     assert Artifact.read(path).parameters == {}
 
 
+@pytest.mark.parametrize("bend", [None, 0.5])
+def test_files_hold_how_errors_of_a_flow_grow(bend, tmp_path):
+    artifact = tracking(bend=bend)
+    artifact.save(tmp_path / "map.safetensors")
+    found = Artifact.read(tmp_path / "map.safetensors").flow.bend
+    assert found is None if bend is None else np.array_equal(found, [0.5, 1.0])
+
+
 def test_flows_from_before_they_were_polynomials(tmp_path):
     artifact = tracking()
     linear = dataclasses.replace(artifact.flow, polynomial=artifact.flow.polynomial[:, : 1 + artifact.nx + artifact.nu])

@@ -65,9 +65,11 @@ def numpy_alone(monkeypatch):
         monkeypatch.setattr(module, "MANY_ROWS", 10**9)
 
 
-@pytest.mark.parametrize(("outputs", "inputs", "surer"), [(1, True, 0.0), (1, False, 0.0), (2, True, 2.0)])
-def test_two_thousand_single_samples(outputs, inputs, surer):
-    artifact = tracking(outputs, inputs, surer)
+@pytest.mark.parametrize(
+    ("outputs", "inputs", "surer", "bend"), [(1, True, 0.0, None), (1, False, 0.0, 0.5), (2, True, 2.0, None)]
+)
+def test_two_thousand_single_samples(outputs, inputs, surer, bend):
+    artifact = tracking(outputs, inputs, surer, bend)
     y, u = signals(artifact, 2000)
     one, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
     expected = along(other, y, u)
@@ -78,9 +80,9 @@ def test_two_thousand_single_samples(outputs, inputs, surer):
     assert not np.array_equal(found[0], expected[0])  # not the same arithmetic
 
 
-@pytest.mark.parametrize("outputs", [1, 2])
-def test_two_thousand_samples_of_many_rows(outputs, monkeypatch):
-    artifact = tracking(outputs)
+@pytest.mark.parametrize(("outputs", "bend"), [(1, 0.5), (2, None)])
+def test_two_thousand_samples_of_many_rows(outputs, bend, monkeypatch):
+    artifact = tracking(outputs, bend=bend)
     y, u = signals(artifact, 2000, (ROWS,))
     one, other = KKLObserver(artifact, 0.1), KKLObserver(artifact, 0.1)
     found = along(one, y, u)

@@ -342,6 +342,27 @@ def test_estimates_stay_within_bounds_and_finite():
         assert np.isfinite(observer.covariance).all()
 
 
+def test_a_flow_may_be_off_by_more_where_the_state_moves_far():
+    """Its covariance is then that of a Kalman filter with as much more process noise, at each sample."""
+    artifact = tracking_observer()
+    bend, scale = np.array([0.4, 0.8]), artifact.flow.x_scale
+    observer = KKLObserver(dataclasses.replace(artifact, flow=dataclasses.replace(artifact.flow, bend=bend)), LEVEL)
+    plain, twice = KKLObserver(artifact, LEVEL), KKLObserver(artifact, LEVEL)
+    for each in (observer, plain, twice):
+        each.reset(np.array([3.0]))
+    for k in range(30):
+        x = observer.decode()
+        twice._tracker._state = observer._tracker._state.copy()
+        twice.step(None)
+        moved = ((twice.decode() - x) / scale) ** 2
+        P = twice.covariance + np.diag((bend * moved.sum() * scale) ** 2)
+        observer.step(None)
+        if k > 12:  # T_inv is asked no longer
+            np.testing.assert_allclose(observer.covariance, P, rtol=1e-6)
+        plain.step(None)
+    assert (observer.std > plain.std).all()
+
+
 def test_bad_samples_change_nothing():
     observer, _, y = settled()
     x_hat = observer.decode()

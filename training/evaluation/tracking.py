@@ -12,7 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
-from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_error
+from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -181,7 +181,7 @@ def _learned(
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
-    return dataclasses.replace(flow, error=usual_error(flow, judged))
+    return dataclasses.replace(flow, error=usual_error(flow, judged), bend=usual_bend(flow, judged))
 
 
 def _factors(

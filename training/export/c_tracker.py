@@ -57,6 +57,7 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
         array("double", "output_mean", artifact.C @ flow.x_offset),
         array("double", "C", artifact.C * flow.x_scale),
         block("double", "Q", f"[{len(Q)}]", Q),
+        *([] if flow.bend is None else [array("double", "bend", flow.bend)]),
         block("double", "R", f"[{len(R)}]", R),
     ]
     for label, spread in _spreads(exported).items():
@@ -87,6 +88,7 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
             terms=flow.polynomial.shape[1],
             count=2 * nx,
             far=number(math.sqrt(nx)),
+            bent=c_tracker_templates.BENT.format(**words) if flow.bend is not None else "",
             scaled_inputs=c_tracker_templates.SCALED_INPUTS.format(**words) if flow.nu else "",
             share=number(share),
             limit=number(limit),

@@ -119,7 +119,7 @@ static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P
         }}
         P[i][i] += Q[i];
     }}
-}}
+{bent}}}
 
 /* Predict, and take in a sample, one output after another. What is missing is replaced by what was predicted. */
 static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{ny}])
@@ -199,6 +199,14 @@ static void supervise({NAME}_observer *observer)
     if (lost)
         observer->mean_square = 1.0;
 }}
+"""
+
+BENT = """\
+    double moved = 0.0; /* the square of how far: the flow is off by more where that is far */
+    for (size_t i = 0; i < {nx}; i++)
+        moved += SQUARE(x[i] - observer->x[i]);
+    for (size_t i = 0; i < {nx}; i++)
+        P[i][i] += SQUARE(bend[i] * moved);
 """
 
 SCALED_INPUTS = """\

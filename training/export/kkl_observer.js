@@ -165,7 +165,7 @@ class Tracker {
   constructor(tensors, described, C) {
     Object.assign(this, described);
     const names = ["x_offset", "x_scale", "u_scale", "gain", "polynomial", "earlier", "by", "low", "high", "error", "process_noise"];
-    for (const name of [...names, "least_measurement_noise"]) this[name] = tensors[`flow.${name}`]?.data ?? [];
+    for (const name of [...names, "bend", "least_measurement_noise"]) this[name] = tensors[`flow.${name}`]?.data ?? [];
     this.network = new Network(tensors, "flow.", this.activation);
     this.nx = this.x_offset.length;
     this.ny = C.shape[0];
@@ -240,7 +240,9 @@ class Tracker {
     }
     const average = (of) => points.reduce((sum, point) => sum + of(point), 0) / points.length;
     const mean = x.map((_, i) => average((point) => point[i]));
-    const spread = P.map((row, i) => row.map((_, j) => average((point) => (point[i] - mean[i]) * (point[j] - mean[j])) + (i === j ? Q[i] : 0)));
+    const moved = mean.reduce((sum, value, i) => sum + (value - x[i]) ** 2, 0); // the flow is off by more where that is far
+    const added = (i) => (this.bend.length ? Q[i] + (this.bend[i] * moved) ** 2 : Q[i]);
+    const spread = P.map((row, i) => row.map((_, j) => average((point) => (point[i] - mean[i]) * (point[j] - mean[j])) + (i === j ? added(i) : 0)));
     return [mean, spread];
   }
 

@@ -142,7 +142,7 @@ class TrackerNodes:
         off = graph("Sub", moved, mean)
         P = graph("MatMul", graph("Transpose", off, perm=[1, 2, 0]), graph("Transpose", off, perm=[1, 0, 2]))
         P = graph("Mul", P, graph.constant([1.0 / len(points)]))
-        return mean, graph("Add", P, self._process_covariance()), [entry for row in L for entry in row]
+        return mean, graph("Add", P, self._process_covariance(mean)), [entry for row in L for entry in row]
 
     def _moved(self, points: str) -> str:
         """Where scaled states, behind which lie scaled inputs, are a sample later: (m, nx)."""
@@ -160,12 +160,17 @@ class TrackerNodes:
         change = graph("Add", change, graph("Mul", said, graph.constant(flow.gain)))
         return graph("Add", graph("Gather", points, graph.constant(np.arange(flow.nx), np.int64), axis=1), change)
 
-    def _process_covariance(self) -> str:
-        """Of what is added to scaled states at each sample, (n, nx, nx)."""
+    def _process_covariance(self, mean: str) -> str:
+        """Of what is added to scaled states on the way to their mean (n, nx) a sample later, (n, nx, nx)."""
         graph, flow = self._graph, self._flow
         level = graph("Max", self._given["process_noise"], graph.constant([flow.least_process_noise]))
         added = graph("Mul", level, graph.constant(flow.process_noise))
         Q = graph("Add", graph("Mul", added, added), graph.constant(flow.error**2))
+        if flow.bend is not None:
+            step = graph("Sub", mean, self._before[0])
+            moved = graph("MatMul", graph("Mul", step, step), graph.constant(np.ones((flow.nx, 1))))
+            bent = graph("Mul", moved, graph.constant(flow.bend))
+            Q = graph("Add", Q, graph("Mul", bent, bent))
         return graph("Mul", graph("Unsqueeze", Q, graph.constant([2], np.int64)), graph.constant(np.eye(flow.nx)))
 
     def _measurement_variances(self) -> list[str]:

@@ -89,6 +89,8 @@ def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> di
     storage.put_mlp(tensors, "flow.", flow.mlp)
     arrays = {name: getattr(flow, name) for name in _FLOW_ARRAYS}
     arrays["low"], arrays["high"] = flow.scaled_bounds
+    if flow.bend is not None:
+        arrays["bend"] = flow.bend
     arrays["least_measurement_noise"] = flow.least_measurement_noise
     arrays["earlier"], arrays["by"] = table(flow.nx + flow.nu, flow.degree)
     for kind, factors in (("factors", flow.factors), ("free_factors", flow.free_factors)):

@@ -9,7 +9,7 @@ from rich.console import Console
 from tracking import DT, exact_motion, plain_observer, tracking_observer
 
 from kkl_gym import get_system
-from observers import Artifact, KKLObserver, Limits, load
+from observers import MLP, Artifact, KKLObserver, Limits, load
 from training.commands.tracking import Tracking
 from training.evaluation import tracking
 from training.evaluation.certificates.certificate import certify
@@ -17,9 +17,6 @@ from training.evaluation.coverage import coverage
 from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.tracking import learn_tracking
-from training.export.exported import Exported
-from training.export.onnx_graph import onnx_model
-from training.export.step_file import write_step
 from training.guided import GuidedKalmanFilter
 from training.maps import flow, regions
 from training.progress import progress_bars
@@ -206,14 +203,8 @@ def _bare():
     return dataclasses.replace(plain_observer().inverse, spread=None)
 
 
-def test_who_needs_t_inv_alone_says_so(tmp_path):
+def test_who_needs_t_inv_alone_says_so():
     artifact = tracking_observer()
-    artifact.save(tmp_path / "map.safetensors")
-    exported = Exported.read(tmp_path / "map.safetensors")
-    with pytest.raises(ValueError, match="tracks, which --format c alone can export"):
-        write_step(tmp_path / "step.safetensors", exported)
-    with pytest.raises(ValueError, match="tracks, which --format c alone can export"):
-        onnx_model(exported)
     with pytest.raises(ValueError, match="tracks"):
         certify(artifact, Noiseless())
     with pytest.raises(ValueError, match="tracks"):
@@ -234,5 +225,37 @@ def test_the_command_writes_it(tmp_path, monkeypatch):
     np.testing.assert_array_equal(written.flow.factors.factors, found.flow.factors.factors)
     y = np.random.default_rng(0).normal(size=(20, 2, 1))
     assert not np.allclose(KKLObserver(written, 0.2).estimate(y), KKLObserver(plain_observer(), 0.2).estimate(y))
+    assert f"kkl-gym evaluate {source} runs/tracking/map.safetensors says what it gains" in console.export_text()
     with pytest.raises(ValueError, match=r"must end in \.safetensors"):
         Tracking(str(source), out=tmp_path / "map").run(console)
+    with pytest.raises(ValueError, match="is the map that is taught, which would be lost"):
+        Tracking(str(source), out=source).run(console)
+
+
+def test_errors_that_grow_with_how_far_the_state_moves_are_found(learned):
+    """On increments that a flow misses by 0.3 times the square of their length, and by less."""
+    rng, nothing = np.random.default_rng(0), dataclasses.replace(learned.flow, gain=np.zeros(2))
+    still = dataclasses.replace(nothing, polynomial=np.zeros_like(nothing.polynomial))
+    steps = np.exp(rng.uniform(-9, 0, (20_000, 1))) * rng.normal(size=(20_000, 2))
+    square = (steps**2).sum(-1, keepdims=True)
+    for share, expected in ((0.3, 0.3), (0.03, None)):
+        missed = share * square * rng.normal(size=(20_000, 2))
+        # the flow says steps, and the truth is that and what is missed
+        moves = dataclasses.replace(still, u_scale=np.ones(2), mlp=_passing(2), polynomial=_of_inputs(2))
+        change = (steps + missed) * moves.x_scale
+        drawn = flow.Increments(moves.x_offset + np.zeros((20_000, 2)), steps, change, moves.x_offset, moves.x_scale)
+        found = flow.usual_bend(moves, drawn)
+        if expected is None:
+            assert found is None
+        else:
+            np.testing.assert_allclose(found, expected, rtol=0.25)
+
+
+def _passing(n):
+    """A network of n states and n inputs that says nothing."""
+    return MLP([np.zeros((4, 2 * n)), np.zeros((n, 4))], [np.zeros(4), np.zeros(n)], "tanh")
+
+
+def _of_inputs(n):
+    """States move by their inputs."""
+    return np.hstack([np.zeros((n, 1 + n)), np.eye(n)])

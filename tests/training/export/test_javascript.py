@@ -128,7 +128,7 @@ def test_error_bars(process, options, make_artifact, tmp_path):
     [
         {},
         {"inputs": False},
-        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True},
+        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
         {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
     ],
 )

@@ -29,7 +29,7 @@ def of_floats(artifact, steps, batch=()):
     [
         {},
         {"inputs": False},
-        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True},
+        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
         {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
     ],
 )
