@@ -767,8 +767,9 @@ class KKLObserver:
             raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
         if all_finite(y):
             return None
-        if ny == 1 and not batch and not first:
-            raise ValueError("y holds NaN, infinity or values beyond 1e15; a missing sample is step(None, u)")
+        if ny == 1 and not batch:
+            hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
+            raise ValueError(f"y holds NaN, infinity or values beyond 1e15; {hint}")
         gaps = np.isnan(y)
         if not all_finite(np.where(gaps, 0.0, y)):
             raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")

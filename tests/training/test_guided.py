@@ -208,7 +208,7 @@ def test_bad_samples_are_refused_and_change_nothing():
         ours.step(y[0])
     with pytest.raises(RuntimeError, match="call reset"):
         _ = ours.covariance
-    with pytest.raises(ValueError, match="missing sample"):
+    with pytest.raises(ValueError, match="the first sample must be there"):
         ours.reset([np.nan])
     run(ours, y[:10])
     for sample, u, message in (
