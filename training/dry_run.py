@@ -15,9 +15,7 @@ from training.trajectories.record import CHUNK, recording_ages
 
 RUNS = 3  # one to warm up, and two whose difference is timed
 FEW = 2  # batches in each stage of the first two
-CPU_SECONDS = (
-    8.0  # of each stage of the last: a batch takes a millisecond on a GPU, and a second with the paper's sizes
-)
+CPU_SECONDS = 8.0  # of each stage of the last: batches take from a millisecond to a second
 WARM_UP_TRAJECTORIES = 50
 # Arrays that exist at once in the largest stage, as counted in training/pipeline.py: those of states in NumPy and in
 # torch, and those of the filter's states.

@@ -11,6 +11,13 @@ from observers import MLP, Factors, Flow
 from observers.polynomial import count
 
 JUMPS = (600, 605)  # samples that no motion explains
+# Options of :func:`tracking` that exports have to get right.
+KINDS = (
+    {},
+    {"inputs": False},
+    {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
+    {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
+)
 
 
 def a_flow(nx, nu, ny, seed=0, process=None):
@@ -68,3 +75,8 @@ def signals(artifact, steps, batch=()):
     y = np.array(y)
     y[slice(*JUMPS)] += 6.0
     return y, u
+
+
+def of_floats(artifact, steps):
+    """The same as floats hold them exactly."""
+    return (each.astype(np.float32).astype(float) for each in signals(artifact, steps))

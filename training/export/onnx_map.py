@@ -1,6 +1,6 @@
 """T_inv as nodes of an ONNX graph, and how far it is off."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -101,9 +101,9 @@ class Maps:
         """D L L^T D, as :class:`observers.spread.Spread` says."""
         graph, inverse = self._graph, read.inverse
         assert inverse.spread is not None  # or the artifact could not have a flow
-        spread = replace(inverse.spread, mlp=inverse.spread.in_units(inverse.x_scale))
-        out = graph.cast(graph.network(spread.mlp, self._inputs(read, age), self._real), np.float64)
-        values, nx = graph.columns(out, spread.mlp.outputs), spread.nx
+        bars, nx = inverse.spread.in_units(inverse.x_scale), inverse.spread.nx
+        out = graph.cast(graph.network(bars, self._inputs(read, age), self._real), np.float64)
+        values = graph.columns(out, bars.outputs)
         rise, below = self._rise(inverse, age), iter(values[nx:])
         rows: list[list[str]] = []
         for value, unit in zip(values, scale.tolist(), strict=False):
@@ -144,9 +144,6 @@ class Maps:
             return graph.constant([[1.0]])
         passed = graph("Div", graph("Sub", at, graph.constant(points[:-1])), graph.constant(np.diff(points)))
         passed = graph.within(passed, 0.0, 1.0)  # of each interval
-        first, last = (
-            np.zeros(len(points)),
-            np.eye(len(points) - 1, len(points), 1) - np.eye(len(points) - 1, len(points)),
-        )
-        first[0] = 1.0
-        return graph("Add", graph("MatMul", passed, graph.constant(last)), graph.constant(first))
+        shape = (len(points) - 1, len(points))
+        shifted = graph("MatMul", passed, graph.constant(np.eye(*shape, 1) - np.eye(*shape)))  # from each to the next
+        return graph("Add", shifted, graph.constant(np.eye(1, len(points))))

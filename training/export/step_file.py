@@ -18,7 +18,7 @@ _MAP_ARRAYS = ("z_offset", "whiten", "noise_gain", "x_offset", "x_scale")
 _MAP_SCALARS = tuple(
     f"{name}_{end}" for name in ("measurement_noise", "process_noise", "age") for end in ("unit", "max")
 )
-_FLOW_ARRAYS = ("x_offset", "x_scale", "u_scale", "gain", "polynomial", "low", "high", "error", "process_noise")
+_FLOW_ARRAYS = ("x_offset", "x_scale", "u_scale", "gain", "polynomial", "error", "process_noise")
 _LIMIT_ARRAYS = ("levels", "mean", "low", "high")
 
 

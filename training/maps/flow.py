@@ -35,7 +35,7 @@ NARROW, WIDE = 8, 32  # neurons in each hidden layer
 MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 FARTHEST = 0.1  # share of the increments, of the longest, from which it is found how errors grow with them
-LEAST_BEND = 0.1  # of that: less changed neither errors nor coverage (0.02 on Van der Pol, 0.0002 on Lorenz)
+LEAST_BEND = 0.1  # of that: less would hardly change a covariance, unless a state crosses its range in a sample
 TINY = np.finfo(float).tiny
 LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of smaller ones are not taken relative
 
@@ -282,8 +282,12 @@ def usual_error(flow: Flow, increments: Increments) -> np.ndarray:
         now and then, do not count. For a tracker that trusts the flow less everywhere would be worse than to be lost
         there.
     """
-    apart = (flow(increments.x, increments.u) - increments.x - increments.change) / flow.x_scale
-    return np.asarray(OF_MEDIAN * np.median(np.abs(apart), axis=0))
+    return np.asarray(OF_MEDIAN * np.median(_missed(flow, increments), axis=0))
+
+
+def _missed(flow: Flow, increments: Increments) -> np.ndarray:
+    """How far a flow is off after a sample, in scaled states, (n, nx)."""
+    return np.asarray(np.abs(flow(increments.x, increments.u) - increments.x - increments.change) / flow.x_scale)
 
 
 def usual_bend(flow: Flow, increments: Increments) -> np.ndarray | None:
@@ -304,6 +308,6 @@ def usual_bend(flow: Flow, increments: Increments) -> np.ndarray | None:
     """
     moved = ((increments.change / flow.x_scale) ** 2).sum(-1)
     far = moved >= np.quantile(moved, 1 - FARTHEST)
-    apart = (flow(increments.x[far], increments.u[far]) - increments.x[far] - increments.change[far]) / flow.x_scale
-    bend = np.asarray(OF_MEDIAN * np.median(np.abs(apart) / np.maximum(moved[far, None], TINY), axis=0))
+    shares = _missed(flow, increments)[far] / np.maximum(moved[far, None], TINY)
+    bend = np.asarray(OF_MEDIAN * np.median(shares, axis=0))
     return bend if bend.max() >= LEAST_BEND else None

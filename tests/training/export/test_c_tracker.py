@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from compiled_c import WARNINGS, compiled, estimates, needs_cc
 from exported_steps import apart, doubles, exported_of, in_doubles, stepped
-from random_tracking import signals, tracking
+from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver
 from training.export.c_source import c_files
@@ -32,22 +32,9 @@ int main(void)
 """
 
 
-def of_floats(artifact, steps):
-    """Signals that floats hold exactly."""
-    return (each.astype(np.float32).astype(float) for each in signals(artifact, steps))
-
-
 @needs_cc
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-9)])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"inputs": False},
-        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
-        {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
-    ],
-)
+@pytest.mark.parametrize("options", KINDS)
 def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     exported = exported_of(tracking(**options), tmp_path, precision=precision)
     y, u = of_floats(exported.artifact, 2000)

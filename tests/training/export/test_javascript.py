@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from error_bars import with_error_bars
 from exported_steps import apart, exported_of, motion, noise, stepped
-from random_tracking import signals, tracking
+from random_tracking import KINDS, signals, tracking
 
 from observers import Expression, KKLObserver, Limits, load
 from training.export import Exported
@@ -123,15 +123,7 @@ def test_error_bars(process, options, make_artifact, tmp_path):
     assert np.allclose(found, covariances, rtol=1e-3, atol=1e-5 * np.abs(covariances).max())
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"inputs": False},
-        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
-        {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
-    ],
-)
+@pytest.mark.parametrize("options", KINDS)
 def test_maps_that_track(options, tmp_path):
     exported = exported_of(tracking(**options), tmp_path, precision="double")  # compared with a step in doubles
     y, u = signals(exported.artifact, 1000)

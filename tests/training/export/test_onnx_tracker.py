@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exported_steps import UNTRACKED, apart, doubles, exported_of, in_doubles, motion, stepped
-from random_tracking import signals, tracking
+from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver, shipped
 from training.export import Exported
@@ -18,21 +18,8 @@ from onnx_steps import Runner
 from training.export.onnx_graph import onnx_model
 
 
-def of_floats(artifact, steps, batch=()):
-    """Signals that floats hold exactly."""
-    return (each.astype(np.float32).astype(float) for each in signals(artifact, steps, batch))
-
-
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-9)])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"inputs": False},
-        {"outputs": 2, "surer": 2.0, "process": True, "free_inverse": True, "bend": 0.5},
-        {"system": "lorenz", "surer": 2.0, "age": False, "pair": True},
-    ],
-)
+@pytest.mark.parametrize("options", KINDS)
 def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     exported = exported_of(tracking(**options), tmp_path, precision=precision)
     y, u = of_floats(exported.artifact, 2000)
