@@ -1,5 +1,7 @@
 """A tracker's step as machine code, where Numba is installed: one call for a single sample, a few for a batch.
 
+That of a single sample takes the linear filter along: a call takes about as long as what is computed in it.
+
 It computes what :mod:`observers.unscented` does, on the flow of :mod:`observers.flow` and for outputs C x with noise of
 each its own. The kernels are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly
 overhead. Of a batch, the flow's network evaluates all sigma points at once, by BLAS.
@@ -13,28 +15,33 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from observers.compiled import _kernels
+from observers.filter import LinearFilter
 from observers.flow import Flow
 from observers.polynomial import table
+from observers.sparse import single_kernel, without_zeros
 from observers.unscented import Gaussian
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
+_TERMS = 4  # of the polynomial that are added at a time
 _BLOCK = 64  # points that go through the polynomial at a time
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
-_ALL = np.ones(1, dtype=bool)
 
 
 class CompiledTracker:
     """A step of an unscented Kalman filter on a learned flow, whose states are scaled.
 
     Where a method takes a state, that is an array (n, nx + nx^2 + 1) in memory without gaps, which is written over. A
-    row holds the estimate, its covariance, and the running mean square of the innovations.
+    row holds the estimate, its covariance, and the running mean square of the innovations. A single sample has a state
+    of one row.
 
     Parameters
     ----------
     flow : Flow
         The motion over a sample.
+    linear : LinearFilter
+        What makes z of the outputs.
     C : ndarray, shape (ny, nx)
         Of the outputs y = C x.
     variances : (ndarray, ndarray)
@@ -48,7 +55,15 @@ class CompiledTracker:
         If Numba is not installed.
     """
 
-    def __init__(self, flow: Flow, C: np.ndarray, *, variances: tuple[np.ndarray, np.ndarray], share: float) -> None:
+    def __init__(
+        self,
+        flow: Flow,
+        linear: LinearFilter,
+        C: np.ndarray,
+        *,
+        variances: tuple[np.ndarray, np.ndarray],
+        share: float,
+    ) -> None:
         network, (q, r) = flow.mlp.compiled, variances
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
@@ -58,10 +73,14 @@ class CompiledTracker:
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx
         one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
-        polynomial = np.zeros((flow.nx, -(-flow.polynomial.shape[1] // 4) * 4))  # four terms are added at a time
-        polynomial[:, : flow.polynomial.shape[1]] = flow.polynomial
-        of_network = network.packed, network.widths, network.between
-        self._one = functools.partial(one, states, outputs, scale, polynomial, *of_network)
+        terms = flow.polynomial.shape[1]
+        polynomial = np.pad(flow.polynomial, ((0, 0), (0, -terms % _TERMS)))
+        gains, places, mixing = without_zeros(linear.transition, linear.drive)
+        # A few arrays of all there is: each that is handed over takes as long as a hundred multiplications.
+        numbers = np.concatenate([part.ravel() for part in (states, outputs, scale, polynomial, gains, mixing)])
+        whole = np.array([len(network.widths), *network.widths, *places.ravel()])
+        self._one = functools.partial(one, numbers, whole, network.packed, network.between)
+        self._told = flow.nx + 2 * len(C) + linear.size
         self._enter = functools.partial(enter, states, scale, polynomial)
         self._leave = functools.partial(leave, states, outputs)
         self._take = functools.partial(take, states)
@@ -86,15 +105,43 @@ class CompiledTracker:
             The outputs that were predicted; NaN where a covariance was none.
         """
         expected = np.empty((len(y), self._ny))
-        if len(y) == 1:
-            self._one(u, y, _ALL if rows is None else rows, state, expected)
-            return expected
         moved = np.empty((self._nx, len(y) * self._points))
         inputs = np.empty((moved.shape[1], self._nx + u.shape[1]), np.float32)
         self._enter(u, state, inputs, moved)
         taken = np.ones(len(y), dtype=bool) if rows is None else rows
         self._leave(self._network.batch(inputs), moved, y, taken, state, expected)
         return expected
+
+    def single(
+        self, state: np.ndarray, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Predict a single sample, take it in, and take the filter along.
+
+        Parameters
+        ----------
+        state : ndarray, shape (1, nx + nx^2 + 1)
+            The state.
+        z : ndarray, shape (size,)
+            That of the filter.
+        y : ndarray, shape (ny,)
+            The sample before.
+        u : ndarray, shape (nu,)
+            Inputs.
+        y_next : ndarray, shape (ny,)
+            The sample; NaN where it is missing.
+
+        Returns
+        -------
+        x : ndarray, shape (nx,)
+            The estimate in units of the states.
+        y_next : ndarray, shape (ny,)
+            The sample; where it is missing the output that was predicted, or y where there is no such number.
+        z_next : ndarray, shape (size,)
+            The filter's next state.
+        """
+        told, nx, ny = np.empty(self._told), self._nx, self._ny
+        self._one(z, y, u, y_next, state, told)
+        return told[:nx], told[nx + ny : nx + 2 * ny], told[nx + 2 * ny :]
 
     def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:
         """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
@@ -131,10 +178,11 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     import numba
 
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
-    evaluate, count, far, weight = _kernels(activation)[1], 2 * nx, math.sqrt(nx), 1 / (2 * nx)
+    evaluate, update = _kernels(activation)[1], single_kernel()
+    count, far, weight = 2 * nx, math.sqrt(nx), 1 / (2 * nx)
     entries = nx * nx
     earlier, by = table(nx + nu, degree)
-    terms = len(by)
+    terms, padded = len(by), -(-len(by) // _TERMS) * _TERMS
 
     @_inlined
     def within(states: np.ndarray, i: int, s: float) -> float:
@@ -190,8 +238,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     @_inlined
     def along(polynomial: np.ndarray, points: np.ndarray, block: int, moved: np.ndarray) -> None:
         """Where points go by the polynomial, (nx, n). A block of them stays in the cache, its loops are vectors."""
-        signals, total = np.zeros((nx + nu, block)), np.empty(block)
-        products = np.zeros((polynomial.shape[1], block))
+        memory = np.zeros((nx + nu + 1 + padded, block))
+        signals, total, products = memory[: nx + nu], memory[nx + nu], memory[nx + nu + 1 :]
         products[0] = 1.0
         for first in range(0, points.shape[1], block):
             size = min(block, points.shape[1] - first)
@@ -202,8 +250,8 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
                 multiply(products[earlier[t]], signals[by[t]], products[t])
             for i in range(nx):
                 total[:] = signals[i]
-                for t in range(0, polynomial.shape[1], 4):
-                    add_four(polynomial[i, t : t + 4], products[t : t + 4], total)
+                for t in range(0, padded, _TERMS):
+                    add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], total)
                 for p in range(size):
                     moved[i, first + p] = total[p]
 
@@ -283,27 +331,47 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
 
     @compiled
     def one(
-        states: np.ndarray,
-        outputs: np.ndarray,
-        scale: np.ndarray,
-        polynomial: np.ndarray,
+        numbers: np.ndarray,
+        whole: np.ndarray,
         packed: np.ndarray,
-        widths: np.ndarray,
         between: np.ndarray,
-        u: np.ndarray,
+        z: np.ndarray,
         y: np.ndarray,
-        rows: np.ndarray,
+        u: np.ndarray,
+        y_next: np.ndarray,
         state: np.ndarray,
-        expected: np.ndarray,
+        told: np.ndarray,
     ) -> None:
-        L, found, across = np.empty((nx, nx)), np.empty(nx + entries), np.empty(nx)
-        points, moved = np.empty((nx + nu, count)), np.empty((nx, count))
-        inputs, h = np.empty((count, nx + nu), np.float32), np.empty((count, nx), np.float32)
-        before(states, scale, state[0], u[0], L, points, inputs)
+        size, layers, at = len(z), whole[0], 0
+        widths, places = whole[1 : 1 + layers], whole[1 + layers :].reshape(2, (len(whole) - 1 - layers) // 2)
+        states = numbers[: nx * (_BEND + 1)].reshape(nx, _BEND + 1)
+        at += nx * (_BEND + 1)
+        outputs = numbers[at : at + ny * (_C + nx)].reshape(ny, _C + nx)
+        at += ny * (_C + nx)
+        scale = numbers[at : at + nu]
+        at += nu
+        polynomial = numbers[at : at + nx * padded].reshape(nx, padded)
+        at += nx * padded
+        end = len(numbers) - places.shape[1]
+        gains, mixing = numbers[at:end].reshape((end - at) // size, size), numbers[end:]
+
+        memory, of_network = np.empty((2 * nx + nu, count)), np.empty((count, 2 * nx + nu), np.float32)
+        points, moved, inputs, h = memory[: nx + nu], memory[nx + nu :], of_network[:, : nx + nu], of_network[:, nx + nu :]
+        more = np.empty((nx + 2, entries + nx))
+        L, found, across = more[2:], more[0], more[1]
+        before(states, scale, state[0], u, L, points, inputs)
         along(polynomial, points, count, moved)
         for p in range(count):
             evaluate(inputs[p], packed, widths, between, h[p])
-        after(states, outputs, h, moved, y[0], rows[0], found, across, state[0], expected[0])
+        expected, filled = told[nx : nx + ny], told[nx + ny : nx + 2 * ny]
+        after(states, outputs, h, moved, y_next, True, found, across, state[0], expected)
+        for i in range(nx):
+            told[i] = states[i, _OFFSET] + states[i, _SCALE] * state[0, i]
+        for k in range(ny):
+            filled[k] = y_next[k]
+            if np.isnan(y_next[k]):
+                filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
+        update(gains, places, mixing, z, y, u, filled, told[nx + 2 * ny :])
 
     @compiled
     def enter(

@@ -97,8 +97,8 @@ class LinearFilter:
                 f"dt = {dt!r}, B of up to {abs(B).max():g} and the eigenvalues of A, {poles}, lead beyond the range of "
                 "floats"
             )
-        self._drive = np.hstack([self.early_y, self.held_u, self.late_y]).T.copy()
-        self._update = np.vstack([self.transition.T, self._drive])
+        self.drive = np.hstack([self.early_y, self.held_u, self.late_y]).T.copy()
+        self._update = np.vstack([self.transition.T, self.drive])
 
     @property
     def size(self) -> int:
@@ -187,6 +187,6 @@ class LinearFilter:
     @functools.cached_property
     def _sparse(self) -> SparseUpdate | None:
         try:
-            return SparseUpdate(self.transition, self._drive)
+            return SparseUpdate(self.transition, self.drive)
         except (ImportError, ValueError):
             return None

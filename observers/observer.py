@@ -409,24 +409,28 @@ class KKLObserver:
         u = self._input(u, batch)
         gaps, missing = None, y is None
         if y is None:
-            y, gaps = self._y, np.ones(self._y.shape, dtype=bool)
+            y, gaps = np.full(self._y.shape, np.nan), np.ones(self._y.shape, dtype=bool)
         else:
             y = real_array("y", y).copy()  # as in reset
             gaps = self._check_output(y, batch)
-        tracker = self._tracker
-        if tracker is not None:
-            h = tracker.advance(y if gaps is None else np.where(gaps, np.nan, y), u, rows)
-            if gaps is not None:
-                y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
-        elif gaps is not None:
-            y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
-        linear = self.artifact.filter
-        if y.ndim == 1:
+        if not batch:
+            if rows is not None and not rows:
+                return
+            rows = None
             self._samples += 1
-        if y.ndim == 1 and self._compiled:
-            z = linear.advance_single(self._z, self._y, u, y)
+        tracker, linear = self._tracker, self.artifact.filter
+        moved = None if tracker is None or batch else tracker.step_single(self._z, self._y, u, y)
+        if moved is not None:
+            z, y = moved
         else:
-            z = linear.advance(self._z, self._y, u, y)
+            if tracker is not None:
+                h = tracker.advance(y, u, rows)
+                if gaps is not None:
+                    y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
+            elif gaps is not None:
+                y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
+            advance = linear.advance_single if self._compiled and not batch else linear.advance
+            z = advance(self._z, self._y, u, y)
         if rows is None:
             self._z, self._y, self._age = z, y, self._age + 1
         else:
@@ -464,10 +468,12 @@ class KKLObserver:
         ValueError
             If ``rows`` does not fit the batch.
         """
-        z, age = self._moment(rows)
         if self._tracker is not None:
+            if self._z is None:
+                raise RuntimeError("call reset(y0) before the observer is used")
             x_hat = self._tracker.estimate
-            return x_hat if rows is None else x_hat[np.asarray(rows)]
+            return x_hat if rows is None else x_hat[bool_array("rows", rows, self._z.shape[:-1])]
+        z, age = self._moment(rows)
         if self._x_hat is not None:
             return self._x_hat.copy() if rows is None else self._x_hat[rows]
         if rows is not None:
@@ -537,12 +543,12 @@ class KKLObserver:
         ValueError
             If ``rows`` does not fit the batch, or the artifact holds no error bars.
         """
-        self.artifact.require_spread()
-        if self._tracker is not None:
+        if self._tracker is not None:  # its artifact has error bars
             if self._z is None:
                 raise RuntimeError("call reset(y0) before the observer is used")
             covariance = self._tracker.covariance(self._z, self._age)
             return covariance if rows is None else covariance[bool_array("rows", rows, self._z.shape[:-1])]
+        self.artifact.require_spread()
         self._asked = True
         if rows is None and self._parts is not None:
             return self._states.covariance(self._parts)

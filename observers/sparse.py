@@ -33,13 +33,11 @@ class SparseUpdate:
     """
 
     def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
-        diagonal = transition.diagonal()
-        places = np.array(np.nonzero(transition - np.diag(diagonal)))  # rows and columns
-        if places.shape[1] > len(transition):
-            raise ValueError(f"{places.shape[1]} entries off the diagonal of {len(transition)} are too many to gain")
-        self._terms, spare = len(drive), np.zeros((-len(drive) % 3, len(transition)))  # batches take three at once
-        update = np.vstack([diagonal, drive, spare]), places, transition[*places]
-        self._shape, self._batch, self._one = update[0].shape, partial(_kernel(), *update), partial(_single(), *update)
+        gains, places, mixing = parts = without_zeros(transition, drive)
+        if len(mixing) > len(transition):
+            raise ValueError(f"{len(mixing)} entries off the diagonal of {len(transition)} are too many to gain")
+        self._terms, self._shape = len(drive), gains.shape
+        self._batch, self._one = partial(_kernel(), *parts), partial(single_kernel(), *parts)
 
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
         """Return the next z.
@@ -92,8 +90,33 @@ class SparseUpdate:
         return z_next
 
 
+def without_zeros(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What the kernels take of a filter.
+
+    Parameters
+    ----------
+    transition : ndarray, shape (size, size)
+        From z to the next.
+    drive : ndarray, shape (m, size)
+        What each column of the terms adds.
+
+    Returns
+    -------
+    gains : ndarray, shape (1 + m or a few more, size)
+        The diagonal, and what the terms add; rows of zeros, for batches take three at once.
+    places : ndarray of int, shape (2, k)
+        Rows and columns of the entries off the diagonal that are not zero.
+    mixing : ndarray, shape (k,)
+        These entries.
+    """
+    diagonal, spare = transition.diagonal(), np.zeros((-len(drive) % 3, len(transition)))
+    places = np.array(np.nonzero(transition - np.diag(diagonal)))
+    return np.vstack([diagonal, drive, spare]), places, transition[*places]
+
+
 @cache
-def _single() -> Callable[..., None]:
+def single_kernel() -> Callable[..., None]:
+    """The step of one sample: (gains, places, mixing, z, y, u, y_next, z_next), the last of which is written."""
     import numba
 
     @numba.njit

@@ -41,11 +41,12 @@ class _Calibrated:
         return np.asarray(weights @ self._parts.reshape(2, -1)).reshape(-1, *self._parts.shape[1:])
 
     def scale(self, age: float) -> np.ndarray:
-        """The same of a single sample."""
-        age = min(age, self._last)
-        if age not in self._scales:
-            self._scales[age] = self.scales(*self.at(np.array([age])))[0]
-        return self._scales[age]
+        """The same of a single sample, its rows one after another."""
+        scale = self._scales.get(age if age < self._last else self._last)
+        if scale is None:
+            age = min(age, self._last)
+            scale = self._scales[age] = self.scales(*self.at(np.array([age]))).ravel()
+        return scale
 
 
 class Tracker:
@@ -93,6 +94,7 @@ class Tracker:
         self._variances = q, r = flow.variances(measurement_noise, process_noise)
         self._Q, self._R = np.diag(q), np.diag(r)
         self._low, self._high = flow.scaled_bounds
+        self._nz = len(artifact.filter.A)
         self._C = None if artifact.C is None else artifact.C * flow.x_scale
         self._units = flow.x_scale[:, None] * flow.x_scale
         self._window, self._share, self._limit = supervision(flow, self._dt)
@@ -104,6 +106,8 @@ class Tracker:
         self._batch: tuple[int, ...]
         self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
+        self._shown: np.ndarray | None = None  # the estimate of a single sample, where machine code has made it
+        self._heard: tuple[np.ndarray, np.ndarray, Gaussian] | None = None  # z, rows (n,), what T_inv said of these
 
     @property
     def _x(self) -> np.ndarray:
@@ -125,6 +129,8 @@ class Tracker:
     def estimate(self) -> np.ndarray:
         """The estimates, (..., nx)."""
         flow = self._flow
+        if self._shown is not None:
+            return self._shown.copy()
         if not self._batch:  # a single sample: every call of numpy would be felt
             x: np.ndarray = self._state[0, : flow.nx] * flow.x_scale
             x += flow.x_offset
@@ -133,16 +139,18 @@ class Tracker:
 
     def covariance(self, z: np.ndarray, age: np.ndarray | float) -> np.ndarray:
         """Covariances of the estimates' errors, (..., nx, nx), beside z, (..., size), at ages in samples."""
-        nz = len(self._artifact.filter.A)  # behind it lies z_u, exactly 0 until an input acts
+        nz = self._nz  # behind it lies z_u, exactly 0 until an input acts
         if not self._batch:  # a single sample: every call of numpy would be felt
-            acted = len(z) > nz and (z[nz] != 0.0 or any(z[nz:].tolist()))
+            acted = len(z) > nz and (z.item(nz) != 0.0 or any(z[nz:].tolist()))
             calibrated = self._calibrated if acted else self._free_calibrated
-            if age >= self._window or self._known[0]:
-                return np.asarray(
-                    self._state[0, self._flow.nx : -1].reshape(self._units.shape) * calibrated.scale(float(age))
-                )
-            return self._soon(self._said_of_one(z, float(age)), *calibrated.at(np.array([age])))[0]
-        age = np.broadcast_to(age, self._batch).ravel()
+            if age >= self._window or self._known.item(0):
+                single: np.ndarray = self._state[0, self._flow.nx : -1] * calibrated.scale(age)
+                return single.reshape(self._units.shape)
+            heard = self._heard
+            said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
+            return self._soon(said, *calibrated.at(np.array([age])))[0]
+        heard, age = self._heard, np.broadcast_to(age, self._batch).ravel()
+        where = heard[1] if heard is not None and heard[0] is z else np.zeros(len(age), dtype=bool)
         z = z.reshape(len(age), z.shape[-1])
         factor, doubt = self._calibrated.at(age)
         free = ~_acted(z[:, nz:])
@@ -151,7 +159,11 @@ class Tracker:
         P = self._P * self._calibrated.scales(factor, doubt)
         soon = (age < self._window) & ~self._known
         if soon.any():
-            P[soon] = self._soon(self._said(z[soon], age[soon]), factor[soon], doubt[soon], soon)
+            if heard is not None and where[soon].all():
+                said = heard[2][0][soon[where]], heard[2][1][soon[where]]
+            else:
+                said = self._said(z[soon], age[soon])
+            P[soon] = self._soon(said, factor[soon], doubt[soon], soon)
         return P.reshape(*self._batch, *P.shape[1:])
 
     def _soon(
@@ -183,7 +195,7 @@ class Tracker:
             return
         begun, where = copy.copy(self), rows.ravel()
         begun.reset(z, age, x0)
-        self._state = self._state.copy()  # others may look at what there was
+        self._shown, self._state = None, self._state.copy()  # others may look at what there was
         self._state[where] = begun._state
         self._known = self._known.copy()
         self._known[where] = begun._known
@@ -205,7 +217,8 @@ class Tracker:
         """Make the machine code for single samples now, by one of z, (size,), that is forgotten."""
         one = copy.copy(self)
         one.reset(z, 0)
-        one.advance(np.zeros(len(self._R)), np.zeros(self._flow.nu))
+        y = np.zeros(len(self._R))
+        one.step_single(z, y, np.zeros(self._flow.nu), y)
         one.supervise(z, 0)
 
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
@@ -214,8 +227,8 @@ class Tracker:
         Returns the outputs that were expected, (..., ny), which are not finite where a covariance broke down.
         """
         n, ny = len(self._state), len(self._R)
-        y, rows = y.reshape(n, ny), None if rows is None else rows.flatten()
-        if self._machine is not None:
+        self._shown, y, rows = None, y.reshape(n, ny), None if rows is None else rows.flatten()
+        if self._machine is not None and self._batch:
             inputs = u.copy().reshape(n, self._flow.nu)  # the user's own may be read-only
             return self._machine.advance(self._state, inputs, y, rows).reshape(*self._batch, ny)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -237,6 +250,20 @@ class Tracker:
         self._state = state
         return expected.reshape(*self._batch, ny)
 
+    def step_single(
+        self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """As :meth:`advance` for a single sample by machine code, which takes the filter's state z along.
+
+        Returns the next z, (size,), and the sample, (ny,), with what was expected in place of what is missing. None
+        where this is left to NumPy, and nothing has happened.
+        """
+        if self._batch or not self._singly or self._compiled is None:
+            return None
+        u = u.copy()  # the user's own: to Numba, an array that is read-only or has strides is of another type
+        self._shown, y_next, z = self._compiled.single(self._state, z, y, u, y_next)
+        return z, y_next
+
     def _ahead(self, u: np.ndarray) -> Gaussian:
         """Scaled estimates and covariances a sample later, before that sample is known."""
         flow = self._flow
@@ -254,24 +281,30 @@ class Tracker:
     def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         if not self._batch:  # a single sample: every call of numpy would be felt
-            age, one = float(age), not self._state[0, -1] <= self._limit  # lost where it is NaN too
+            age, one = float(age), not self._state.item(-1) <= self._limit  # lost where it is NaN too
             if (one or age < self._window) and (rows is None or rows):
-                self._take(self._said_of_one(z, age, one), _FLAGS[one], _FIRST)
+                said = self._said_of_one(z, age, one)
+                self._take(said, _FLAGS[one], _FIRST)
+                self._heard = z, _FLAGS[True], said
             return
         age = np.broadcast_to(age, self._batch).ravel()
         lost, asked = ~(self._mean_square <= self._limit), age < self._window
         if rows is not None:
             lost, asked = lost & rows.ravel(), asked & rows.ravel()
-        where = np.flatnonzero(lost | asked)
+        asked |= lost
+        where = np.flatnonzero(asked)
         if not len(where):
             return
-        z = z.reshape(-1, z.shape[-1])
-        if len(where) < len(z):
-            z, age, lost = z[where], age[where], lost[where]
-        self._take(self._said(z, age, lost), lost, where)
+        flat = z.reshape(-1, z.shape[-1])
+        if len(where) < len(flat):
+            flat, age, lost = flat[where], age[where], lost[where]
+        said = self._said(flat, age, lost)
+        self._take(said, lost, where)
+        self._heard = z, asked, said
 
     def _take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray) -> None:
         """Take what T_inv says of some rows, (k,), where it is surer or the tracker is lost."""
+        self._shown = None
         if self._machine is not None:
             self._machine.take(said, lost, where, self._state)
             return
@@ -300,7 +333,7 @@ class Tracker:
 
     def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
         """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
-        self._state = self._packed(*self._scaled(x, P), np.ones(len(x)))
+        self._shown, self._state = None, self._packed(*self._scaled(x, P), np.ones(len(x)))
 
     def _packed(self, x: np.ndarray, P: np.ndarray, mean_square: np.ndarray) -> np.ndarray:
         return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), mean_square[:, None]], axis=1)
@@ -330,7 +363,7 @@ class Tracker:
         if C is None:
             return None
         try:
-            return CompiledTracker(self._flow, C, variances=self._variances, share=self._share)
+            return CompiledTracker(self._flow, self._artifact.filter, C, variances=self._variances, share=self._share)
         except ImportError:
             return None
 

@@ -1,6 +1,7 @@
 """What single and vector wrappers share: an observer fitted to a plant, and what it shows."""
 
 import dataclasses
+import math
 import os
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -324,6 +325,25 @@ class KKLEstimator:
         if self._uncertainty:
             return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
+
+    def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
+        """As :meth:`shown`, of a single sample: of so few numbers every call of NumPy would be felt.
+
+        Parameters
+        ----------
+        report : mapping of str to ndarray
+            As :meth:`report` returns it.
+
+        Returns
+        -------
+        list of float
+            What :meth:`shown` returns.
+        """
+        values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
+        if self._uncertainty:
+            variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]
+            values += [math.sqrt(value) if value >= 0.0 else math.nan for value in variances]
+        return values
 
 
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:

@@ -124,6 +124,10 @@ class NamedEstimator(KKLEstimator):
         """What of a report is the observation: y, then x_hat or z."""
         return np.concatenate([report["y"], super().shown(report)], axis=-1)
 
+    def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
+        """The same of a single sample."""
+        return [*report["y"].tolist(), *super().listed(report)]
+
 
 class Samples:
     """What an observer from rollouts sees of an environment.

@@ -192,7 +192,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             base.drawn_by += 1
             self._draws = base.drawn_by
         self.observation_space = self._estimator.space
-        self._limits = [*zip(estimator.space.low.tolist(), estimator.space.high.tolist(), strict=True)]
+        self._low, self._high = estimator.space.low.tolist(), estimator.space.high.tolist()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -291,14 +291,14 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             self._trail.append(report["x_hat"].tolist())
         if self._rendering and self.render_mode == "human":
             self._animate()
-        shown = self._estimator.shown(report)
-        if len(self._limits) <= _FEW:
-            for value, (low, high) in zip(shown.tolist(), self._limits):
+        if len(self._low) <= _FEW:
+            values = self._estimator.listed(report)
+            for value, low, high in zip(values, self._low, self._high):
                 if not low <= value <= high:
                     break
             else:
-                return shown.astype(_FLOAT32)
-        return observation(shown, self._estimator.space)
+                return np.array(values, _FLOAT32)
+        return observation(self._estimator.shown(report), self._estimator.space)
 
 
 class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], RecordConstructorArgs):

@@ -10,7 +10,7 @@ import pytest
 from random_tracking import JUMPS, a_flow, signals, tracking
 
 import observers
-from observers import Expression, KKLObserver, compiled_tracker
+from observers import Expression, KKLObserver, LinearFilter, compiled_tracker
 from observers.compiled_tracker import CompiledTracker
 from observers.observer import SOON
 from observers.sparse import MANY_ROWS
@@ -175,7 +175,8 @@ def test_steps_of_other_sizes(nx, nu, ny):
     C = rng.normal(size=(ny, nx))
     low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
     q, r = flow.variances(0.3, 0.1)
-    machine = CompiledTracker(flow, C, variances=(q, r), share=0.1)
+    linear = LinearFilter(np.array([[-1.0, 2.0], [-2.0, -1.0]]), rng.normal(size=(2, ny)), dt=0.1, nu=nu)
+    machine = CompiledTracker(flow, linear, C, variances=(q, r), share=0.1)
     for n in (1, 129):
         x, root, u = rng.normal(size=(n, nx)), rng.normal(size=(n, nx, nx)), rng.normal(size=(n, nu))
         P, y, before = root @ root.mT / 9 + 1e-6 * np.eye(nx), rng.normal(size=(n, ny)), rng.uniform(0.5, 2.0, n)
@@ -190,12 +191,15 @@ def test_steps_of_other_sizes(nx, nu, ny):
         ahead = predicted(x, P, move=move, Q=np.diag(q))
         expected = corrected(*ahead, y, output=lambda s: (flow.x_offset + flow.x_scale * s) @ C.T, R=np.diag(r))
         state = np.column_stack([x, P.reshape(n, -1), before])
-        np.testing.assert_allclose(
-            machine.advance(state, u, y, None),
-            ahead[0] @ (C * flow.x_scale).T + C @ flow.x_offset,
-            rtol=1e-5,
-            atol=1e-5,
-        )
+        seen = ahead[0] @ (C * flow.x_scale).T + C @ flow.x_offset
+        if n == 1:
+            z, last = rng.normal(size=linear.size), rng.normal(size=ny)
+            x_hat, filled, z_next = machine.single(state, z, last, u[0], y[0])
+            np.testing.assert_allclose(x_hat, flow.x_offset + flow.x_scale * state[0, :nx], rtol=1e-12)
+            np.testing.assert_allclose(filled, np.where(np.isnan(y), seen, y)[0], rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(z_next, linear.advance(z, last, u[0], filled), rtol=1e-12)
+        else:
+            np.testing.assert_allclose(machine.advance(state, u, y, None), seen, rtol=1e-5, atol=1e-5)
         share = 0.1 * (1 - np.isnan(y).mean(-1))
         wanted = np.clip(expected[0], low, high), expected[1], before + share * (expected[2] - before)
         parts = state[:, :nx], state[:, nx:-1].reshape(P.shape), state[:, -1]
@@ -291,7 +295,12 @@ def test_observers_of_one_artifact_in_threads(batch, again):
         observer.reset((1 + 0.1 * i) * y[0])
         for k in range(1, 100):
             observer.step((1 + 0.1 * i) * y[k], u[k])
-        ahead = {observer._tracker.copied().advance(y[0], u[0]).tobytes() for _ in range(again)}
+        z, tracker = observer.z, observer._tracker
+        if batch:
+            ahead = {tracker.copied().advance(y[0], u[0]).tobytes() for _ in range(again)}
+        else:
+            nothing = np.full_like(y[0], np.nan)  # so that what is predicted takes its place
+            ahead = {tracker.copied().step_single(z, y[0], u[0], nothing)[1].tobytes() for _ in range(again)}
         found[i] = observer.decode(), ahead
 
     threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
