@@ -14,7 +14,7 @@ import numpy as np
 
 PIECE = 2**15  # values of a layer that a batch computes at once: they fit into the second cache
 _TILE = 256  # biases that lie one after another for some rows: in loops as short as a narrow layer much would be lost
-_UNROLLED = 4  # inputs that a single sample's loop takes at once
+UNROLLED = 4  # inputs that a single sample's loop takes at once
 _LINE = 16  # numbers of float32 in a line of the cache
 FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
 
@@ -62,7 +62,7 @@ class CompiledNetwork:
         self.packed = _aligned(
             np.concatenate([part.ravel() for weight, bias in layers for part in (bias, _padded(weight))])
         )
-        row = -(-(self._most + _UNROLLED) // _LINE) * _LINE
+        row = -(-(self._most + UNROLLED) // _LINE) * _LINE
         self.between = _aligned(np.zeros(3 * row, np.float32)).reshape(3, row)  # no kernel lets another thread in
         self._spare: list[np.ndarray] = []  # what batches take, and put back: BLAS does let others in
 
@@ -302,7 +302,7 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 
 def _padded(weight: np.ndarray) -> np.ndarray:
     """Weights with rows of zeros, for as many inputs as the loop takes at once."""
-    return np.pad(weight, ((0, -len(weight) % _UNROLLED), (0, 0)))
+    return np.pad(weight, ((0, -len(weight) % UNROLLED), (0, 0)))
 
 
 @functools.cache
@@ -419,12 +419,12 @@ def _kernels(activation: str) -> tuple[Any, Any]:
             h[j] = x[j]
         for layer in range(len(widths) - 1):
             inputs, width = widths[layer], widths[layer + 1]
-            for j in range(inputs, inputs + _UNROLLED):
+            for j in range(inputs, inputs + UNROLLED):
                 h[j] = 0.0  # beside the rows of zeros
             for j in range(width):
                 into[j] = packed[at + j]
             at += width
-            for i in range(0, inputs, _UNROLLED):
+            for i in range(0, inputs, UNROLLED):
                 a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
                 first, second = packed[at : at + width], packed[at + width : at + 2 * width]
                 third, fourth = packed[at + 2 * width : at + 3 * width], packed[at + 3 * width : at + 4 * width]

@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from observers.compiled import _kernels
+from observers.compiled import UNROLLED, _kernels, active_kernel
 from observers.filter import LinearFilter
 from observers.flow import Flow
 from observers.polynomial import table
@@ -25,7 +25,9 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
 _TERMS = 4  # of the polynomial that are added at a time
-_BLOCK = 64  # points that go through the polynomial at a time
+_FEW_POINTS = 16  # are fewer than a wide network's neurons
+_NONE = np.empty((0, 0))
+_LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 
 
@@ -71,21 +73,22 @@ class CompiledTracker:
         states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale, bend)
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
-        self._network, self._nx, self._ny, self._points = network, flow.nx, len(C), 2 * flow.nx
-        one, enter, leave, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
+        self._nx, self._ny = flow.nx, len(C)
+        one, many, take = _tracking(network.activation, flow.nx, flow.nu, len(C), flow.degree)
         terms = flow.polynomial.shape[1]
-        polynomial = np.pad(flow.polynomial, ((0, 0), (0, -terms % _TERMS)))
+        polynomial = np.pad(flow.polynomial, ((0, 0), (0, _padded(terms) - terms)))
         gains, places, mixing = without_zeros(linear.transition, linear.drive)
         # A few arrays of all there is: each that is handed over takes as long as a hundred multiplications.
         numbers = np.concatenate([part.ravel() for part in (states, outputs, scale, polynomial, gains, mixing)])
         whole = np.array([len(network.widths), *network.widths, *places.ravel()])
-        self._one = functools.partial(one, numbers, whole, network.packed, network.between)
+        self._one = functools.partial(one, numbers, whole, network.packed)
         self._told = flow.nx + 2 * len(C) + linear.size
-        self._enter = functools.partial(enter, states, scale, polynomial)
-        self._leave = functools.partial(leave, states, outputs)
+        self._many = functools.partial(many, states, outputs, scale, polynomial, network.packed, network.widths)
         self._take = functools.partial(take, states)
 
-    def advance(self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None) -> np.ndarray:
+    def advance(
+        self, state: np.ndarray, u: np.ndarray, y: np.ndarray, rows: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Predict a sample, and take it in.
 
         Parameters
@@ -101,16 +104,14 @@ class CompiledTracker:
 
         Returns
         -------
-        ndarray, shape (n, ny)
+        x : ndarray, shape (n, nx)
+            The estimates in units of the states.
+        expected : ndarray, shape (n, ny)
             The outputs that were predicted; NaN where a covariance was none.
         """
-        expected = np.empty((len(y), self._ny))
-        moved = np.empty((self._nx, len(y) * self._points))
-        inputs = np.empty((moved.shape[1], self._nx + u.shape[1]), np.float32)
-        self._enter(u, state, inputs, moved)
-        taken = np.ones(len(y), dtype=bool) if rows is None else rows
-        self._leave(self._network.batch(inputs), moved, y, taken, state, expected)
-        return expected
+        x, expected = np.empty((len(y), self._nx)), np.empty((len(y), self._ny))
+        self._many(u, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, x, expected)
+        return x, expected
 
     def single(
         self, state: np.ndarray, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
@@ -143,7 +144,9 @@ class CompiledTracker:
         self._one(z, y, u, y_next, state, told)
         return told[:nx], told[nx + ny : nx + 2 * ny], told[nx + 2 * ny :]
 
-    def take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray) -> None:
+    def take(
+        self, said: Gaussian, lost: np.ndarray, where: np.ndarray, state: np.ndarray, x: np.ndarray | None
+    ) -> None:
         """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
 
         Parameters
@@ -156,8 +159,10 @@ class CompiledTracker:
             The rows that these are.
         state : ndarray, shape (n, nx + nx^2 + 1)
             The state.
+        x : ndarray, shape (n, nx), optional
+            The estimates in units of the states, which are written over as the state is.
         """
-        self._take(*said, lost, where, state)
+        self._take(*said, lost, where, state, _NONE if x is None else x)
 
 
 def _packed(*columns: np.ndarray) -> np.ndarray:
@@ -178,163 +183,14 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
     import numba
 
     compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
-    evaluate, update = _kernels(activation)[1], single_kernel()
-    count, far, weight = 2 * nx, math.sqrt(nx), 1 / (2 * nx)
-    entries = nx * nx
-    earlier, by = table(nx + nu, degree)
-    terms, padded = len(by), -(-len(by) // _TERMS) * _TERMS
-
-    @_inlined
-    def within(states: np.ndarray, i: int, s: float) -> float:
-        s = states[i, _LOW] if s < states[i, _LOW] else s
-        return states[i, _HIGH] if s > states[i, _HIGH] else s
-
-    @_inlined
-    def before(
-        states: np.ndarray,
-        scale: np.ndarray,
-        row: np.ndarray,
-        u: np.ndarray,
-        L: np.ndarray,
-        points: np.ndarray,
-        inputs: np.ndarray,
-    ) -> None:
-        """The sigma points of a row, before rows of scaled inputs, (nx + nu, 2 nx), and as the network has them.
-
-        NaN where there is no Cholesky factor.
-        """
-        for i in range(nx):
-            for p in range(count):
-                points[i, p] = row[i]
-            for j in range(i + 1):
-                entry = row[nx + nx * i + j]
-                for k in range(j):
-                    entry -= L[i, k] * L[j, k]
-                if i > j:
-                    L[i, j] = entry / L[j, j]
-                else:
-                    L[i, j] = math.sqrt(entry) if entry > 0.0 else np.nan
-                points[i, j] += far * L[i, j]
-                points[i, nx + j] -= far * L[i, j]
-        for p in range(count):
-            for i in range(nx):
-                points[i, p] = within(states, i, points[i, p])
-                inputs[p, i] = points[i, p]
-            for j in range(nu):
-                points[nx + j, p] = inputs[p, nx + j] = u[j] * scale[j]
-
-    @_inlined
-    def multiply(a: np.ndarray, b: np.ndarray, product: np.ndarray) -> None:
-        for p in range(len(product)):
-            product[p] = a[p] * b[p]
-
-    @_inlined
-    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
-        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
-        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
-        for p in range(len(total)):
-            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
-
-    @_inlined
-    def along(polynomial: np.ndarray, points: np.ndarray, block: int, moved: np.ndarray) -> None:
-        """Where points go by the polynomial, (nx, n). A block of them stays in the cache, its loops are vectors."""
-        memory = np.zeros((nx + nu + 1 + padded, block))
-        signals, total, products = memory[: nx + nu], memory[nx + nu], memory[nx + nu + 1 :]
-        products[0] = 1.0
-        for first in range(0, points.shape[1], block):
-            size = min(block, points.shape[1] - first)
-            for j in range(nx + nu):
-                for p in range(size):
-                    signals[j, p] = points[j, first + p]
-            for t in range(1, terms):
-                multiply(products[earlier[t]], signals[by[t]], products[t])
-            for i in range(nx):
-                total[:] = signals[i]
-                for t in range(0, padded, _TERMS):
-                    add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], total)
-                for p in range(size):
-                    moved[i, first + p] = total[p]
-
-    @_inlined
-    def after(
-        states: np.ndarray,
-        outputs: np.ndarray,
-        h: np.ndarray,
-        moved: np.ndarray,
-        y: np.ndarray,
-        takes: bool,
-        found: np.ndarray,
-        across: np.ndarray,
-        row: np.ndarray,
-        expected: np.ndarray,
-    ) -> None:
-        """Moments of where the points of a row go with it, and a sample taken in, one output after another."""
-        distance = 0.0
-        for i in range(nx):
-            total = 0.0
-            for p in range(count):
-                moved[i, p] += states[i, _GAIN] * h[p, i]
-                total += moved[i, p]
-            mean = weight * total
-            for p in range(count):
-                moved[i, p] -= mean
-            found[i] = mean
-            distance += (mean - row[i]) * (mean - row[i])
-            for j in range(i + 1):
-                entry = 0.0
-                for p in range(count):
-                    entry += moved[i, p] * moved[j, p]
-                found[nx + nx * i + j] = weight * entry
-            found[nx + nx * i + i] += states[i, _NOISE]
-        for i in range(nx):
-            if states[i, _BEND] > 0.0:  # or infinity times 0 would be no number
-                bent = states[i, _BEND] * distance
-                found[nx + nx * i + i] += bent * bent
-        for k in range(ny):
-            expected[k] = outputs[k, _MEAN]
-            for i in range(nx):
-                expected[k] += outputs[k, _C + i] * found[i]
-        if takes:
-            squared, seen = 0.0, 0
-            for k in range(ny):
-                if np.isnan(y[k]):
-                    continue
-                apart, pivot = y[k] - outputs[k, _MEAN], outputs[k, _VARIANCE]
-                for i in range(nx):
-                    across[i] = 0.0
-                    for j in range(nx):
-                        across[i] += outputs[k, _C + j] * found[nx + (nx * i + j if j < i else nx * j + i)]
-                    apart -= outputs[k, _C + i] * found[i]
-                for i in range(nx):
-                    pivot += outputs[k, _C + i] * across[i]
-                squared += apart * apart / pivot
-                seen += 1
-                for i in range(nx):
-                    gain = across[i] / pivot
-                    found[i] += gain * apart
-                    for j in range(i + 1):
-                        found[nx + nx * i + j] -= gain * across[j]
-            total = 0.0
-            for i in range(nx):
-                total += found[i]
-                for j in range(i + 1):
-                    total += found[nx + nx * i + j]
-            if np.isfinite(total):
-                for i in range(nx):
-                    row[i] = within(states, i, found[i])
-                    for j in range(i + 1):
-                        row[nx + nx * i + j] = row[nx + nx * j + i] = found[nx + nx * i + j]
-                if seen > 0:
-                    row[nx + entries] += outputs[0, _SHARE] * seen / ny * (squared / seen - row[nx + entries])
-            else:
-                row[nx + entries] = np.inf
+    update, padded = single_kernel(), _padded(len(table(nx + nu, degree)[0]))
+    step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
 
     @compiled
     def one(
         numbers: np.ndarray,
         whole: np.ndarray,
         packed: np.ndarray,
-        between: np.ndarray,
         z: np.ndarray,
         y: np.ndarray,
         u: np.ndarray,
@@ -355,56 +211,26 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         end = len(numbers) - places.shape[1]
         gains, mixing = numbers[at:end].reshape((end - at) // size, size), numbers[end:]
 
-        memory, of_network = np.empty((2 * nx + nu, count)), np.empty((count, 2 * nx + nu), np.float32)
-        points, moved, inputs, h = memory[: nx + nu], memory[nx + nu :], of_network[:, : nx + nu], of_network[:, nx + nu :]
-        more = np.empty((nx + 2, entries + nx))
-        L, found, across = more[2:], more[0], more[1]
-        before(states, scale, state[0], u, L, points, inputs)
-        along(polynomial, points, count, moved)
-        for p in range(count):
-            evaluate(inputs[p], packed, widths, between, h[p])
-        expected, filled = told[nx : nx + ny], told[nx + ny : nx + 2 * ny]
-        after(states, outputs, h, moved, y_next, True, found, across, state[0], expected)
-        for i in range(nx):
-            told[i] = states[i, _OFFSET] + states[i, _SCALE] * state[0, i]
+        expected, filled, all_rows = told[nx : nx + ny], told[nx + ny : nx + 2 * ny], np.ones(1, np.bool_)
+        step_one(
+            states,
+            outputs,
+            scale,
+            polynomial,
+            packed,
+            widths,
+            u.reshape(1, nu),
+            y_next.reshape(1, ny),
+            all_rows,
+            state,
+            told[:nx].reshape(1, nx),
+            expected.reshape(1, ny),
+        )
         for k in range(ny):
             filled[k] = y_next[k]
             if np.isnan(y_next[k]):
                 filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
         update(gains, places, mixing, z, y, u, filled, told[nx + 2 * ny :])
-
-    @compiled
-    def enter(
-        states: np.ndarray,
-        scale: np.ndarray,
-        polynomial: np.ndarray,
-        u: np.ndarray,
-        state: np.ndarray,
-        inputs: np.ndarray,
-        moved: np.ndarray,
-    ) -> None:
-        L = np.empty((nx, nx))
-        points = np.empty((nx + nu, len(inputs)))
-        for row in range(len(state)):
-            own = slice(row * count, (row + 1) * count)
-            before(states, scale, state[row], u[row], L, points[:, own], inputs[own])
-        along(polynomial, points, _BLOCK, moved)
-
-    @compiled
-    def leave(
-        states: np.ndarray,
-        outputs: np.ndarray,
-        h: np.ndarray,
-        moved: np.ndarray,
-        y: np.ndarray,
-        rows: np.ndarray,
-        state: np.ndarray,
-        expected: np.ndarray,
-    ) -> None:
-        found, across = np.empty(nx + entries), np.empty(nx)
-        for row in range(len(state)):
-            own = slice(row * count, (row + 1) * count)
-            after(states, outputs, h[own], moved[:, own], y[row], rows[row], found, across, state[row], expected[row])
 
     @compiled
     def take(
@@ -414,6 +240,7 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
         lost: np.ndarray,
         where: np.ndarray,
         state: np.ndarray,
+        told: np.ndarray,
     ) -> None:
         for k in range(len(where)):
             row, ours, theirs = state[where[k]], 0.0, 0.0
@@ -422,10 +249,298 @@ def _tracking(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[
                 theirs += P[k, i, i] / (states[i, _SCALE] * states[i, _SCALE])
             if lost[k] or theirs < ours:
                 for i in range(nx):
-                    row[i] = within(states, i, (x[k, i] - states[i, _OFFSET]) / states[i, _SCALE])
+                    s = (x[k, i] - states[i, _OFFSET]) / states[i, _SCALE]
+                    s = states[i, _LOW] if s < states[i, _LOW] else s
+                    row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
+                    if len(told) > 0:
+                        told[where[k], i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
                     for j in range(nx):
                         row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
-                    row[nx + entries] = 1.0
+                    row[nx + nx * nx] = 1.0
 
-    return one, enter, leave, take
+    return one, step_lanes, take
+
+
+def _padded(terms: int) -> int:
+    return -(-terms // _TERMS) * _TERMS
+
+
+def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -> Callable[..., None]:
+    """A kernel that takes so many rows at a time: what they have in common is a loop over them.
+
+    Its arrays have an entry for each row in the end, or for each sigma point of each row.
+    """
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
+    active, of_one, signals, count = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
+    far, weight, points = math.sqrt(nx), 1 / count, count * lanes
+    earlier, by = table(signals, degree)
+    terms, padded = len(by), _padded(len(by))
+
+    @_inlined
+    def factorise(P: np.ndarray) -> None:
+        """Cholesky's factor in the place of P's lower half; NaN where there is none."""
+        for i in range(nx):
+            for j in range(i + 1):
+                for k in range(j):
+                    for r in range(lanes):
+                        P[i, j, r] -= P[i, k, r] * P[j, k, r]
+                if i > j:
+                    for r in range(lanes):
+                        P[i, j, r] /= P[j, j, r]
+                else:
+                    for r in range(lanes):
+                        P[i, j, r] = math.sqrt(P[i, j, r]) if P[i, j, r] > 0.0 else np.nan
+
+    @_inlined
+    def spread_out(states: np.ndarray, x: np.ndarray, L: np.ndarray, at: np.ndarray) -> None:
+        """The sigma points, within the bounds."""
+        for i in range(nx):
+            for p in range(count):
+                for r in range(lanes):
+                    at[i, p * lanes + r] = x[i, r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    at[i, j * lanes + r] += far * L[i, j, r]
+                    at[i, (nx + j) * lanes + r] -= far * L[i, j, r]
+            low, high = states[i, _LOW], states[i, _HIGH]
+            for p in range(points):
+                s = at[i, p]
+                s = low if s < low else s
+                at[i, p] = high if s > high else s
+
+    @_inlined
+    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
+        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+        for p in range(points):
+            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+
+    @_inlined
+    def along(polynomial: np.ndarray, at: np.ndarray, products: np.ndarray, moved: np.ndarray) -> None:
+        """Where the points go by the polynomial."""
+        for t in range(1, terms):
+            before, factor, product = products[earlier[t]], at[by[t]], products[t]
+            for p in range(points):
+                product[p] = before[p] * factor[p]
+        for i in range(nx):
+            for p in range(points):
+                moved[i, p] = at[i, p]
+            for t in range(0, padded, _TERMS):
+                add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], moved[i])
+
+    @_inlined
+    def evaluate_each(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The network, of inputs h; what it says lies in what is returned. The loops are over its width."""
+        memory = np.empty((5, len(h)), np.float32)
+        for p in range(points):
+            for i in range(signals):
+                memory[3, i] = h[i, p]
+            of_one(memory[3, :signals], packed, widths, memory[:3], memory[4, :nx])
+            for i in range(nx):
+                into[i, p] = memory[4, i]
+        return into
+
+    @_inlined
+    def evaluate_all(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The same, in one of the two arrays. The loops are over the points."""
+        begin = 0
+        for layer in range(len(widths) - 1):
+            inputs, width = widths[layer], widths[layer + 1]
+            for i in range(inputs, inputs + UNROLLED):
+                for p in range(points):
+                    h[i, p] = 0.0  # beside the rows of zeros
+            for j in range(width):
+                row = into[j]
+                for p in range(points):
+                    row[p] = packed[begin + j]
+                at = begin + width + j
+                for i in range(0, inputs, UNROLLED):
+                    w0, w1, w2, w3 = packed[at], packed[at + width], packed[at + 2 * width], packed[at + 3 * width]
+                    a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
+                    for p in range(points):
+                        row[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+                    at += UNROLLED * width
+                if layer < len(widths) - 2:
+                    for p in range(points):
+                        row[p] = active(row[p])
+            begin += width + (inputs + (-inputs) % UNROLLED) * width
+            h, into = into, h
+        return h
+
+    @_inlined
+    def evaluate(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The quicker of both."""
+        if points < _FEW_POINTS and widths.max() > _FEW_POINTS:
+            return evaluate_each(packed, widths, h, into)
+        return evaluate_all(packed, widths, h, into)
+
+    @_inlined
+    def moments(
+        states: np.ndarray,
+        h: np.ndarray,
+        moved: np.ndarray,
+        x: np.ndarray,
+        mean: np.ndarray,
+        P: np.ndarray,
+        distance: np.ndarray,
+    ) -> None:
+        """Of where the points go with the network, and what the flow is off by; x are the estimates before."""
+        for r in range(lanes):
+            distance[r] = 0.0
+        for i in range(nx):
+            gain = states[i, _GAIN]
+            for r in range(lanes):
+                mean[i, r] = 0.0
+            for p in range(count):
+                for r in range(lanes):
+                    moved[i, p * lanes + r] += gain * h[i, p * lanes + r]
+                    mean[i, r] += moved[i, p * lanes + r]
+            for r in range(lanes):
+                mean[i, r] *= weight
+                distance[r] += (mean[i, r] - x[i, r]) * (mean[i, r] - x[i, r])
+            for p in range(count):
+                for r in range(lanes):
+                    moved[i, p * lanes + r] -= mean[i, r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    P[i, j, r] = 0.0
+                for p in range(count):
+                    for r in range(lanes):
+                        P[i, j, r] += moved[i, p * lanes + r] * moved[j, p * lanes + r]
+                for r in range(lanes):
+                    P[i, j, r] *= weight
+            for r in range(lanes):
+                P[i, i, r] += states[i, _NOISE]
+        for i in range(nx):
+            if states[i, _BEND] > 0.0:  # or infinity times 0 would be no number
+                for r in range(lanes):
+                    bent = states[i, _BEND] * distance[r]
+                    P[i, i, r] += bent * bent
+
+    @_inlined
+    def correct(
+        output: np.ndarray,
+        y: np.ndarray,
+        mean: np.ndarray,
+        P: np.ndarray,
+        across: np.ndarray,
+        apart: np.ndarray,
+        pivot: np.ndarray,
+        squared: np.ndarray,
+        seen: np.ndarray,
+        there: np.ndarray,
+    ) -> None:
+        """Take in an output, where it is a number."""
+        for r in range(lanes):
+            there[r] = 1.0 if y[r] == y[r] else 0.0
+            apart[r] = y[r] - output[_MEAN] if y[r] == y[r] else 0.0
+            pivot[r] = output[_VARIANCE]
+        for i in range(nx):
+            for r in range(lanes):
+                across[i, r] = 0.0
+            for j in range(nx):
+                entry = P[i, j] if j < i else P[j, i]
+                for r in range(lanes):
+                    across[i, r] += output[_C + j] * entry[r]
+            for r in range(lanes):
+                apart[r] -= there[r] * output[_C + i] * mean[i, r]
+                pivot[r] += output[_C + i] * across[i, r]
+        for r in range(lanes):
+            squared[r] += apart[r] * apart[r] / pivot[r]
+            seen[r] += there[r]
+        for i in range(nx):
+            for r in range(lanes):
+                mean[i, r] += there[r] * across[i, r] / pivot[r] * apart[r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    P[i, j, r] -= there[r] * across[i, r] / pivot[r] * across[j, r]
+
+    @compiled
+    def step(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        polynomial: np.ndarray,
+        packed: np.ndarray,
+        widths: np.ndarray,
+        u: np.ndarray,
+        y: np.ndarray,
+        rows: np.ndarray,
+        state: np.ndarray,
+        told: np.ndarray,
+        expected: np.ndarray,
+    ) -> None:
+        n, cut = len(state), nx * nx
+        of_rows = np.empty((cut + 3 * nx + 7, lanes))
+        P, x, mean = of_rows[:cut].reshape(nx, nx, lanes), of_rows[cut : cut + nx], of_rows[cut + nx : cut + 2 * nx]
+        across, more = of_rows[cut + 2 * nx : cut + 3 * nx], of_rows[cut + 3 * nx :]
+        distance, sample, apart, pivot, squared, seen, there = (
+            more[0],
+            more[1],
+            more[2],
+            more[3],
+            more[4],
+            more[5],
+            more[6],
+        )
+        of_points = np.zeros((signals + nx + padded, points))
+        at, moved, products = of_points[:signals], of_points[signals : signals + nx], of_points[signals + nx :]
+        products[0] = 1.0
+        between = np.empty((2, widths.max() + UNROLLED, points), np.float32)
+        for first in range(0, n, lanes):
+            for r in range(lanes):
+                now = min(first + r, n - 1)  # behind the last row, copies of it
+                for i in range(nx):
+                    x[i, r] = state[now, i]
+                    for j in range(i + 1):
+                        P[i, j, r] = state[now, nx + nx * i + j]
+                for j in range(nu):
+                    for p in range(count):
+                        at[nx + j, p * lanes + r] = u[now, j] * scale[j]
+            factorise(P)
+            spread_out(states, x, P, at)
+            for i in range(signals):
+                for p in range(points):
+                    between[0, i, p] = at[i, p]
+            along(polynomial, at, products, moved)
+            moments(states, evaluate(packed, widths, between[0], between[1]), moved, x, mean, P, distance)
+
+            size = min(lanes, n - first)
+            for k in range(ny):
+                for r in range(size):
+                    expected[first + r, k] = outputs[k, _MEAN]
+                    for i in range(nx):
+                        expected[first + r, k] += outputs[k, _C + i] * mean[i, r]
+            for r in range(lanes):
+                squared[r] = seen[r] = 0.0
+            for k in range(ny):
+                for r in range(lanes):
+                    sample[r] = y[min(first + r, n - 1), k]
+                correct(outputs[k], sample, mean, P, across, apart, pivot, squared, seen, there)
+            for r in range(size):
+                row, total = state[first + r], 0.0
+                for i in range(nx):
+                    total += mean[i, r]
+                    for j in range(i + 1):
+                        total += P[i, j, r]
+                if rows[first + r] and np.isfinite(total):
+                    for i in range(nx):
+                        s = mean[i, r]
+                        s = states[i, _LOW] if s < states[i, _LOW] else s
+                        row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
+                        for j in range(i + 1):
+                            row[nx + nx * i + j] = row[nx + nx * j + i] = P[i, j, r]
+                    if seen[r] > 0:
+                        row[nx + cut] += outputs[0, _SHARE] * seen[r] / ny * (squared[r] / seen[r] - row[nx + cut])
+                elif rows[first + r]:
+                    row[nx + cut] = np.inf
+                for i in range(nx):
+                    told[first + r, i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
+
+    return step
+
+
+__all__ = ["CompiledTracker"]

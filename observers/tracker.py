@@ -106,7 +106,7 @@ class Tracker:
         self._batch: tuple[int, ...]
         self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
-        self._shown: np.ndarray | None = None  # the estimate of a single sample, where machine code has made it
+        self._shown: np.ndarray | None = None  # the estimates, (n, nx) or (nx,), where machine code has made them
         self._heard: tuple[np.ndarray, np.ndarray, Gaussian] | None = None  # z, rows (n,), what T_inv said of these
 
     @property
@@ -130,7 +130,7 @@ class Tracker:
         """The estimates, (..., nx)."""
         flow = self._flow
         if self._shown is not None:
-            return self._shown.copy()
+            return self._shown.copy().reshape(*self._batch, flow.nx) if self._batch else self._shown.copy()
         if not self._batch:  # a single sample: every call of numpy would be felt
             x: np.ndarray = self._state[0, : flow.nx] * flow.x_scale
             x += flow.x_offset
@@ -204,6 +204,7 @@ class Tracker:
         """Another that stands where this one does, and goes its own way."""
         other = copy.copy(self)
         other._state = self._state.copy()
+        other._shown = None
         return other
 
     def go_on(self, other: "Tracker") -> None:
@@ -230,7 +231,8 @@ class Tracker:
         self._shown, y, rows = None, y.reshape(n, ny), None if rows is None else rows.flatten()
         if self._machine is not None and self._batch:
             inputs = u.copy().reshape(n, self._flow.nu)  # the user's own may be read-only
-            return self._machine.advance(self._state, inputs, y, rows).reshape(*self._batch, ny)
+            self._shown, expected = self._machine.advance(self._state, inputs, y, rows)
+            return expected.reshape(*self._batch, ny)
         with np.errstate(over="ignore", invalid="ignore"):
             x, P = self._ahead(u)
             if self._C is None:
@@ -304,10 +306,12 @@ class Tracker:
 
     def _take(self, said: Gaussian, lost: np.ndarray, where: np.ndarray) -> None:
         """Take what T_inv says of some rows, (k,), where it is surer or the tracker is lost."""
-        self._shown = None
+        if not self._batch:
+            self._shown = None
         if self._machine is not None:
-            self._machine.take(said, lost, where, self._state)
+            self._machine.take(said, lost, where, self._state, self._shown)
             return
+        self._shown = None
         x, P = self._scaled(*said)
         taken = lost | (_mean_square(P) < _mean_square(self._P[where]))
         if taken.any():

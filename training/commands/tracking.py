@@ -12,6 +12,7 @@ from rich.console import Console
 from observers import Artifact
 from observers.names import resolve
 from training.commands.teaching import Teaching
+from training.presets import SMALL, Size
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class Tracking(Teaching):
     and what is measured has to be among the hidden signals.
     """
 
+    size: Size = "default"
+    """small: a network half as wide, for fast simulations and microcontrollers."""
     steps: int = 40_000
     """Batches for the network."""
     trajectories: int = 1600
@@ -64,6 +67,7 @@ class Tracking(Teaching):
             from_records=learn_recorded_tracking,
             trajectories=self.trajectories,
             steps=self.steps,
+            small=self.size == SMALL,
         )
         if found.signals is None:
             words = [

@@ -31,6 +31,7 @@ def learn_tracking(
     system: System,
     *,
     steps: int = 40_000,
+    small: bool = False,
     trajectories: int = 1600,
     seed: int = 0,
     policy: Controller | None = None,
@@ -53,6 +54,8 @@ def learn_tracking(
         What it was made for.
     steps : int
         Batches for the network.
+    small : bool
+        Whether the network is half as wide as usual, for small maps.
     trajectories : int
         Number of motions to calibrate on.
     seed : int
@@ -96,7 +99,15 @@ def learn_tracking(
     torch.manual_seed(seed)
     with progress_bars(console) as progress:
         flow = _learned(
-            artifact, system, duration=duration, steps=steps, seed=seed, policy=policy, progress=progress, device=device
+            artifact,
+            system,
+            duration=duration,
+            steps=steps,
+            small=small,
+            seed=seed,
+            policy=policy,
+            progress=progress,
+            device=device,
         )
         ones = np.ones((*(() if len(levels) == 1 else (2,)), *regions.tables))
         flow = dataclasses.replace(flow, factors=Factors(np.array(LEVELS), regions.knots * artifact.filter.dt, ones))
@@ -149,6 +160,7 @@ def _learned(
     *,
     duration: float,
     steps: int,
+    small: bool,
     seed: int,
     policy: Controller | None,
     progress: ProgressBars,
@@ -171,6 +183,7 @@ def _learned(
         u_scale,
         degree=largest_degree(artifact.nx + nu),
         steps=steps,
+        small=small,
         seed=seed,
         progress=progress,
         device=device,

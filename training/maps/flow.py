@@ -31,7 +31,7 @@ DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
 # deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
 # then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
-NARROW, WIDE = 8, 32  # neurons in each hidden layer
+NARROW, WIDE = 8, 32  # neurons in each hidden layer; of small flows half as many
 MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 FARTHEST = 0.1  # share of the increments, of the longest, from which it is found how errors grow with them
@@ -136,6 +136,8 @@ class FlowProblem(nn.Module):
         Of the inputs.
     degree : int
         Of the polynomial, if it leaves little; else it is 1.
+    small : bool
+        Whether the network is half as wide.
     device : torch.device
         Where the network is trained.
 
@@ -147,7 +149,9 @@ class FlowProblem(nn.Module):
         Scale of what it leaves.
     """
 
-    def __init__(self, increments: Increments, u_scale: np.ndarray, *, degree: int, device: torch.device) -> None:
+    def __init__(
+        self, increments: Increments, u_scale: np.ndarray, *, degree: int, small: bool, device: torch.device
+    ) -> None:
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)
         change = increments.change / increments.x_scale
@@ -155,7 +159,7 @@ class FlowProblem(nn.Module):
         little = np.median(np.abs(left), axis=0).max() < LITTLE
         if not little and degree > 1:
             self.polynomial, left = _fitted(inputs, change, 1)
-        width = NARROW if little else WIDE
+        width = (NARROW if little else WIDE) // (2 if small else 1)
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
         self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=DEPTH, activation="tanh").to(device)
@@ -218,6 +222,7 @@ def fit_flow(
     steps: int,
     seed: int,
     progress: ProgressBars,
+    small: bool = False,
     device: torch.device | None = None,
     **of_plant: Any,
 ) -> Flow:
@@ -237,6 +242,8 @@ def fit_flow(
         Of the batches; the network begins with torch's own random numbers.
     progress : ProgressBars
         Where a bar is shown.
+    small : bool
+        Whether the network is half as wide as usual.
     device : torch.device, optional
         Where the network is trained; by default on the CPU.
     **of_plant : object
@@ -248,7 +255,7 @@ def fit_flow(
         One that has no error, and no factors yet.
     """
     device = device or torch.device("cpu")
-    problem = FlowProblem(increments, u_scale, degree=degree, device=device)
+    problem = FlowProblem(increments, u_scale, degree=degree, small=small, device=device)
     optimise_at_once(
         "flow", problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed
     )

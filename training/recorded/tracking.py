@@ -38,6 +38,7 @@ def learn_recorded_tracking(
     held_out: Sequence[Record] | None = None,
     *,
     steps: int = 40_000,
+    small: bool = False,
     seed: int = 0,
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,
@@ -62,6 +63,8 @@ def learn_recorded_tracking(
         are parted as in the training.
     steps : int
         Batches for the network.
+    small : bool
+        Whether the network is half as wide as usual, for small maps.
     seed : int
         Of everything random.
     device : torch.device, optional
@@ -101,6 +104,7 @@ def learn_recorded_tracking(
             np.where(u_scale > 0, u_scale, 1.0),
             degree=DEGREE,
             steps=steps,
+            small=small,
             seed=seed,
             progress=progress,
             device=device,
