@@ -33,7 +33,7 @@ class SparseUpdate:
     """
 
     def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
-        gains, places, mixing = parts = without_zeros(transition, drive)
+        gains, _, mixing = parts = without_zeros(transition, drive)
         if len(mixing) > len(transition):
             raise ValueError(f"{len(mixing)} entries off the diagonal of {len(transition)} are too many to gain")
         self._terms, self._shape = len(drive), gains.shape

@@ -144,7 +144,7 @@ class Tracker:
             acted = len(z) > nz and (z.item(nz) != 0.0 or any(z[nz:].tolist()))
             calibrated = self._calibrated if acted else self._free_calibrated
             if age >= self._window or self._known.item(0):
-                single: np.ndarray = self._state[0, self._flow.nx : -1] * calibrated.scale(age)
+                single: np.ndarray = self._state[0, self._flow.nx : -1] * calibrated.scale(float(age))
                 return single.reshape(self._units.shape)
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))

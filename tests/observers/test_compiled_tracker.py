@@ -10,7 +10,7 @@ import pytest
 from random_tracking import JUMPS, a_flow, signals, tracking
 
 import observers
-from observers import Expression, KKLObserver, LinearFilter, compiled_tracker
+from observers import Expression, KKLObserver, LinearFilter, tracker_kernels
 from observers.compiled_tracker import CompiledTracker
 from observers.observer import SOON
 from observers.sparse import MANY_ROWS
@@ -223,9 +223,9 @@ def test_outputs_that_are_not_linear_stay_with_numpy():
 def test_a_run_compiles_nothing_in_its_midst():
     """Whatever may come: inputs that are read-only or have strides, missing samples, restarts, a filter that is old."""
     artifact = tracking(2)
-    compiled_tracker._tracking.cache_clear()
+    tracker_kernels.kernels.cache_clear()
     observer = KKLObserver(artifact, 0.1, compiled=True)
-    kernels = compiled_tracker._tracking(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny, 3)
+    kernels = tracker_kernels.kernels(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny, 3)
     assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 1]
     frozen, y = np.array([0.2]), np.array([0.1, 0.2])
     frozen.flags.writeable = False

@@ -1,0 +1,400 @@
+"""A tracker's step as Numba compiles it.
+
+Kernels are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly overhead. A step
+takes some rows at a time, and its innermost loops are over these rows or their sigma points, which are vectors to the
+processor. A single sample is the same with one row.
+
+Kernels take a table of states, a row for each: its bounds, the gain of the flow's network, the variance that is added,
+offset, scale and bend. That of outputs has their mean, the variance of the noise, the share of the newest innovation in
+the mean square, and C.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+from observers.compiled import UNROLLED, _kernels, active_kernel
+from observers.polynomial import table
+from observers.sparse import single_kernel
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+_LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
+_TERMS = 4  # of the polynomial that are added at a time
+_FEW_POINTS = 16  # are fewer than a wide network's neurons
+_LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
+_MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
+
+
+def _inlined(function: _F) -> _F:
+    """Part of each kernel that calls it: LLVM would leave some of the calls, at three times the cost of a row."""
+    import numba
+
+    made: Any = numba.njit(function, fastmath={"contract"}, error_model="numpy", inline="always")
+    return cast(_F, made)
+
+
+@functools.cache
+def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
+    """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says."""
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
+    update, padded = single_kernel(), padded_terms(len(table(nx + nu, degree)[0]))
+    step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
+
+    @compiled
+    def one(
+        numbers: np.ndarray,
+        whole: np.ndarray,
+        packed: np.ndarray,
+        z: np.ndarray,
+        y: np.ndarray,
+        u: np.ndarray,
+        y_next: np.ndarray,
+        state: np.ndarray,
+        told: np.ndarray,
+    ) -> None:
+        size, layers, at = len(z), whole[0], 0
+        widths, places = whole[1 : 1 + layers], whole[1 + layers :].reshape(2, (len(whole) - 1 - layers) // 2)
+        states = numbers[: nx * (_BEND + 1)].reshape(nx, _BEND + 1)
+        at += nx * (_BEND + 1)
+        outputs = numbers[at : at + ny * (_C + nx)].reshape(ny, _C + nx)
+        at += ny * (_C + nx)
+        scale = numbers[at : at + nu]
+        at += nu
+        polynomial = numbers[at : at + nx * padded].reshape(nx, padded)
+        at += nx * padded
+        end = len(numbers) - places.shape[1]
+        gains, mixing = numbers[at:end].reshape((end - at) // size, size), numbers[end:]
+
+        expected, filled, all_rows = told[nx : nx + ny], told[nx + ny : nx + 2 * ny], np.ones(1, np.bool_)
+        step_one(
+            states,
+            outputs,
+            scale,
+            polynomial,
+            packed,
+            widths,
+            u.reshape(1, nu),
+            y_next.reshape(1, ny),
+            all_rows,
+            state,
+            told[:nx].reshape(1, nx),
+            expected.reshape(1, ny),
+        )
+        for k in range(ny):
+            filled[k] = y_next[k]
+            if np.isnan(y_next[k]):
+                filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
+        update(gains, places, mixing, z, y, u, filled, told[nx + 2 * ny :])
+
+    @compiled
+    def take(
+        states: np.ndarray,
+        x: np.ndarray,
+        P: np.ndarray,
+        lost: np.ndarray,
+        where: np.ndarray,
+        state: np.ndarray,
+        told: np.ndarray,
+    ) -> None:
+        for k in range(len(where)):
+            row, ours, theirs = state[where[k]], 0.0, 0.0
+            for i in range(nx):
+                ours += row[nx + nx * i + i]
+                theirs += P[k, i, i] / (states[i, _SCALE] * states[i, _SCALE])
+            if lost[k] or theirs < ours:
+                for i in range(nx):
+                    s = (x[k, i] - states[i, _OFFSET]) / states[i, _SCALE]
+                    s = states[i, _LOW] if s < states[i, _LOW] else s
+                    row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
+                    if len(told) > 0:
+                        told[where[k], i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
+                    for j in range(nx):
+                        row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
+                if lost[k]:
+                    row[nx + nx * nx] = 1.0
+
+    return one, step_lanes, take
+
+
+def padded_terms(terms: int) -> int:
+    """Columns of a polynomial's table, the last of which are zero."""
+    return -(-terms // _TERMS) * _TERMS
+
+
+def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -> Callable[..., None]:
+    """A kernel that takes so many rows at a time: what they have in common is a loop over them.
+
+    Its arrays have an entry for each row in the end, or for each sigma point of each row.
+    """
+    import numba
+
+    compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
+    active, of_one, signals, count = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
+    far, weight, points = math.sqrt(nx), 1 / count, count * lanes
+    earlier, by = table(signals, degree)
+    terms, padded = len(by), padded_terms(len(by))
+
+    @_inlined
+    def factorise(P: np.ndarray) -> None:
+        """Cholesky's factor in the place of P's lower half; NaN where there is none."""
+        for i in range(nx):
+            for j in range(i + 1):
+                for k in range(j):
+                    for r in range(lanes):
+                        P[i, j, r] -= P[i, k, r] * P[j, k, r]
+                if i > j:
+                    for r in range(lanes):
+                        P[i, j, r] /= P[j, j, r]
+                else:
+                    for r in range(lanes):
+                        P[i, j, r] = math.sqrt(P[i, j, r]) if P[i, j, r] > 0.0 else np.nan
+
+    @_inlined
+    def spread_out(states: np.ndarray, x: np.ndarray, L: np.ndarray, at: np.ndarray) -> None:
+        """The sigma points, within the bounds."""
+        for i in range(nx):
+            for p in range(count):
+                for r in range(lanes):
+                    at[i, p * lanes + r] = x[i, r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    at[i, j * lanes + r] += far * L[i, j, r]
+                    at[i, (nx + j) * lanes + r] -= far * L[i, j, r]
+            low, high = states[i, _LOW], states[i, _HIGH]
+            for p in range(points):
+                s = at[i, p]
+                s = low if s < low else s
+                at[i, p] = high if s > high else s
+
+    @_inlined
+    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
+        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
+        for p in range(points):
+            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+
+    @_inlined
+    def along(polynomial: np.ndarray, at: np.ndarray, products: np.ndarray, moved: np.ndarray) -> None:
+        """Where the points go by the polynomial."""
+        for t in range(1, terms):
+            before, factor, product = products[earlier[t]], at[by[t]], products[t]
+            for p in range(points):
+                product[p] = before[p] * factor[p]
+        for i in range(nx):
+            for p in range(points):
+                moved[i, p] = at[i, p]
+            for t in range(0, padded, _TERMS):
+                add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], moved[i])
+
+    @_inlined
+    def evaluate_each(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The network, of inputs h; what it says lies in what is returned. The loops are over its width."""
+        memory = np.empty((5, len(h)), np.float32)
+        for p in range(points):
+            for i in range(signals):
+                memory[3, i] = h[i, p]
+            of_one(memory[3, :signals], packed, widths, memory[:3], memory[4, :nx])
+            for i in range(nx):
+                into[i, p] = memory[4, i]
+        return into
+
+    @_inlined
+    def evaluate_all(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The same, in one of the two arrays. The loops are over the points."""
+        begin = 0
+        for layer in range(len(widths) - 1):
+            inputs, width = widths[layer], widths[layer + 1]
+            for i in range(inputs, inputs + UNROLLED):
+                for p in range(points):
+                    h[i, p] = 0.0  # beside the rows of zeros
+            for j in range(width):
+                row = into[j]
+                for p in range(points):
+                    row[p] = packed[begin + j]
+                at = begin + width + j
+                for i in range(0, inputs, UNROLLED):
+                    w0, w1, w2, w3 = packed[at], packed[at + width], packed[at + 2 * width], packed[at + 3 * width]
+                    a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
+                    for p in range(points):
+                        row[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
+                    at += UNROLLED * width
+                if layer < len(widths) - 2:
+                    for p in range(points):
+                        row[p] = active(row[p])
+            begin += width + (inputs + (-inputs) % UNROLLED) * width
+            h, into = into, h
+        return h
+
+    @_inlined
+    def evaluate(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
+        """The quicker of both."""
+        if points < _FEW_POINTS and widths.max() > _FEW_POINTS:
+            return evaluate_each(packed, widths, h, into)
+        return evaluate_all(packed, widths, h, into)
+
+    @_inlined
+    def moments(
+        states: np.ndarray,
+        h: np.ndarray,
+        moved: np.ndarray,
+        x: np.ndarray,
+        mean: np.ndarray,
+        P: np.ndarray,
+        distance: np.ndarray,
+    ) -> None:
+        """Of where the points go with the network, and what the flow is off by; x are the estimates before."""
+        for r in range(lanes):
+            distance[r] = 0.0
+        for i in range(nx):
+            gain = states[i, _GAIN]
+            for r in range(lanes):
+                mean[i, r] = 0.0
+            for p in range(count):
+                for r in range(lanes):
+                    moved[i, p * lanes + r] += gain * h[i, p * lanes + r]
+                    mean[i, r] += moved[i, p * lanes + r]
+            for r in range(lanes):
+                mean[i, r] *= weight
+                distance[r] += (mean[i, r] - x[i, r]) * (mean[i, r] - x[i, r])
+            for p in range(count):
+                for r in range(lanes):
+                    moved[i, p * lanes + r] -= mean[i, r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    P[i, j, r] = 0.0
+                for p in range(count):
+                    for r in range(lanes):
+                        P[i, j, r] += moved[i, p * lanes + r] * moved[j, p * lanes + r]
+                for r in range(lanes):
+                    P[i, j, r] *= weight
+            for r in range(lanes):
+                P[i, i, r] += states[i, _NOISE]
+        for i in range(nx):
+            if states[i, _BEND] > 0.0:  # or infinity times 0 would be no number
+                for r in range(lanes):
+                    bent = states[i, _BEND] * distance[r]
+                    P[i, i, r] += bent * bent
+
+    @_inlined
+    def correct(
+        output: np.ndarray,
+        y: np.ndarray,
+        mean: np.ndarray,
+        P: np.ndarray,
+        across: np.ndarray,
+        apart: np.ndarray,
+        pivot: np.ndarray,
+        squared: np.ndarray,
+        seen: np.ndarray,
+        there: np.ndarray,
+    ) -> None:
+        """Take in an output, where it is a number."""
+        for r in range(lanes):
+            there[r] = 1.0 if y[r] == y[r] else 0.0
+            apart[r] = y[r] - output[_MEAN] if y[r] == y[r] else 0.0
+            pivot[r] = output[_VARIANCE]
+        for i in range(nx):
+            for r in range(lanes):
+                across[i, r] = 0.0
+            for j in range(nx):
+                entry = P[i, j] if j < i else P[j, i]
+                for r in range(lanes):
+                    across[i, r] += output[_C + j] * entry[r]
+            for r in range(lanes):
+                apart[r] -= there[r] * output[_C + i] * mean[i, r]
+                pivot[r] += output[_C + i] * across[i, r]
+        for r in range(lanes):
+            squared[r] += apart[r] * apart[r] / pivot[r]
+            seen[r] += there[r]
+        for i in range(nx):
+            for r in range(lanes):
+                mean[i, r] += there[r] * across[i, r] / pivot[r] * apart[r]
+            for j in range(i + 1):
+                for r in range(lanes):
+                    P[i, j, r] -= there[r] * across[i, r] / pivot[r] * across[j, r]
+
+    @compiled
+    def step(
+        states: np.ndarray,
+        outputs: np.ndarray,
+        scale: np.ndarray,
+        polynomial: np.ndarray,
+        packed: np.ndarray,
+        widths: np.ndarray,
+        u: np.ndarray,
+        y: np.ndarray,
+        rows: np.ndarray,
+        state: np.ndarray,
+        told: np.ndarray,
+        expected: np.ndarray,
+    ) -> None:
+        n, cut = len(state), nx * nx
+        of_rows = np.empty((cut + 3 * nx + 7, lanes))
+        P, x, mean = of_rows[:cut].reshape(nx, nx, lanes), of_rows[cut : cut + nx], of_rows[cut + nx : cut + 2 * nx]
+        across, more = of_rows[cut + 2 * nx : cut + 3 * nx], of_rows[cut + 3 * nx :]
+        distance, sample, apart, pivot = more[0], more[1], more[2], more[3]
+        squared, seen, there = more[4], more[5], more[6]
+        of_points = np.zeros((signals + nx + padded, points))
+        at, moved, products = of_points[:signals], of_points[signals : signals + nx], of_points[signals + nx :]
+        products[0] = 1.0
+        between = np.empty((2, widths.max() + UNROLLED, points), np.float32)
+        for first in range(0, n, lanes):
+            for r in range(lanes):
+                now = min(first + r, n - 1)  # behind the last row, copies of it
+                for i in range(nx):
+                    x[i, r] = state[now, i]
+                    for j in range(i + 1):
+                        P[i, j, r] = state[now, nx + nx * i + j]
+                for j in range(nu):
+                    for p in range(count):
+                        at[nx + j, p * lanes + r] = u[now, j] * scale[j]
+            factorise(P)
+            spread_out(states, x, P, at)
+            for i in range(signals):
+                for p in range(points):
+                    between[0, i, p] = at[i, p]
+            along(polynomial, at, products, moved)
+            moments(states, evaluate(packed, widths, between[0], between[1]), moved, x, mean, P, distance)
+
+            size = min(lanes, n - first)
+            for k in range(ny):
+                for r in range(size):
+                    expected[first + r, k] = outputs[k, _MEAN]
+                    for i in range(nx):
+                        expected[first + r, k] += outputs[k, _C + i] * mean[i, r]
+            for r in range(lanes):
+                squared[r] = seen[r] = 0.0
+            for k in range(ny):
+                for r in range(lanes):
+                    sample[r] = y[min(first + r, n - 1), k]
+                correct(outputs[k], sample, mean, P, across, apart, pivot, squared, seen, there)
+            for r in range(size):
+                row, total = state[first + r], 0.0
+                for i in range(nx):
+                    total += mean[i, r]
+                    for j in range(i + 1):
+                        total += P[i, j, r]
+                if rows[first + r] and np.isfinite(total):
+                    for i in range(nx):
+                        s = mean[i, r]
+                        s = states[i, _LOW] if s < states[i, _LOW] else s
+                        row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
+                        for j in range(i + 1):
+                            row[nx + nx * i + j] = row[nx + nx * j + i] = P[i, j, r]
+                    if seen[r] > 0:
+                        row[nx + cut] += outputs[0, _SHARE] * seen[r] / ny * (squared[r] / seen[r] - row[nx + cut])
+                elif rows[first + r]:
+                    row[nx + cut] = np.inf
+                for i in range(nx):
+                    told[first + r, i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
+
+    return cast(Callable[..., None], step)
+
+
+__all__ = ["kernels", "padded_terms"]
