@@ -29,24 +29,20 @@ _LANES = 32  # rows of a batch that go through together: what there is of them s
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 
 
-def _inlined(function: _F) -> _F:
-    """Part of each kernel that calls it: LLVM would leave some of the calls, at three times the cost of a row."""
+def _compiled(function: _F) -> _F:
     import numba
 
-    made: Any = numba.njit(function, fastmath={"contract"}, error_model="numpy", inline="always")
+    made: Any = numba.njit(function, fastmath={"contract"}, error_model="numpy")
     return cast(_F, made)
 
 
 @functools.cache
 def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
     """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says."""
-    import numba
-
-    compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     update, padded = single_kernel(), padded_terms(len(table(nx + nu, degree)[0]))
     step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
 
-    @compiled
+    @_compiled
     def one(
         numbers: np.ndarray,
         whole: np.ndarray,
@@ -92,7 +88,7 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
                 filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
         update(gains, places, mixing, z, y, u, filled, told[nx + 2 * ny :])
 
-    @compiled
+    @_compiled
     def take(
         states: np.ndarray,
         x: np.ndarray,
@@ -132,15 +128,12 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
 
     Its arrays have an entry for each row in the end, or for each sigma point of each row.
     """
-    import numba
-
-    compiled = functools.partial(numba.njit, fastmath={"contract"}, error_model="numpy")
     active, of_one, signals, count = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
     far, weight, points = math.sqrt(nx), 1 / count, count * lanes
     earlier, by = table(signals, degree)
     terms, padded = len(by), padded_terms(len(by))
 
-    @_inlined
+    @_compiled
     def factorise(P: np.ndarray) -> None:
         """Cholesky's factor in the place of P's lower half; NaN where there is none."""
         for i in range(nx):
@@ -155,7 +148,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                     for r in range(lanes):
                         P[i, j, r] = math.sqrt(P[i, j, r]) if P[i, j, r] > 0.0 else np.nan
 
-    @_inlined
+    @_compiled
     def spread_out(states: np.ndarray, x: np.ndarray, L: np.ndarray, at: np.ndarray) -> None:
         """The sigma points, within the bounds."""
         for i in range(nx):
@@ -172,14 +165,14 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                 s = low if s < low else s
                 at[i, p] = high if s > high else s
 
-    @_inlined
+    @_compiled
     def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
         w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
         a, b, c, d = rows[0], rows[1], rows[2], rows[3]
         for p in range(points):
             total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
 
-    @_inlined
+    @_compiled
     def along(polynomial: np.ndarray, at: np.ndarray, products: np.ndarray, moved: np.ndarray) -> None:
         """Where the points go by the polynomial."""
         for t in range(1, terms):
@@ -192,7 +185,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
             for t in range(0, padded, _TERMS):
                 add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], moved[i])
 
-    @_inlined
+    @_compiled
     def evaluate_each(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The network, of inputs h; what it says lies in what is returned. The loops are over its width."""
         memory = np.empty((5, len(h)), np.float32)
@@ -204,7 +197,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                 into[i, p] = memory[4, i]
         return into
 
-    @_inlined
+    @_compiled
     def evaluate_all(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The same, in one of the two arrays. The loops are over the points."""
         begin = 0
@@ -231,14 +224,14 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
             h, into = into, h
         return h
 
-    @_inlined
+    @_compiled
     def evaluate(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The quicker of both."""
         if points < _FEW_POINTS and widths.max() > _FEW_POINTS:
             return evaluate_each(packed, widths, h, into)
         return evaluate_all(packed, widths, h, into)
 
-    @_inlined
+    @_compiled
     def moments(
         states: np.ndarray,
         h: np.ndarray,
@@ -281,7 +274,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                     bent = states[i, _BEND] * distance[r]
                     P[i, i, r] += bent * bent
 
-    @_inlined
+    @_compiled
     def correct(
         output: np.ndarray,
         y: np.ndarray,
@@ -312,14 +305,15 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
         for r in range(lanes):
             squared[r] += apart[r] * apart[r] / pivot[r]
             seen[r] += there[r]
+            there[r] /= pivot[r]
         for i in range(nx):
             for r in range(lanes):
-                mean[i, r] += there[r] * across[i, r] / pivot[r] * apart[r]
+                mean[i, r] += there[r] * across[i, r] * apart[r]
             for j in range(i + 1):
                 for r in range(lanes):
-                    P[i, j, r] -= there[r] * across[i, r] / pivot[r] * across[j, r]
+                    P[i, j, r] -= there[r] * across[i, r] * across[j, r]
 
-    @compiled
+    @_compiled
     def step(
         states: np.ndarray,
         outputs: np.ndarray,
@@ -394,7 +388,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                 for i in range(nx):
                     told[first + r, i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
 
-    return cast(Callable[..., None], step)
+    return step
 
 
 __all__ = ["kernels", "padded_terms"]
