@@ -13,7 +13,7 @@ import numpy as np
 from observers.filter import LinearFilter
 from observers.flow import Flow
 from observers.sparse import without_zeros
-from observers.tracker_kernels import kernels, padded_terms
+from observers.tracker_kernels import kernels
 from observers.unscented import Gaussian
 
 _NONE = np.empty((0, 0))
@@ -63,8 +63,7 @@ class CompiledTracker:
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._nx, self._ny = flow.nx, len(C)
         one, many, take = kernels(network.activation, flow.nx, flow.nu, len(C), flow.degree)
-        terms = flow.polynomial.shape[1]
-        polynomial = np.pad(flow.polynomial, ((0, 0), (0, padded_terms(terms) - terms)))
+        polynomial = np.ascontiguousarray(flow.polynomial, dtype=float)
         gains, places, mixing = without_zeros(linear.transition, linear.drive)
         # A few arrays of all there is: each that is handed over takes as long as a hundred multiplications.
         numbers = np.concatenate([part.ravel() for part in (states, outputs, scale, polynomial, gains, mixing)])

@@ -17,13 +17,13 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from observers.compiled import UNROLLED, _kernels, active_kernel
-from observers.polynomial import table
+from observers.polynomial import count, table
 from observers.sparse import single_kernel
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
-_TERMS = 4  # of the polynomial that are added at a time
+_WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
 _FEW_POINTS = 16  # are fewer than a wide network's neurons
 _LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
@@ -39,7 +39,7 @@ def _compiled(function: _F) -> _F:
 @functools.cache
 def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
     """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says."""
-    update, padded = single_kernel(), padded_terms(len(table(nx + nu, degree)[0]))
+    update, terms = single_kernel(), count(nx + nu, degree)
     step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
 
     @_compiled
@@ -62,8 +62,8 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
         at += ny * (_C + nx)
         scale = numbers[at : at + nu]
         at += nu
-        polynomial = numbers[at : at + nx * padded].reshape(nx, padded)
-        at += nx * padded
+        polynomial = numbers[at : at + nx * terms].reshape(nx, terms)
+        at += nx * terms
         end = len(numbers) - places.shape[1]
         gains, mixing = numbers[at:end].reshape((end - at) // size, size), numbers[end:]
 
@@ -118,9 +118,45 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
     return one, step_lanes, take
 
 
-def padded_terms(terms: int) -> int:
-    """Columns of a polynomial's table, the last of which are zero."""
-    return -(-terms // _TERMS) * _TERMS
+def _along(nx: int, signals: int, degree: int, points: int) -> Callable[..., None]:
+    """Where points go by a polynomial, (nx, terms): (signals + nx) rows of all points, of which the last are written.
+
+    Of few coefficients it is written out, so that the monomials of a point stay in the processor's registers.
+    """
+    earlier, by = table(signals, degree)
+    terms = len(by)
+    if nx * terms > _WRITTEN_OUT:
+
+        @_compiled
+        def along(polynomial: np.ndarray, flat: np.ndarray) -> None:
+            at = flat.reshape(signals + nx, points)
+            products = np.ones((terms, points))
+            for t in range(1, terms):
+                for p in range(points):
+                    products[t, p] = products[earlier[t], p] * at[by[t], p]
+            for i in range(nx):
+                moved = at[signals + i]
+                for p in range(points):
+                    moved[p] = at[i, p]
+                for t in range(terms):
+                    factor, product = polynomial[i, t], products[t]
+                    for p in range(points):
+                        moved[p] += factor * product[p]
+
+        return along
+
+    lines = ["def along(polynomial, flat):"]
+    lines += [f"    c{i}_{t} = polynomial[{i}, {t}]" for i in range(nx) for t in range(terms)]
+    lines += [f"    for p in range({points}):"]
+    lines += [f"        s{j} = flat[{j * points} + p]" for j in range(signals)]
+    lines += ["        m0 = 1.0"]
+    lines += [f"        m{t} = m{earlier[t]} * s{by[t]}" for t in range(1, terms)]
+    for i in range(nx):
+        change = " + ".join(f"c{i}_{t} * m{t}" for t in range(terms))
+        lines += [f"        flat[{(signals + i) * points} + p] = s{i} + ({change})"]
+    namespace: dict[str, Any] = {}
+    exec("\n".join(lines), namespace)
+    return _compiled(namespace["along"])
 
 
 def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -> Callable[..., None]:
@@ -128,10 +164,9 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
 
     Its arrays have an entry for each row in the end, or for each sigma point of each row.
     """
-    active, of_one, signals, count = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
-    far, weight, points = math.sqrt(nx), 1 / count, count * lanes
-    earlier, by = table(signals, degree)
-    terms, padded = len(by), padded_terms(len(by))
+    active, of_one, signals, each = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
+    far, weight, points = math.sqrt(nx), 1 / each, each * lanes
+    along = _along(nx, signals, degree, points)
 
     @_compiled
     def factorise(P: np.ndarray) -> None:
@@ -152,7 +187,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
     def spread_out(states: np.ndarray, x: np.ndarray, L: np.ndarray, at: np.ndarray) -> None:
         """The sigma points, within the bounds."""
         for i in range(nx):
-            for p in range(count):
+            for p in range(each):
                 for r in range(lanes):
                     at[i, p * lanes + r] = x[i, r]
             for j in range(i + 1):
@@ -164,26 +199,6 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                 s = at[i, p]
                 s = low if s < low else s
                 at[i, p] = high if s > high else s
-
-    @_compiled
-    def add_four(weights: np.ndarray, rows: np.ndarray, total: np.ndarray) -> None:
-        w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
-        a, b, c, d = rows[0], rows[1], rows[2], rows[3]
-        for p in range(points):
-            total[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
-
-    @_compiled
-    def along(polynomial: np.ndarray, at: np.ndarray, products: np.ndarray, moved: np.ndarray) -> None:
-        """Where the points go by the polynomial."""
-        for t in range(1, terms):
-            before, factor, product = products[earlier[t]], at[by[t]], products[t]
-            for p in range(points):
-                product[p] = before[p] * factor[p]
-        for i in range(nx):
-            for p in range(points):
-                moved[i, p] = at[i, p]
-            for t in range(0, padded, _TERMS):
-                add_four(polynomial[i, t : t + _TERMS], products[t : t + _TERMS], moved[i])
 
     @_compiled
     def evaluate_each(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
@@ -248,20 +263,20 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
             gain = states[i, _GAIN]
             for r in range(lanes):
                 mean[i, r] = 0.0
-            for p in range(count):
+            for p in range(each):
                 for r in range(lanes):
                     moved[i, p * lanes + r] += gain * h[i, p * lanes + r]
                     mean[i, r] += moved[i, p * lanes + r]
             for r in range(lanes):
                 mean[i, r] *= weight
                 distance[r] += (mean[i, r] - x[i, r]) * (mean[i, r] - x[i, r])
-            for p in range(count):
+            for p in range(each):
                 for r in range(lanes):
                     moved[i, p * lanes + r] -= mean[i, r]
             for j in range(i + 1):
                 for r in range(lanes):
                     P[i, j, r] = 0.0
-                for p in range(count):
+                for p in range(each):
                     for r in range(lanes):
                         P[i, j, r] += moved[i, p * lanes + r] * moved[j, p * lanes + r]
                 for r in range(lanes):
@@ -334,9 +349,9 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
         across, more = of_rows[cut + 2 * nx : cut + 3 * nx], of_rows[cut + 3 * nx :]
         distance, sample, apart, pivot = more[0], more[1], more[2], more[3]
         squared, seen, there = more[4], more[5], more[6]
-        of_points = np.zeros((signals + nx + padded, points))
-        at, moved, products = of_points[:signals], of_points[signals : signals + nx], of_points[signals + nx :]
-        products[0] = 1.0
+        flat = np.empty((signals + nx) * points)
+        of_points = flat.reshape(signals + nx, points)
+        at, moved = of_points[:signals], of_points[signals:]
         between = np.empty((2, widths.max() + UNROLLED, points), np.float32)
         for first in range(0, n, lanes):
             for r in range(lanes):
@@ -346,14 +361,14 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                     for j in range(i + 1):
                         P[i, j, r] = state[now, nx + nx * i + j]
                 for j in range(nu):
-                    for p in range(count):
+                    for p in range(each):
                         at[nx + j, p * lanes + r] = u[now, j] * scale[j]
             factorise(P)
             spread_out(states, x, P, at)
             for i in range(signals):
                 for p in range(points):
                     between[0, i, p] = at[i, p]
-            along(polynomial, at, products, moved)
+            along(polynomial, flat)
             moments(states, evaluate(packed, widths, between[0], between[1]), moved, x, mean, P, distance)
 
             size = min(lanes, n - first)
@@ -391,4 +406,4 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
     return step
 
 
-__all__ = ["kernels", "padded_terms"]
+__all__ = ["kernels"]
