@@ -42,13 +42,15 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff format .
 
 # Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
-# NAME, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# NAME and NAME-small, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
 maps: $(VENV)/ready  ## train the shipped maps again, three hours on two cores; resumable
 	for system in $(SYSTEMS); do \
 		$(BIN)/kkl-gym train $$system --threads 2 --resume || exit 1; \
 		$(BIN)/kkl-gym errorbars runs/$$system/$$system.safetensors || exit 1; \
 		$(BIN)/kkl-gym tracking runs/errorbars/$$system.safetensors || exit 1; \
 		$(BIN)/kkl-gym train $$system --size small --resume || exit 1; \
+		$(BIN)/kkl-gym errorbars runs/$$system-small/$$system-small.safetensors || exit 1; \
+		$(BIN)/kkl-gym tracking runs/errorbars/$$system-small.safetensors --size small || exit 1; \
 		$(BIN)/kkl-gym train $$system --pipeline spinn --resume || exit 1; done
 
 results: $(VENV)/ready  ## the accuracy in the README and in docs/

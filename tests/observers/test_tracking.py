@@ -273,6 +273,39 @@ def test_soon_after_a_start_t_inv_is_asked_what_errors_there_may_be(doubt):
     np.testing.assert_allclose(batch.covariance[::2], sure.covariance[::2] * (1 - doubt * (1 - np.eye(2))), rtol=1e-9)
 
 
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_t_inv_is_asked_once_a_sample(batch, monkeypatch):
+    """What it said of the estimate is what error bars take, whichever rows have moved, begun anew or are lost."""
+    observer = KKLObserver(tracking_observer(C), LEVEL, process_noise=0.0)
+    other, window = copy.copy(observer), observer.artifact.flow.window / DT
+    asked, estimate = [], type(observer._states).estimate
+
+    def counted(decoders, *signals, **options):
+        asked.append(decoders)
+        return estimate(decoders, *signals, **options)
+
+    monkeypatch.setattr(type(observer._states), "estimate", counted)
+    y = runs(steps=round(window), n=3)[1]
+    y = y if batch else y[:, 0]
+    for each in (observer, other):
+        each.reset(y[0])
+    for k in range(1, len(y)):
+        for each in (observer, other):
+            asked.clear()
+            rows = np.arange(3) != k % 3 if batch else None
+            each.advance(y[k] + (50.0 if k == 5 else 0.0), rows=rows if k % 4 == 1 else None)
+            if k == 7 and batch:
+                each.restart(y[k][:1], np.arange(3) == 0)
+            if each is other:
+                each._tracker._heard = None
+            else:
+                before = len(asked)
+                each.decode_covariance()
+                if k % 4 != 1 and k != 7:  # of rows that stood still, or have begun anew, it is asked again
+                    assert len(asked) == before == 1
+        np.testing.assert_allclose(observer.covariance, other.covariance, rtol=1e-12)
+
+
 @pytest.mark.parametrize("t_is_there", [True, False])
 def test_nobody_asks_t_inv_of_a_start_that_is_known(t_is_there):
     artifact = tracking_observer(factors=doubting(0.3))

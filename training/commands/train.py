@@ -54,8 +54,7 @@ class Train:
     preset: Preset = "fast"
     """fast: about ten minutes; it made the shipped maps. paper: the paper's sizes."""
     size: Size = "default"
-    """small: hidden layers of 40, which are an eighth of the multiplications, for fast simulations and
-    microcontrollers. Writes NAME-small."""
+    """small: hidden layers of 20, a twentieth of the multiplications, for microcontrollers. Writes NAME-small."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/NAME)")] = None
     """The run's folder."""
     config: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: no file)")] = None

@@ -121,7 +121,7 @@ def test_results_of_another_task_or_other_hyperparameters_are_not_mixed(tmp_path
 
 def test_maps_without_error_bars_are_refused_before_anything_is_trained(tmp_path):
     command = Compare(
-        systems=("lorenz",), information=("x_hat", "x_hat_std"), observers=("lorenz-small",), out=tmp_path
+        systems=("lorenz",), information=("x_hat", "x_hat_std"), observers=("lorenz-spinn",), out=tmp_path
     )
     with pytest.raises(ValueError, match="holds no error bars"):
         command.run(Console())

@@ -138,6 +138,19 @@ def test_ages_stop_where_they_no_longer_matter(make_artifact, tmp_path):
 
 @needs_cc
 @pytest.mark.skipif(shutil.which("size") is None, reason="there is no size")
+@pytest.mark.parametrize("name", ["reverse_duffing-small", "van_der_pol-small", "rossler-small", "lorenz-small"])
+def test_small_maps_fit_a_microcontroller(name, tmp_path):
+    exported = Exported.read(name)
+    for file, text in c_files(exported).items():
+        (tmp_path / file).write_text(text)
+    found = footprint(tmp_path / f"{exported.name}.c")
+    assert found.flash <= 64 * 1024
+    assert found.static == 0
+    assert found.state <= 2 * 1024
+
+
+@needs_cc
+@pytest.mark.skipif(shutil.which("size") is None, reason="there is no size")
 def test_the_footprint_is_that_of_weights_and_state(tmp_path):
     exported = Exported.read("lorenz-spinn")
     for name, text in c_files(exported).items():
