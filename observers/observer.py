@@ -19,7 +19,7 @@ from observers.replacement import check_replacement
 from observers.spread import deviations
 from observers.tracker import Tracker
 
-SOON = 1000  # single samples after which a simulation will go on for long enough to wait a second for the compiler
+SOON = 1000  # single samples after which a simulation will go on for long enough to wait seconds for the compiler
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
@@ -54,7 +54,7 @@ class KKLObserver:
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
         Whether single samples go through machine code, which takes some seconds to make, and then a third of the time,
-        or an eighth where the observer tracks. True makes it here, such as before a loop in real time; it needs Numba,
+        or a twelfth where the observer tracks. True makes it here, such as before a loop in real time; it needs Numba,
         the extra ``fast``. False leaves them to NumPy. None is NumPy until a :meth:`reset` after 1,000 samples, and
         then Numba if it is installed: no run is held up in its midst. The two agree to rounding. Batches of 128 rows or
         more take Numba wherever it is.
@@ -419,7 +419,7 @@ class KKLObserver:
             rows = None
             self._samples += 1
         tracker, linear = self._tracker, self.artifact.filter
-        moved = None if tracker is None or batch else tracker.step_single(self._z, self._y, u, y)
+        moved = None if tracker is None else tracker.step_single(self._z, self._y, u, y)
         if moved is not None:
             z, y = moved
         else:

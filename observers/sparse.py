@@ -11,7 +11,7 @@ from functools import cache, partial
 
 import numpy as np
 
-MANY_ROWS = 128  # fewer gain too little to wait a second for the compiler
+MANY_ROWS = 128  # fewer gain too little to wait seconds for the compiler
 
 
 class SparseUpdate:
@@ -119,7 +119,7 @@ def single_kernel() -> Callable[..., None]:
     """The step of one sample: (gains, places, mixing, z, y, u, y_next, z_next), the last of which is written."""
     import numba
 
-    @numba.njit
+    @numba.njit(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
     def update(
         gains: np.ndarray,
         places: np.ndarray,

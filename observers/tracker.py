@@ -200,11 +200,16 @@ class Tracker:
         self._known = self._known.copy()
         self._known[where] = begun._known
 
+    def __copy__(self) -> "Tracker":
+        """Another that looks at the same; not by pickling, which would lose the machine code."""
+        other = object.__new__(type(self))
+        vars(other).update(vars(self))
+        return other
+
     def copied(self) -> "Tracker":
         """Another that stands where this one does, and goes its own way."""
         other = copy.copy(self)
-        other._state = self._state.copy()
-        other._shown = None
+        other._state, other._shown = self._state.copy(), None
         return other
 
     def go_on(self, other: "Tracker") -> None:
@@ -216,6 +221,8 @@ class Tracker:
 
     def warm_up(self, z: np.ndarray) -> None:
         """Make the machine code for single samples now, by one of z, (size,), that is forgotten."""
+        if self._compiled is None:
+            return
         one = copy.copy(self)
         one.reset(z, 0)
         y = np.zeros(len(self._R))
@@ -229,9 +236,10 @@ class Tracker:
         """
         n, ny = len(self._state), len(self._R)
         self._shown, y, rows = None, y.reshape(n, ny), None if rows is None else rows.flatten()
-        if self._machine is not None and self._batch:
+        machine = self._machine if self._batch else None
+        if machine is not None:
             inputs = u.copy().reshape(n, self._flow.nu)  # the user's own may be read-only
-            self._shown, expected = self._machine.advance(self._state, inputs, y, rows)
+            self._shown, expected = machine.advance(self._state, inputs, y, rows)
             return expected.reshape(*self._batch, ny)
         with np.errstate(over="ignore", invalid="ignore"):
             x, P = self._ahead(u)
@@ -282,6 +290,7 @@ class Tracker:
 
     def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
+        self._heard = None
         if not self._batch:  # a single sample: every call of numpy would be felt
             age, one = float(age), not self._state.item(-1) <= self._limit  # lost where it is NaN too
             if (one or age < self._window) and (rows is None or rows):
@@ -337,7 +346,8 @@ class Tracker:
 
     def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
         """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
-        self._shown, self._state = None, self._packed(*self._scaled(x, P), np.ones(len(x)))
+        self._shown, self._heard = None, None
+        self._state = self._packed(*self._scaled(x, P), np.ones(len(x)))
 
     def _packed(self, x: np.ndarray, P: np.ndarray, mean_square: np.ndarray) -> np.ndarray:
         return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), mean_square[:, None]], axis=1)

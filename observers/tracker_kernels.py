@@ -24,7 +24,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
 _WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
-_FEW_POINTS = 16  # are fewer than a wide network's neurons
+_WIDE = 16  # layers than which a loop over the points of one row is shorter
 _LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 
@@ -37,9 +37,21 @@ def _compiled(function: _F) -> _F:
 
 
 @functools.cache
+def _unscaling() -> Callable[[float, float, float], float]:
+    """A state in its own units, rounded as NumPy does it: a row that stands still says the same whoever is asked."""
+    import numba
+
+    @numba.njit(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
+    def unscaled(offset: float, scale: float, s: float) -> float:
+        return offset + scale * s
+
+    return cast(Callable[[float, float, float], float], unscaled)
+
+
+@functools.cache
 def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
     """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says."""
-    update, terms = single_kernel(), count(nx + nu, degree)
+    update, unscaled, terms = single_kernel(), _unscaling(), count(nx + nu, degree)
     step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
 
     @_compiled
@@ -54,10 +66,10 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
         state: np.ndarray,
         told: np.ndarray,
     ) -> None:
-        size, layers, at = len(z), whole[0], 0
+        size, layers = len(z), whole[0]
         widths, places = whole[1 : 1 + layers], whole[1 + layers :].reshape(2, (len(whole) - 1 - layers) // 2)
         states = numbers[: nx * (_BEND + 1)].reshape(nx, _BEND + 1)
-        at += nx * (_BEND + 1)
+        at = nx * (_BEND + 1)
         outputs = numbers[at : at + ny * (_C + nx)].reshape(ny, _C + nx)
         at += ny * (_C + nx)
         scale = numbers[at : at + nu]
@@ -109,7 +121,7 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
                     s = states[i, _LOW] if s < states[i, _LOW] else s
                     row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
                     if len(told) > 0:
-                        told[where[k], i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
+                        told[where[k], i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
                     for j in range(nx):
                         row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
@@ -166,7 +178,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
     """
     active, of_one, signals, each = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
     far, weight, points = math.sqrt(nx), 1 / each, each * lanes
-    along = _along(nx, signals, degree, points)
+    along, unscaled = _along(nx, signals, degree, points), _unscaling()
 
     @_compiled
     def factorise(P: np.ndarray) -> None:
@@ -242,7 +254,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
     @_compiled
     def evaluate(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The quicker of both."""
-        if points < _FEW_POINTS and widths.max() > _FEW_POINTS:
+        if lanes == 1 and widths.max() > _WIDE:
             return evaluate_each(packed, widths, h, into)
         return evaluate_all(packed, widths, h, into)
 
@@ -401,7 +413,7 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
                 elif rows[first + r]:
                     row[nx + cut] = np.inf
                 for i in range(nx):
-                    told[first + r, i] = states[i, _OFFSET] + states[i, _SCALE] * row[i]
+                    told[first + r, i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
 
     return step
 

@@ -256,6 +256,33 @@ def test_a_long_simulation_is_compiled_at_a_reset():
     assert observer._tracker._machine is not None
 
 
+@pytest.mark.parametrize("batch", [(), (ROWS,)])
+def test_who_stands_still_says_the_same(batch):
+    """To the last bit: a copy, rows that take no sample in, and those beside rows that begin anew."""
+    artifact = tracking(1)
+    y, u = signals(artifact, 40, batch)
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    observer.reset(y[0])
+    for k in range(1, 40):
+        observer.step(y[k], u[k])
+        x_hat, rows = observer.decode(), np.arange(ROWS) < 3 if batch else np.array(False)
+        assert np.array_equal(copy.copy(observer).decode(), x_hat)
+        observer.advance(y[k], rows=rows)
+        assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
+        if batch:
+            observer.restart(y[k][rows], rows)
+            assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
+
+
+def test_machine_code_is_there_at_the_first_sample_and_in_copies():
+    artifact = tracking(1)
+    observer = KKLObserver(artifact, 0.1, compiled=True)
+    made = vars(observer._tracker)["_compiled"]
+    observer.reset(np.zeros(1))
+    observer.step(np.zeros(1))
+    assert vars(copy.copy(observer)._tracker)["_compiled"] is vars(observer._tracker)["_compiled"] is made
+
+
 def test_one_row_of_a_batch_is_numpys():
     artifact = tracking(1)
     observer = KKLObserver(artifact, 0.1, compiled=True)
