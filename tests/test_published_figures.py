@@ -110,6 +110,22 @@ def test_the_page_on_accuracy_says_what_noise_does():
     assert not behind, "which the page says"
 
 
+@pytest.mark.parametrize(
+    ("title", "column", "chosen"),
+    [
+        ("no noise, all steps", "smape", ("X", False, 0.0)),
+        ("noise 0.5, all steps", "smape", ("X", False, 0.5)),
+        ("driven, noise 0.5, after 5 s", "smape_late", ("X", True, 0.5)),
+    ],
+)
+def test_the_guide_to_speed_has_small_maps_beside_the_default(title, column, chosen):
+    page = (ROOT / "docs" / "guides" / "speed.md").read_text()
+    for label, suffix, file in (("default", "", "tracking/accuracy"), ("small", "-small", "accuracy-small")):
+        found = pd.read_csv(RESULTS / f"{file}.csv")
+        medians = found.groupby(["starts", "driven", "measurement_noise", "observer"])[column].median()
+        assert f"| {label}, {title} | {' | '.join(text(medians[(*chosen, s + suffix)]) for s in SYSTEMS)} |" in page
+
+
 def test_the_guide_to_speed_has_the_errors_and_times_of_each_width():
     found, page = pd.read_csv(RESULTS / "sizes" / "lorenz.csv"), (ROOT / "docs" / "guides" / "speed.md").read_text()
     for title, column, digits in (
