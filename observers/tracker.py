@@ -28,7 +28,7 @@ class _Calibrated:
     def __init__(self, factors: Factors, shares: tuple[float, float], dt: float, units: np.ndarray) -> None:
         self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
         self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
-        self._last = float(self._ages[-1])
+        self.last = float(self._ages[-1])  # after which nothing changes
         self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
     def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -42,9 +42,9 @@ class _Calibrated:
 
     def scale(self, age: float) -> np.ndarray:
         """The same of a single sample, its rows one after another."""
-        scale = self._scales.get(age if age < self._last else self._last)
+        scale = self._scales.get(age if age < self.last else self.last)
         if scale is None:
-            age = min(age, self._last)
+            age = min(age, self.last)
             scale = self._scales[age] = self.scales(*self.at(np.array([age]))).ravel()
         return scale
 
@@ -149,22 +149,39 @@ class Tracker:
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
             return self._soon(said, *calibrated.at(np.array([age])))[0]
-        heard, age = self._heard, np.broadcast_to(age, self._batch).ravel()
-        where = heard[1] if heard is not None and heard[0] is z else np.zeros(len(age), dtype=bool)
-        z = z.reshape(len(age), z.shape[-1])
-        factor, doubt = self._calibrated.at(age)
-        free = ~_acted(z[:, nz:])
-        if free.any():
-            factor[free], doubt[free] = self._free_calibrated.at(age[free])
-        P = self._P * self._calibrated.scales(factor, doubt)
-        soon = (age < self._window) & ~self._known
-        if soon.any():
+        heard, n, nx = self._heard, len(self._state), self._flow.nx
+        where = heard[1] if heard is not None and heard[0] is z else np.zeros(n, dtype=bool)
+        z = z.reshape(n, z.shape[-1])
+        age, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
+        P = (self._state[:, nx:-1] * self._scales(age, acted)).reshape(n, nx, nx)
+        if age.min(initial=np.inf) < self._window:
+            age = np.broadcast_to(age, n)
+            soon = (age < self._window) & ~self._known
             if heard is not None and where[soon].all():
                 said = heard[2][0][soon[where]], heard[2][1][soon[where]]
             else:
                 said = self._said(z[soon], age[soon])
-            P[soon] = self._soon(said, factor[soon], doubt[soon], soon)
-        return P.reshape(*self._batch, *P.shape[1:])
+            P[soon] = self._soon(said, *self._factors(age[soon], acted[soon]), soon)
+        return P.reshape(*self._batch, nx, nx)
+
+    def _factors(self, age: np.ndarray, acted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Factors and doubts, (n,), at ages in samples; of rows on which an input has acted, and of others."""
+        factor, doubt = self._calibrated.at(age)
+        if not acted.all():
+            factor[~acted], doubt[~acted] = self._free_calibrated.at(age[~acted])
+        return factor, doubt
+
+    def _scales(self, age: np.ndarray, acted: np.ndarray) -> np.ndarray:
+        """What is multiplied with covariances where T_inv is not asked, (n, nx^2), or of all rows (nx^2,).
+
+        Ages are those of all rows, (n,), or the one that they share, (1,).
+        """
+        both = self._calibrated, self._free_calibrated
+        last = max(each.last for each in both)
+        if len(age) == 1 or age.min(initial=np.inf) >= last:  # most often
+            driven, free = (each.scale(age.item(0) if len(age) == 1 else last) for each in both)
+            return driven if acted.all() else free if not acted.any() else np.where(acted[:, None], driven, free)
+        return self._calibrated.scales(*self._factors(age, acted)).reshape(len(age), len(self._units) ** 2)
 
     def _soon(
         self, said: Gaussian, factor: np.ndarray, doubt: np.ndarray, rows: np.ndarray | slice = slice(None)
