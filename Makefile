@@ -5,6 +5,7 @@ VENV := .venv$(if $(VERSION),-$(VERSION))
 BIN := $(VENV)/bin
 SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 STATIC := $(SYSTEMS:%=%-static)
+SMALL := $(SYSTEMS:%=%-small)
 
 .PHONY: demo install test test-coverage test-slow test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
@@ -61,14 +62,15 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 		--csv runs/error_bars/$$map.csv || exit 1; done
 	mkdir -p docs/results/error_bars
 	cp $(STATIC:%=runs/error_bars/%.csv) docs/results/error_bars
-	$(BIN)/kkl-gym evaluate $(SYSTEMS:%=%-small) --csv docs/results/accuracy-small.csv
+	$(BIN)/kkl-gym evaluate $(SMALL) --csv docs/results/accuracy-small.csv
 	mkdir -p docs/results/tracking
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --noise 0 0.1 0.5 1 --ekf --csv docs/results/tracking/accuracy.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --process-noise 0.05 --csv docs/results/tracking/process-noise.csv
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
-	for system in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$system --calibration \
-		--csv runs/error_bars/$$system.csv || exit 1; done
-	cp $(SYSTEMS:%=runs/error_bars/%.csv) docs/results/tracking
+	for map in $(SYSTEMS) $(SMALL); do $(BIN)/kkl-gym evaluate $$map --calibration \
+		--csv runs/error_bars/$$map.csv || exit 1; done
+	cp $(SYSTEMS:%=runs/error_bars/%.csv) $(SMALL:%=runs/error_bars/%.csv) docs/results/tracking
+	$(BIN)/kkl-gym evaluate reverse_duffing --calibration --trajectories 400 --csv docs/results/tracking/reverse_duffing-400.csv
 	$(BIN)/kkl-gym evaluate $(STATIC) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv
 	$(BIN)/kkl-gym evaluate $(STATIC) --plant-error 0.1 --csv docs/results/plant-error.csv
 	$(MAKE) figures
