@@ -252,7 +252,9 @@ def running():
         return means.array(means.within((*shape, 1)), optional=True)  # None is a missing one, or no input
 
     batch = means.array(lambda y: y.ndim and means.within((*y.shape[:-1], 1))(y))
-    record = means.array(lambda y: y.ndim > 1 and len(y) and means.within((*y.shape[:-1], 1))(y))
+    record = means.array(
+        lambda y: y.ndim > 1 and len(y) and with_gaps((*y.shape[:-1], 1))(y) and np.isfinite(y[0]).all()
+    )
     inputs = means.array(lambda u: u.shape in ((4, 1), (5, 1)) and means.within((4, 1))(u[:4]), optional=True)
     yield from calls(OBSERVERS, "observer", observer, observed, (
         ("reset y", "y", Y[0], batch, lambda o, v: o.reset(v), array_value),
@@ -272,7 +274,7 @@ def running():
     ))  # fmt: skip
     pair, gaps = (
         np.array([0.3, 0.1]),
-        means.array(lambda y: means.within((2,))(np.nan_to_num(y, nan=0.0)), optional=True),
+        means.array(with_gaps((2,)), optional=True),
     )
     yield from calls(OBSERVERS, "two outputs", two_outputs, observed, (
         ("reset y", "y", pair, means.array(lambda y: y.ndim and means.within((*y.shape[:-1], 2))(y)),
@@ -290,9 +292,14 @@ def running():
              array_value),
             ("advance rows", "rows", rows, means.bools((N,), True), lambda o, v: o.advance(Y[:3], rows=v), array_value),
             ("decode rows", "rows", rows, means.bools((N,), True), lambda o, v: o.decode(v), array_value),
-            ("step y", "y", Y[:3], sample(N), lambda o, v: o.step(v), array_value),
+            ("step y", "y", Y[:3], means.array(with_gaps((N, 1)), optional=True), lambda o, v: o.step(v), array_value),
             ("step u", "u", Y[:3], sample(N), lambda o, v: o.step(Y[:3], v), array_value),
         ))  # fmt: skip
+
+
+def with_gaps(shape):
+    """Samples of that shape, of which some may be missing."""
+    return lambda y: means.within(shape)(np.nan_to_num(y, nan=0.0))
 
 
 def two_of_three(rows):
