@@ -42,6 +42,8 @@ class LinearFilter:
         What the outputs at the beginning and at the end of an interval add.
     held_u : ndarray, shape (size, nu)
         What the inputs held over an interval add.
+    drive : ndarray, shape (2 ny + nu, size)
+        early_y, held_u and late_y side by side, transposed.
     equilibrium : ndarray, shape (size, ny)
         The state that constant outputs lead to.
 

@@ -150,18 +150,19 @@ class Tracker:
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
             return self._soon(said, *calibrated.at(np.array([age])))[0]
         heard, n, nx = self._heard, len(self._state), self._flow.nx
-        where = heard[1] if heard is not None and heard[0] is z else np.zeros(n, dtype=bool)
+        heard = heard if heard is not None and heard[0] is z else None
         z = z.reshape(n, z.shape[-1])
-        age, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
-        P = (self._state[:, nx:-1] * self._scales(age, acted)).reshape(n, nx, nx)
-        if age.min(initial=np.inf) < self._window:
-            age = np.broadcast_to(age, n)
-            soon = (age < self._window) & ~self._known
-            if heard is not None and where[soon].all():
-                said = heard[2][0][soon[where]], heard[2][1][soon[where]]
+        ages, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
+        P = (self._state[:, nx:-1] * self._scales(ages, acted)).reshape(n, nx, nx)
+        soon = (ages < self._window) & ~self._known
+        if soon.any():
+            ages = np.broadcast_to(ages, n)[soon]
+            if heard is not None and heard[1][soon].all():
+                _, asked, (x, covariance) = heard
+                said = x[soon[asked]], covariance[soon[asked]]
             else:
-                said = self._said(z[soon], age[soon])
-            P[soon] = self._soon(said, *self._factors(age[soon], acted[soon]), soon)
+                said = self._said(z[soon], ages)
+            P[soon] = self._soon(said, *self._factors(ages, acted[soon]), soon)
         return P.reshape(*self._batch, nx, nx)
 
     def _factors(self, age: np.ndarray, acted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
 _WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
-_WIDE = 16  # layers than which a loop over the points of one row is shorter
+_WIDE = 16  # neurons of a layer: beyond, a single row's loops are over them, and not over its few points
 _LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
 _MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
 
