@@ -38,7 +38,7 @@ def _unary(name: str, on_numbers: Callable[[Any], Any], meaning: str) -> Callabl
             return on_arrays(x)
         return _elsewhere(name, x)
 
-    return _named(function, f"{name}(x)", meaning)
+    return _named(function, f"{name}(x)", meaning, on_numbers)
 
 
 def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> Callable[[Any, Any], Any]:
@@ -51,11 +51,12 @@ def _binary(name: str, on_numbers: Callable[[Any, Any], Any], meaning: str) -> C
             return on_arrays(a, b)
         return _elsewhere(name, a, b)
 
-    return _named(function, f"{name}(a, b)", meaning)
+    return _named(function, f"{name}(a, b)", meaning, on_numbers)
 
 
-def _named(function: Any, call: str, meaning: str) -> Any:
+def _named(function: Any, call: str, meaning: str, on_numbers: Callable[..., Any]) -> Any:
     function.__name__ = function.__qualname__ = call.partition("(")[0]
+    function.on_numbers = on_numbers  # for compilers
     function.__doc__ = f"{call}, {meaning}, for floats, NumPy arrays, torch tensors and sympy expressions."
     return function
 

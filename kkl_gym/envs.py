@@ -2,12 +2,14 @@
 
 import itertools
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
 import numpy as np
 
+from kkl_gym.compiled_single import SOON, single_step
 from kkl_gym.equations import complex_motion, components, target_of
 from kkl_gym.plant import Plant
 from kkl_gym.rendering import (
@@ -20,7 +22,7 @@ from kkl_gym.rendering import (
     samples_a_frame,
 )
 from kkl_gym.simulate import advance, followed
-from kkl_gym.system import Box, System
+from kkl_gym.system import Box, Components, System
 from observers.checks import integer, mapping, real_array, shown
 
 _KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
@@ -130,6 +132,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
+        self._sample = self._samples = 0  # since reset, and before it
+        self._advance: Callable[..., Components] = partial(advance, self.system)
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
@@ -175,7 +179,10 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             start = self.plant.draw_start(self.np_random)
         self._x = tuple(start.tolist())
         self._y = self._measure(self._next_noise()[1])
+        self._samples += self._sample
         self._sample = 0
+        if self._samples >= SOON:
+            self._advance = single_step(self.system).advance
         self._u = None
         self._trail.clear()
         self._trail.append(self._x)
@@ -216,7 +223,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset() before step()")
         u = self._input(action)
         w, v = self._next_noise()
-        x = advance(self.system, self._x, u, w, self.dt)
+        x = self._advance(self._x, u, w, self.dt)
         escaped = not self._inside(x)
         if escaped:  # unless that is but an error of the method
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
@@ -317,7 +324,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_canvas": None, "_window": None}  # they cannot be copied, and are made anew
+        # What cannot be copied is made anew, when it is asked for or at a reset.
+        return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:

@@ -126,7 +126,10 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 
 
 def _dot(row: Iterable[Any], u: Components) -> Any:
-    return sum(gij * uj for gij, uj in zip(row, u, strict=True))
+    total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
+    for gij, uj in zip(row, u, strict=True):
+        total = total + gij * uj
+    return total
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:

@@ -41,11 +41,11 @@ class _Calibrated:
         return np.asarray(weights @ self._parts.reshape(2, -1)).reshape(-1, *self._parts.shape[1:])
 
     def scale(self, age: float) -> np.ndarray:
-        """The same of a single sample, its rows one after another."""
+        """The same of a single sample, (nx, nx)."""
         scale = self._scales.get(age if age < self.last else self.last)
         if scale is None:
             age = min(age, self.last)
-            scale = self._scales[age] = self.scales(*self.at(np.array([age]))).ravel()
+            scale = self._scales[age] = self.scales(*self.at(np.array([age])))[0]
         return scale
 
 
@@ -108,6 +108,7 @@ class Tracker:
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
         self._shown: np.ndarray | None = None  # the estimates, (n, nx) or (nx,), where machine code has made them
         self._heard: tuple[np.ndarray, np.ndarray, Gaussian] | None = None  # z, rows (n,), what T_inv said of these
+        self._looked_at: tuple[Any, Any] = None, None  # a state of one row, and its covariance, a view of that
 
     @property
     def _x(self) -> np.ndarray:
@@ -144,8 +145,10 @@ class Tracker:
             acted = len(z) > nz and (z.item(nz) != 0.0 or any(z[nz:].tolist()))
             calibrated = self._calibrated if acted else self._free_calibrated
             if age >= self._window or self._known.item(0):
-                single: np.ndarray = self._state[0, self._flow.nx : -1] * calibrated.scale(float(age))
-                return single.reshape(self._units.shape)
+                if self._looked_at[0] is not self._state:
+                    self._looked_at = self._state, self._P[0]
+                single: np.ndarray = self._looked_at[1] * calibrated.scale(float(age))
+                return single
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
             return self._soon(said, *calibrated.at(np.array([age])))[0]
@@ -173,14 +176,14 @@ class Tracker:
         return factor, doubt
 
     def _scales(self, age: np.ndarray, acted: np.ndarray) -> np.ndarray:
-        """What is multiplied with covariances where T_inv is not asked, (n, nx^2), or of all rows (nx^2,).
+        """What is multiplied with covariances where T_inv is not asked, (n, nx^2), or of all rows (1, nx^2).
 
         Ages are those of all rows, (n,), or the one that they share, (1,).
         """
         both = self._calibrated, self._free_calibrated
         last = max(each.last for each in both)
         if len(age) == 1 or age.min(initial=np.inf) >= last:  # most often
-            driven, free = (each.scale(age.item(0) if len(age) == 1 else last) for each in both)
+            driven, free = (each.scale(age.item(0) if len(age) == 1 else last).reshape(1, -1) for each in both)
             return driven if acted.all() else free if not acted.any() else np.where(acted[:, None], driven, free)
         return self._calibrated.scales(*self._factors(age, acted)).reshape(len(age), len(self._units) ** 2)
 
@@ -382,7 +385,8 @@ class Tracker:
         return np.minimum(np.maximum(s, self._low), self._high)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+        state = {name: value for name, value in self.__dict__.items() if name != "_compiled"}  # Numba is not everywhere
+        return {**state, "_looked_at": (None, None)}  # a copy of a view is none
 
     @property
     def _machine(self) -> CompiledTracker | None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import EquationError
+from kkl_gym.compiled_single import single_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
 from training.checking.finding import Finding, Verdict, number, percent
@@ -93,13 +94,15 @@ def kinds_of_numbers(system: System) -> Iterator[Finding]:
 
 
 def machine_code(subject: Subject) -> Iterator[Finding]:
-    """Whether batches run as machine code."""
+    """Whether batches and single environments run as machine code."""
     if importlib.util.find_spec("numba") is None:
         yield Finding("compiled", "note", "Numba is not installed: batches run on NumPy", 'pip install "kkl-gym[fast]"')
         return
     obstacle = subject.step.obstacle
     if obstacle is None:
-        yield Finding("compiled", "ok", "large batches of environments run as machine code")
+        slow = single_step(subject.system).obstacle
+        singly = "and so do single ones" if slow is None else f"single ones take their steps in Python ({slow})"
+        yield Finding("compiled", "ok", f"large batches of environments run as machine code, {singly}")
     elif subject.system.discrete:
         yield Finding("compiled", "ok", "nothing to compile: the system is not integrated")
     else:

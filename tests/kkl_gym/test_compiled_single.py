@@ -1,0 +1,244 @@
+import copy
+import functools
+import logging
+import math
+import pickle
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from kinked_systems import SYSTEMS as KINKED
+
+import kkl_gym.compiled_single
+from kkl_gym import SYSTEMS, EquationError, KKLEnv, System, get_system
+from kkl_gym.compiled_single import SOON, compiled_step, single_step
+from kkl_gym.elementary import clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
+from kkl_gym.simulate import advance
+
+GRAVITY = 9.81
+
+
+@pytest.fixture(autouse=True)
+def compiler():
+    pytest.importorskip("numba")
+
+
+@dataclass(frozen=True)
+class Pendulum(System):
+    """Two inputs, one through a matrix that depends on the state; numbers of class and module; a numerical rate."""
+
+    damping: float = 0.1
+
+    length = 2
+    name = "pendulum"
+    X = ((-3, 3), (-3, 3))
+    bounds = ((-30, 30), (-30, 30))
+    u_max = (2, 3)
+
+    def f(self, x):
+        angle, speed = x
+        return speed, -GRAVITY / self.length * sin(angle) - self.damping * speed * abs(speed)
+
+    def g(self, x):
+        return (0.0, 0.1), (cos(x[0]), 0.0)
+
+    def h(self, x):
+        return (x[0],)
+
+
+class TwoInputs(Pendulum):
+    """The same with a constant input matrix."""
+
+    name = "two_inputs"
+    G = ((0.0, 0.1), (1.0, 0.7))
+    g = System.g
+
+
+@dataclass(frozen=True)
+class Elementary(System):
+    """All there is in kkl_gym.elementary, and branches."""
+
+    name = "elementary"
+    X = ((-2, 2), (0.5, 3), (-1, 1))
+    bounds = ((-5, 5), (-5, 5), (-5, 5))
+
+    def f(self, x):
+        a, b, c = x
+        if c > 0.2:
+            a = a + 0.1 * c
+        return (
+            tanh(b) * where(a > b, c, 1) - clip(a, -1, 1),
+            exp(-abs(b)) - log(1.0 + a * a) + maximum(a, c) / 3 - 0.3 * tan(0.1 * c),
+            sqrt(abs(a)) - sign(c) * minimum(b, 1.0),
+        )
+
+    def h(self, x):
+        return (x[0],)
+
+
+def starts(system, n, factor=2.0, seed=7):
+    rng = np.random.default_rng(seed)
+    scale = np.array(system.scale)
+    for x in rng.uniform(*system.box(factor), (n, system.nx)):
+        u = (np.array(system.u_max) * rng.uniform(-1, 1, system.nu)).tolist()
+        yield tuple(x.tolist()), u, (scale * rng.uniform(-1, 1, system.nx)).tolist()
+
+
+@pytest.mark.parametrize(
+    "system", [*map(get_system, SYSTEMS), Pendulum(), TwoInputs(0.3), Elementary(), *KINKED], ids=lambda s: s.name
+)
+@pytest.mark.parametrize("dt", [0.01, 0.13])
+def test_it_is_pythons_step_to_the_last_bit(system, dt):
+    step = single_step(system).advance
+    for at in starts(system, 500):
+        expected = advance(system, *at, dt)
+        assert np.array_equal(step(*at, dt), expected, equal_nan=True), at
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_parameters_are_the_systems_own(name):
+    system = get_system(name)
+    changed = system.replace({key: 1.1 * value for key, value in system.parameters.items()})
+    step = single_step(changed).advance
+    for at in starts(system, 100):
+        assert tuple(step(*at, 0.01)) == tuple(advance(changed, *at, 0.01))
+
+
+@pytest.mark.parametrize("wild", [math.inf, math.nan, 1e200, -1e7])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_wild_states_end_as_in_python(name, wild):
+    system = get_system(name)
+    x, u, w = (1.0,) * (system.nx - 1) + (wild,), [0.0] * system.nu, [0.0] * system.nx
+    step = single_step(system).advance
+    assert np.array_equal(step(x, u, w, 0.01), advance(system, x, u, w, 0.01), equal_nan=True)
+
+
+class Powers(Elementary):
+    name = "powers"
+
+    def f(self, x):
+        return x[0] ** 3, x[1], x[2]
+
+
+class Generators(Elementary):
+    name = "generators"
+
+    def f(self, x):
+        return tuple(-xi for xi in x)
+
+
+class Calls(Elementary):
+    name = "calls"
+
+    def f(self, x):
+        return self.helper(x), 0.0, 0.0
+
+    def helper(self, x):
+        return -x[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "why"),
+    [
+        (Powers, "f has a power; products"),
+        (Generators, "UnsupportedError: The use of yield"),
+        (Calls, "Unknown attribute 'helper'"),
+    ],
+)
+def test_what_cannot_be_compiled_stays_in_python_and_the_log_says_why(kind, why, caplog):
+    with caplog.at_level(logging.INFO, "kkl_gym"):
+        assert why in single_step(kind()).obstacle
+        assert single_step(kind()).obstacle
+    (record,) = [record for record in caplog.records if record.name == "kkl_gym"]
+    assert record.getMessage().startswith(f"single steps of {kind.name} stay in Python: ")
+
+
+def test_without_numba_it_stays_in_python(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    kkl_gym.compiled_single._shared_step.cache_clear()
+    assert single_step(get_system("lorenz")).obstacle.startswith("ModuleNotFoundError")
+    kkl_gym.compiled_single._shared_step.cache_clear()
+
+
+def episode(env, seed, steps, gain=0.5):
+    obs, info = env.reset(seed=seed)
+    found = [(obs, info["x"], info["y"])]
+    for k in range(steps):
+        obs, reward, terminated, _, info = env.step(np.full(env.action_space.shape, gain * math.sin(0.01 * k)))
+        found.append((obs, info["x"], info["y"], info["u"], reward, terminated))
+        if terminated:
+            break
+    return found
+
+
+def in_python(env):
+    return isinstance(env._advance, functools.partial)
+
+
+def same(one, other):
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        assert all(np.array_equal(p, q) for p, q in zip(a, b, strict=True))
+
+
+@pytest.mark.parametrize("system", [*SYSTEMS, Pendulum()], ids=str)
+def test_episodes_are_the_same_with_it_and_without(system):
+    env = KKLEnv(system)
+    before = episode(env, 3, SOON + 500)
+    assert in_python(env)
+    after = episode(env, 3, SOON + 500)
+    assert not in_python(env)
+    same(before, after)
+
+
+def test_it_waits_for_a_reset_after_many_steps():
+    env = KKLEnv("lorenz")
+    episode(env, 0, SOON // 2)
+    episode(env, 0, SOON // 2 - 1)
+    episode(env, 0, 3)
+    assert in_python(env)
+    env.reset(seed=0)
+    assert not in_python(env)
+
+
+def test_copies_go_on_as_the_original():
+    env = KKLEnv("lorenz", measurement_noise=0.0)
+    episode(env, 0, SOON)
+    episode(env, 0, 10)
+    twins = copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    expected = env.step([0.3])
+    for twin in twins:
+        for a, b in zip(twin.step([0.3])[:4], expected[:4], strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_numbers_of_the_module_and_of_the_class_are_taken_as_they_are_at_the_reset(monkeypatch):
+    system = Pendulum()
+    at = (1.0, 0.0), [0.0, 0.0], [0.0, 0.0]
+    single_step(system)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert tuple(single_step(system).advance(*at, 0.1)) == tuple(advance(system, *at, 0.1))
+    monkeypatch.setattr(Pendulum, "length", 1)
+    assert tuple(single_step(system).advance(*at, 0.1)) == tuple(advance(system, *at, 0.1))
+
+
+class Failing(Elementary):
+    """Its equations fail at one state."""
+
+    name = "failing"
+
+    def f(self, x):
+        if x[0] == 0.125:
+            raise ValueError("no such state")
+        return -x[0], -x[1], -x[2]
+
+
+def test_equations_that_fail_say_what_they_say_in_python():
+    at = (0.125, 1.0, 1.0), [], [0.0] * 3
+    said = []
+    for step in (compiled_step(Failing()), functools.partial(advance, Failing())):
+        with pytest.raises(EquationError, match="no such state") as raised:
+            step(*at, 0.01)
+        said.append(str(raised.value))
+    assert said[0] == said[1]
