@@ -1,7 +1,7 @@
 """Many environments at once, simulated as one batch."""
 
+import functools
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import gymnasium as gym
@@ -10,7 +10,7 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from kkl_gym.compiled import batch_step
+from kkl_gym.compiled import BatchStep, batch_step
 from kkl_gym.equations import components, target_of
 from kkl_gym.plant import NOISE_BLOCK, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
@@ -122,7 +122,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         nx, ny = self.system.nx, self.system.ny
         low, high = np.array(self.system.bounds, dtype=float).T.copy()
         self._u_max, target = (np.array(each, dtype=float) for each in (self.system.u_max, target_of(self.system)))
-        self._judged = partial(judged, bounds=(low, high), target=target, weights=self.plant.weights)
+        self._judged = functools.partial(judged, bounds=(low, high), target=target, weights=self.plant.weights)
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
@@ -145,7 +145,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Where they do not, the logger ``kkl_gym`` has said why at level INFO, and
         ``kkl_gym.compiled.batch_step(env.system).obstacle`` says it again.
         """
-        return batch_step(self.system).obstacle is None
+        return self._advance.obstacle is None
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -296,7 +296,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(self._canvas.draw(*row) for row in zip(self._trails.rows, guesses, self._u.T))
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_canvas": None}  # a canvas cannot be copied, and is drawn anew
+        # What cannot be copied is made anew.
+        return {name: value for name, value in self.__dict__.items() if name != "_advance"} | {"_canvas": None}
 
     @property  # type: ignore[override]
     def np_random(self) -> tuple[np.random.Generator, ...]:
@@ -341,12 +342,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._sample[rows] = 0
         self._terminated[rows] = self._truncated[rows] = False
 
+    @functools.cached_property
+    def _advance(self) -> BatchStep:
+        return batch_step(self.system)
+
     def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Advance some rows by a sampling interval; returns their rewards."""
         whole = len(rows) == self.num_envs
         before = self._x if whole else self._x[:, rows]
         w, v = self._noise(rows)
-        x = batch_step(self.system)(before, u, w, self.plant.dt)
+        x = self._advance(before, u, w, self.plant.dt)
         inside, reward = self._judged(x)
         if not inside.all():  # unless that is but an error of the method
             x = followed_rows(self.system, before, u, w, dt=self.plant.dt, end=x, rows=np.flatnonzero(~inside))
@@ -379,16 +384,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """One sample of w, (nx, rows), and of v, (ny, rows)."""
         whole = len(rows) == self.num_envs
         used = self._used if whole else self._used[rows]
-        if used.max() == NOISE_BLOCK:
+        together = whole and (used == used[0]).all()  # most often
+        if (used[0] if together else used.max()) == NOISE_BLOCK:
             self._draw(rows[used == NOISE_BLOCK])
             used = np.where(used == NOISE_BLOCK, 0, used)
         if whole:
             self._used = used + 1
         else:
             self._used[rows] = used + 1
-        first = used[0]
-        if whole and (used == first).all():
-            drawn = self._w[first].T, self._v[first].T
+        if together:
+            drawn = self._w[used[0]].T, self._v[used[0]].T
         else:
             drawn = self._w[used, :, rows], self._v[used, :, rows]
         w, v = self.plant.noise(*drawn)

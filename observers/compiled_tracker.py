@@ -62,7 +62,8 @@ class CompiledTracker:
         outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._nx, self._ny = flow.nx, len(C)
-        one, many, take = kernels(network.activation, flow.nx, flow.nu, len(C), flow.degree)
+        used = tuple(map(tuple, (flow.polynomial != 0).tolist()))
+        one, many, take = kernels(network.activation, flow.nu, len(C), flow.degree, used)
         polynomial = np.ascontiguousarray(flow.polynomial, dtype=float)
         gains, places, mixing = without_zeros(linear.transition, linear.drive)
         # A few arrays of all there is: each that is handed over takes as long as a hundred multiplications.

@@ -319,11 +319,14 @@ class Tracker:
                 self._take(said, _FLAGS[one], _FIRST)
                 self._heard = z, _FLAGS[True], said
             return
+        lost = ~(self._mean_square <= self._limit)
+        asked = np.ravel(age) < self._window  # of all rows, or the one age that they share
+        if not asked.any() and not lost.any():  # most often
+            return
         age = np.broadcast_to(age, self._batch).ravel()
-        lost, asked = ~(self._mean_square <= self._limit), age < self._window
         if rows is not None:
             lost, asked = lost & rows.ravel(), asked & rows.ravel()
-        asked |= lost
+        asked = asked | lost
         where = np.flatnonzero(asked)
         if not len(where):
             return

@@ -1,8 +1,8 @@
 """A tracker's step as Numba compiles it.
 
-Kernels are made for numbers of states, inputs and outputs: loops as short as theirs are else mostly overhead. A step
-takes some rows at a time, and its innermost loops are over these rows or their sigma points, which are vectors to the
-processor. A single sample is the same with one row.
+Kernels are made for numbers of states, inputs and outputs, and for the terms that a flow's polynomial has: loops as
+short as theirs are else mostly overhead. A step takes some rows at a time, and its innermost loops are over these rows
+or their sigma points, which are vectors to the processor. A single sample is the same with one row.
 
 Kernels take a table of states, a row for each: its bounds, the gain of the flow's network, the variance that is added,
 offset, scale and bend. That of outputs has their mean, the variance of the noise, the share of the newest innovation in
@@ -49,10 +49,14 @@ def _unscaling() -> Callable[[float, float, float], float]:
 
 
 @functools.cache
-def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[Any, ...]:
-    """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says."""
-    update, unscaled, terms = single_kernel(), _unscaling(), count(nx + nu, degree)
-    step_one, step_lanes = (_step(activation, nx, nu, ny, degree, lanes) for lanes in (1, _LANES))
+def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bool, ...], ...]) -> tuple[Any, ...]:
+    """Those of :class:`observers.compiled_tracker.CompiledTracker`: a single sample, a batch, and what T_inv says.
+
+    ``used`` says for each state which terms its polynomial has.
+    """
+    update, unscaled, nx = single_kernel(), _unscaling(), len(used)
+    terms = count(nx + nu, degree)
+    step_one, step_lanes = (_step(activation, nu, ny, degree, used, lanes) for lanes in (1, _LANES))
 
     @_compiled
     def one(
@@ -130,14 +134,15 @@ def kernels(activation: str, nx: int, nu: int, ny: int, degree: int) -> tuple[An
     return one, step_lanes, take
 
 
-def _along(nx: int, signals: int, degree: int, points: int) -> Callable[..., None]:
+def _along(signals: int, degree: int, used: tuple[tuple[bool, ...], ...], points: int) -> Callable[..., None]:
     """Where points go by a polynomial, (nx, terms): (signals + nx) rows of all points, of which the last are written.
 
-    Of few coefficients it is written out, so that the monomials of a point stay in the processor's registers.
+    Of few coefficients it is written out, so that the monomials of a point stay in the processor's registers, and those
+    that no state has are left out.
     """
-    earlier, by = table(signals, degree)
+    (earlier, by), nx = table(signals, degree), len(used)
     terms = len(by)
-    if nx * terms > _WRITTEN_OUT:
+    if sum(map(sum, used)) > _WRITTEN_OUT:
 
         @_compiled
         def along(polynomial: np.ndarray, flat: np.ndarray) -> None:
@@ -157,28 +162,35 @@ def _along(nx: int, signals: int, degree: int, points: int) -> Callable[..., Non
 
         return along
 
+    asked = {0} | {t for of_one in used for t in range(terms) if of_one[t]}
+    for t in range(terms - 1, 0, -1):
+        if t in asked:  # as are those that it is a product of
+            asked.add(int(earlier[t]))
     lines = ["def along(polynomial, flat):"]
-    lines += [f"    c{i}_{t} = polynomial[{i}, {t}]" for i in range(nx) for t in range(terms)]
+    lines += [f"    c{i}_{t} = polynomial[{i}, {t}]" for i in range(nx) for t in range(terms) if used[i][t]]
     lines += [f"    for p in range({points}):"]
     lines += [f"        s{j} = flat[{j * points} + p]" for j in range(signals)]
     lines += ["        m0 = 1.0"]
-    lines += [f"        m{t} = m{earlier[t]} * s{by[t]}" for t in range(1, terms)]
+    lines += [f"        m{t} = m{earlier[t]} * s{by[t]}" for t in sorted(asked - {0})]
     for i in range(nx):
-        change = " + ".join(f"c{i}_{t} * m{t}" for t in range(terms))
-        lines += [f"        flat[{(signals + i) * points} + p] = s{i} + ({change})"]
+        change = " + ".join(f"c{i}_{t} * m{t}" for t in range(terms) if used[i][t])
+        lines += [f"        flat[{(signals + i) * points} + p] = s{i} + ({change or 0.0})"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
     return _compiled(namespace["along"])
 
 
-def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -> Callable[..., None]:
+def _step(
+    activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bool, ...], ...], lanes: int
+) -> Callable[..., None]:
     """A kernel that takes so many rows at a time: what they have in common is a loop over them.
 
     Its arrays have an entry for each row in the end, or for each sigma point of each row.
     """
-    active, of_one, signals, each = active_kernel(activation), _kernels(activation)[1], nx + nu, 2 * nx
+    active, of_one, nx = active_kernel(activation), _kernels(activation)[1], len(used)
+    signals, each = nx + nu, 2 * nx
     far, weight, points = math.sqrt(nx), 1 / each, each * lanes
-    along, unscaled = _along(nx, signals, degree, points), _unscaling()
+    along, unscaled = _along(signals, degree, used, points), _unscaling()
 
     @_compiled
     def factorise(P: np.ndarray) -> None:
@@ -273,26 +285,23 @@ def _step(activation: str, nx: int, nu: int, ny: int, degree: int, lanes: int) -
             distance[r] = 0.0
         for i in range(nx):
             gain = states[i, _GAIN]
+            for p in range(points):
+                moved[i, p] += gain * h[i, p]
             for r in range(lanes):
-                mean[i, r] = 0.0
-            for p in range(each):
-                for r in range(lanes):
-                    moved[i, p * lanes + r] += gain * h[i, p * lanes + r]
-                    mean[i, r] += moved[i, p * lanes + r]
-            for r in range(lanes):
-                mean[i, r] *= weight
+                total = 0.0
+                for p in range(each):
+                    total += moved[i, p * lanes + r]
+                mean[i, r] = total * weight
                 distance[r] += (mean[i, r] - x[i, r]) * (mean[i, r] - x[i, r])
             for p in range(each):
                 for r in range(lanes):
                     moved[i, p * lanes + r] -= mean[i, r]
             for j in range(i + 1):
                 for r in range(lanes):
-                    P[i, j, r] = 0.0
-                for p in range(each):
-                    for r in range(lanes):
-                        P[i, j, r] += moved[i, p * lanes + r] * moved[j, p * lanes + r]
-                for r in range(lanes):
-                    P[i, j, r] *= weight
+                    total = 0.0
+                    for p in range(each):
+                        total += moved[i, p * lanes + r] * moved[j, p * lanes + r]
+                    P[i, j, r] = total * weight
             for r in range(lanes):
                 P[i, i, r] += states[i, _NOISE]
         for i in range(nx):

@@ -18,7 +18,9 @@ from training.systems import profile
 Preset = Literal["fast", "paper"]
 Size = Literal["default", "small"]
 SMALL = "small"  # what names of small maps end in
-SMALL_WIDTH = 20  # of their hidden layers: a twentieth of the multiplications
+# Of small maps: hidden layers of a twentieth of the multiplications, and none of the slow modes that average noise. A
+# tracker does that by itself.
+SMALL_SETTINGS: dict[str, Any] = {"width": 20, "pairs": ()}
 LARGE: dict[str, Any] = {
     "width": 512,
     "depth": 4,

@@ -168,10 +168,14 @@ def test_a_single_sample_is_a_row_of_a_batch(compiled):
     assert found > 3
 
 
-@pytest.mark.parametrize(("nx", "nu", "ny"), [(1, 0, 1), (5, 2, 3)])
-def test_steps_of_other_sizes(nx, nu, ny):
-    """A single sample's and a batch's, of one more row than any loop would like."""
+@pytest.mark.parametrize(("nx", "nu", "ny", "thin"), [(1, 0, 1, False), (5, 2, 3, False), (3, 1, 1, True)])
+def test_steps_of_other_sizes(nx, nu, ny, thin):
+    """A single sample's and a batch's, of one more row than any loop would like; of polynomials that lack terms too."""
     rng, flow = np.random.default_rng(nx), a_flow(nx, nu, ny)
+    if thin:
+        polynomial = 10 * flow.polynomial * (rng.random(flow.polynomial.shape) < 0.2)
+        polynomial[0], polynomial[1, :-1], polynomial[1, -1] = 0.0, 0.0, 1e-3  # no term at all, and the last alone
+        flow = replace(flow, polynomial=polynomial)
     C = rng.normal(size=(ny, nx))
     low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
     q, r = flow.variances(0.3, 0.1)
@@ -225,7 +229,8 @@ def test_a_run_compiles_nothing_in_its_midst():
     artifact = tracking(2)
     tracker_kernels.kernels.cache_clear()
     observer = KKLObserver(artifact, 0.1, compiled=True)
-    kernels = tracker_kernels.kernels(artifact.flow.mlp.activation, artifact.nx, artifact.nu, artifact.ny, 3)
+    used = tuple(map(tuple, (artifact.flow.polynomial != 0).tolist()))
+    kernels = tracker_kernels.kernels(artifact.flow.mlp.activation, artifact.nu, artifact.ny, 3, used)
     assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 1]
     frozen, y = np.array([0.2]), np.array([0.1, 0.2])
     frozen.flags.writeable = False

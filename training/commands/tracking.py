@@ -29,7 +29,7 @@ class Tracking(Teaching):
     """
 
     size: Size = "default"
-    """small: a network half as wide, for fast simulations and microcontrollers."""
+    """small: a smaller network, and a polynomial of few terms, for fast simulations and microcontrollers."""
     steps: int = 40_000
     """Batches for the network."""
     trajectories: int = 1600

@@ -16,7 +16,7 @@ from training.commands.data import DataOptions
 from training.commands.options import HalfWidths, Parameters
 from training.commands.settings import RecordedSettings, Settings
 from training.config import Config, Pipeline, read_changes
-from training.presets import CLOSED_LOOP, SMALL, SMALL_WIDTH, Preset, Size, preset
+from training.presets import CLOSED_LOOP, SMALL, SMALL_SETTINGS, Preset, Size, preset
 from training.progress import LOG, ProgressBars, duration, progress_bars
 from training.spectrum import Spectrum
 from training.systems import named_policy
@@ -180,7 +180,7 @@ class Train:
         """The settings that are to differ from the preset's: those of the file, and those of options before them."""
         changes = (read_changes(self.config) if self.config else {}) | self.settings
         if self.size == SMALL:
-            changes.setdefault("width", SMALL_WIDTH)
+            changes = {**SMALL_SETTINGS, **changes}
         if changes.get("random_features"):
             changes.setdefault("forward_steps", 0)  # what is solved for is not trained
         if self.uncertain:

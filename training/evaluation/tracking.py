@@ -55,7 +55,7 @@ def learn_tracking(
     steps : int
         Batches for the network.
     small : bool
-        Whether the network is half as wide as usual, for small maps.
+        Whether network and polynomial are smaller than usual, for small maps.
     trajectories : int
         Number of motions to calibrate on.
     seed : int

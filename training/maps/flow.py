@@ -26,12 +26,16 @@ PAIRS = 400_000
 # most of them near and some far. That a tracker does not leave the motions it is the near ones that decide.
 NEAR, FAR, FAR_SHARE = (1e-4, 0.05), (0.05, 0.3), 0.25
 STILL = 0.5  # share of the pairs without input, where there are inputs
-DEPTH, BATCH, LEARNING_RATE = 2, 1024, 3e-3
+BATCH, LEARNING_RATE = 1024, 3e-3
 # A polynomial of higher degree is taken where it alone is usually off by less than that part of a state's standard
 # deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
 # then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
-NARROW, WIDE = 8, 32  # neurons in each hidden layer; of small flows half as many
+NARROW, WIDE = (8, 2), (32, 2)  # neurons in each hidden layer, and how many there are
+SMALL_NARROW, SMALL_WIDE = (4, 1), (12, 2)  # of small flows
+# The polynomials of small flows lack terms that move a state by less than that part of what they leave, or than that
+# many standard deviations. The others are then fitted again (S. L. Brunton et al., Proc. Natl. Acad. Sci. 113, 2016).
+NEGLIGIBLE, INVISIBLE = 0.3, 1e-6
 MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 FARTHEST = 0.1  # share of the increments, of the longest, from which it is found how errors grow with them
@@ -137,7 +141,7 @@ class FlowProblem(nn.Module):
     degree : int
         Of the polynomial, if it leaves little; else it is 1.
     small : bool
-        Whether the network is half as wide.
+        Whether terms of the polynomial that hardly matter are left out, and the network is smaller.
     device : torch.device
         Where the network is trained.
 
@@ -159,10 +163,13 @@ class FlowProblem(nn.Module):
         little = np.median(np.abs(left), axis=0).max() < LITTLE
         if not little and degree > 1:
             self.polynomial, left = _fitted(inputs, change, 1)
-        width = (NARROW if little else WIDE) // (2 if small else 1)
+        elif small and degree > 1:
+            self.polynomial, left = _thinned(inputs, change, self.polynomial, degree)
+        shapes = (SMALL_NARROW, SMALL_WIDE) if small else (NARROW, WIDE)
+        width, depth = shapes[0 if little else 1]
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
-        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=DEPTH, activation="tanh").to(device)
+        self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=depth, activation="tanh").to(device)
         self._inputs, self._left = tensor(inputs, device), tensor(left, device)
         self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
 
@@ -189,6 +196,25 @@ def _fitted(inputs: np.ndarray, change: np.ndarray, degree: int) -> tuple[np.nda
     """A polynomial by least squares, (nx, terms), and what it leaves."""
     terms = monomials(inputs, degree)
     polynomial = np.linalg.lstsq(terms, change, rcond=None)[0].T
+    return polynomial, change - terms @ polynomial.T
+
+
+def _thinned(
+    inputs: np.ndarray, change: np.ndarray, polynomial: np.ndarray, degree: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """A polynomial without terms that are negligible beside what it leaves, (nx, terms), and what it leaves then."""
+    terms = monomials(inputs, degree)
+    sizes, left = np.sqrt((terms**2).mean(0)), change - terms @ polynomial.T
+    polynomial = polynomial.copy()
+    for coefficients, target, off in zip(polynomial, change.T, left.std(0), strict=True):
+        while True:
+            used = np.flatnonzero(coefficients)
+            negligible = np.abs(coefficients[used]) * sizes[used] < max(NEGLIGIBLE * off, INVISIBLE)
+            if not negligible.any():
+                break
+            coefficients[used[negligible]] = 0.0
+            kept = used[~negligible]
+            coefficients[kept] = np.linalg.lstsq(terms[:, kept], target, rcond=None)[0]
     return polynomial, change - terms @ polynomial.T
 
 
@@ -243,7 +269,7 @@ def fit_flow(
     progress : ProgressBars
         Where a bar is shown.
     small : bool
-        Whether the network is half as wide as usual.
+        As :class:`FlowProblem` has it.
     device : torch.device, optional
         Where the network is trained; by default on the CPU.
     **of_plant : object

@@ -64,7 +64,7 @@ def learn_recorded_tracking(
     steps : int
         Batches for the network.
     small : bool
-        Whether the network is half as wide as usual, for small maps.
+        Whether network and polynomial are smaller than usual, for small maps.
     seed : int
         Of everything random.
     device : torch.device, optional

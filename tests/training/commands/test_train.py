@@ -94,7 +94,8 @@ def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(tmp_path, capsys, m
     main(["train", "van_der_pol", "--size", "small", "--no-inputs", *sizes.split()])
     path = tmp_path / "runs" / "van_der_pol-small" / "van_der_pol-small.safetensors"
     assert Artifact.read(path).inverse.mlp.weights[0].shape[0] == 20
+    assert len(Artifact.read(path).filter.A) == 15  # without the default's pairs of slow modes
     assert "width = 20" in capsys.readouterr().out
-    assert Train("van_der_pol", size="small", settings={"width": 8})._changes() == {"width": 8}
+    assert Train("van_der_pol", size="small", settings={"width": 8})._changes() == {"width": 8, "pairs": ()}
     with pytest.raises(SystemExit, match="--size is of no use with --data"):
         main(["train", "--data", "runs.csv", "--size", "small"])

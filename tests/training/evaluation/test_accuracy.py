@@ -12,7 +12,7 @@ from observers.names import resolve
 from training.config import Config, current_names
 from training.evaluation.errors import errors, unseen_trajectories
 from training.evaluation.metrics import component_smape
-from training.presets import SMALL_WIDTH, preset
+from training.presets import SMALL_SETTINGS, preset
 
 # Medians over 100 unseen runs of 50 s, in percent, that the default maps promise. The paper's SMAPE over all steps from
 # X: without noise, at sigma_v = 0.5, and (first 5 s left out) driven by random steps and sines; and component-wise,
@@ -83,7 +83,7 @@ def test_shipped_maps_are_what_the_preset_makes(name):
     artifact = observers.load(name).artifact
     kind = name.removeprefix(artifact.system).rpartition("-v")[0]
     pipeline = "spinn" if kind == "-spinn" else "input-aware"
-    changes = {"-small": {"width": SMALL_WIDTH}}
+    changes = {"-small": SMALL_SETTINGS}
     settings = preset(get_system(artifact.system), pipeline, "fast", changes=changes.get(kind))
     made, config = current_names(artifact.training), json.loads(json.dumps(asdict(settings)))
     later = {

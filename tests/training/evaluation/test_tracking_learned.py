@@ -10,6 +10,7 @@ from tracking import DT, exact_motion, plain_observer, tracking_observer
 
 from kkl_gym import get_system
 from observers import MLP, Artifact, KKLObserver, Limits, load
+from observers.polynomial import monomials
 from training.commands.tracking import Tracking
 from training.evaluation import tracking
 from training.evaluation.certificates.certificate import certify
@@ -133,8 +134,17 @@ def test_a_policy_needs_an_observer_that_knows_of_inputs():
     np.testing.assert_array_equal(alone.change, under.change)
 
 
+SHAPES = {  # of networks, where a polynomial leaves much, and of small flows
+    (False, False): [8, 8, 2],
+    (False, True): [4, 2],
+    (True, False): [32, 32, 2],
+    (True, True): [12, 12, 2],
+}
+
+
+@pytest.mark.parametrize("thin", [False, True])
 @pytest.mark.parametrize("bent", [False, True])
-def test_a_motion_that_is_a_polynomial_is_found_exactly(bent):
+def test_a_motion_that_is_a_polynomial_is_found_exactly(bent, thin):
     """In units of which none is 1. Where a polynomial leaves much, it is linear, and the network a wide one."""
     rng = np.random.default_rng(0)
     x = rng.normal(size=(2000, 2)) * (3.0, 0.2) + (1.0, -0.5)
@@ -149,6 +159,7 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent):
             degree=3,
             steps=1,
             seed=0,
+            small=thin,
             progress=progress,
             low=np.full(2, -20.0),
             high=np.full(2, 20.0),
@@ -158,9 +169,27 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent):
             window=1.0,
         )
     assert found.degree == (1 if bent else 3)
-    assert found.mlp.weights[0].shape == (32 if bent else 8, 3)
+    assert [len(weights) for weights in found.mlp.weights] == SHAPES[bent, thin]
     if not bent:
         assert np.abs(found(x, u) - x - change).max() < 1e-12
+        # 1, x1, x1^2, x1^3 and x2 of the first state; 1, x1, x2, x1 x2 and u of the second.
+        assert (found.polynomial != 0).sum(1).tolist() == ([5, 5] if thin else [20, 20])
+
+
+def test_terms_that_small_flows_lack_are_below_what_the_others_leave():
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(5000, 2))
+    terms = monomials(inputs, 3)
+    wanted = np.zeros((2, terms.shape[1]))
+    wanted[0, [1, 6]], wanted[1, [2, 4]] = (0.3, 0.02), (-0.1, 1e-3)  # the last is below the noise
+    change = terms @ wanted.T + 0.01 * rng.normal(size=(5000, 2))
+    dense, before = flow._fitted(inputs, change, 3)
+    thin, left = flow._thinned(inputs, change, dense, 3)
+    assert np.flatnonzero(thin[0]).tolist() == [1, 6]
+    assert np.flatnonzero(thin[1]).tolist() == [2]
+    np.testing.assert_allclose(thin[thin != 0], wanted[[0, 0, 1], [1, 6, 2]], atol=1e-3)
+    np.testing.assert_allclose(left, change - terms @ thin.T)
+    assert (left.std(0) < 1.02 * before.std(0)).all()
 
 
 def test_degrees_are_as_high_as_sixty_terms_allow():
