@@ -31,5 +31,5 @@ def test_one_row_for_each_file_and_no_name_cut():
 def test_what_each_map_is_told():
     rows = {line.split()[0]: line.split() for line in printed(120).splitlines() if line.strip()}
     assert rows["van_der_pol-v2"][1:] == ["(van_der_pol)", "input-aware*", "1", "23", "1", "0.05", "0.36"]
-    assert rows["van_der_pol-small-v2"][1:] == ["(van_der_pol-small)", "input-aware*", "1", "23", "1", "0.05", "0.07"]
+    assert rows["van_der_pol-small-v2"][1:] == ["(van_der_pol-small)", "input-aware*", "1", "15", "1", "0.05", "0.05"]
     assert rows["lorenz-spinn-v2"][1:] == ["(lorenz-spinn)", "spinn", "0", "9", "1", "–", "0.28"]
