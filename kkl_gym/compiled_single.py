@@ -22,8 +22,8 @@ import numpy as np
 from kkl_gym import elementary
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance, runge_kutta
 from kkl_gym.system import Components, System
+from observers.observer import SOON
 
-SOON = 1000  # steps after which a simulation will go on for long enough to wait a second for the compiler
 _EQUATIONS = ("f", "g", "rate")
 _TRIALS = 1000  # states at which both are compared
 
