@@ -2,19 +2,22 @@
 
 The system's own functions f, g and rate are compiled as they stand, and put into the step that single states take.
 Machine code adds and multiplies as Python does, in the same order, so that an episode is the same with it and without,
-to the last bit. Powers are the exception: what ``**`` rounds to is left to the compiler. Equations with powers stay in
-Python, and so do those that Numba cannot read.
+to the last bit. That holds of +, -, * and /, of comparisons and of :mod:`kkl_gym.elementary`. Equations with anything
+else, such as powers and NumPy's functions, which compilers round in their own ways, stay in Python.
 """
 
+import builtins
 import dis
 import functools
+import inspect
 import logging
 import math
 import re
+import warnings
 from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import FunctionType
+from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
@@ -24,8 +27,12 @@ from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance, runge_kutta
 from kkl_gym.system import Components, System
 from observers.observer import SOON
 
-_EQUATIONS = ("f", "g", "rate")
 _TRIALS = 1000  # states at which both are compared
+_MOST_SUBSTEPS = 64  # of a state that is compared: Python would take long for more
+_MOST_INSTRUCTIONS = 600  # of Python's, in f, g and rate each; beyond, compiling takes many seconds
+_OPERATORS = ("+", "-", "*", "/", "&", "|")
+_KEPT = 64  # compiled steps
+_shared: dict[Any, "SingleStep"] = {}  # by all that they were made of
 
 Step = Callable[[Components, Components, Components, float], Components]
 """(x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance` of a system."""
@@ -66,21 +73,31 @@ def single_step(system: System) -> SingleStep:
     SingleStep
         The step, and why it is not compiled where it is not.
     """
-    read = tuple(tuple(sorted(_numbers_read(system, name).items())) for name in _EQUATIONS)
-    return _shared_step(type(system), tuple(system.parameters.items()), read)  # type: ignore[arg-type]
-
-
-@functools.lru_cache(maxsize=64)
-def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...], read: Any) -> SingleStep:
-    system = kind(**dict(parameters))
+    in_python = functools.partial(advance, system)
     if system.discrete:
-        return SingleStep(functools.partial(advance, system), f"{system.name} makes its step itself")
+        return SingleStep(in_python, f"{system.name} makes its step itself")
     try:
-        return SingleStep(compiled_step(system))
-    except Exception as error:  # anything may come out of Numba for a user's equations, which Python then takes
-        obstacle = _reason(error)
-        logger.info("single steps of %s stay in Python: %s", system.name, obstacle)
-        return SingleStep(functools.partial(advance, system), obstacle)
+        made_of = _made_of(system)
+    except Exception as error:
+        return SingleStep(in_python, _reason(error))
+    if made_of not in _shared:
+        while len(_shared) >= _KEPT:
+            _shared.pop(next(iter(_shared)))
+        try:
+            _shared[made_of] = SingleStep(compiled_step(system))
+        except Exception as error:  # anything may come out of Numba for a user's equations, which Python then takes
+            obstacle = _reason(error)
+            logger.info("single steps of %s stay in Python: %s", system.name, obstacle)
+            _shared[made_of] = SingleStep(in_python, obstacle)
+    found = _shared[made_of]
+    return found if found.obstacle is None else SingleStep(in_python, found.obstacle)
+
+
+def _made_of(system: System) -> tuple[Any, ...]:
+    """All that a compiled step depends on; floats as text, for 0.0 is not -0.0."""
+    functions = tuple(getattr(type(system), name) for name in ("f", "g", "rate"))
+    numbers = (repr((found.on_self, found.of_module)) for found in (_Read(system, each) for each in functions))
+    return type(system), *functions, repr((system.parameters, system.G, system.X, system.bounds, system.dt)), *numbers
 
 
 def _reason(error: Exception) -> str:
@@ -108,24 +125,25 @@ def compiled_step(system: System) -> Step:
     ImportError
         If Numba is not installed.
     ValueError
-        If the equations hold powers, or the result is not what Python makes of them.
+        If the equations hold what might be rounded in another way, are too long, or the result is not what Python makes
+        of them.
     Exception
         What Numba raises if it cannot take the equations.
     """
     import numba
 
     _teach_elementary()
-    compiled: Any = functools.partial(numba.njit, error_model="numpy")  # a division by zero is infinite
+    compiled: Any = functools.partial(numba.njit, error_model="python")  # which raises where Python does
     nx, nu = system.nx, system.nu
     constant = type(system).g is System.g
     namespace: dict[str, Any] = {"nan": math.nan}
     for name in ("f",) if constant else ("f", "g"):
-        namespace[name] = compiled(_equations(system, name))
-        namespace[f"{name}_self"] = _stand_in(system, name)
+        function = getattr(type(system), name)
+        namespace[name], namespace[f"{name}_self"] = compiled(function), _checked(system, name).stand_in()
     if type(system).rate is System.rate:
         exec("\n".join(_rate_lines(system)), namespace)
     else:
-        namespace["rate_of"], namespace["rate_self"] = compiled(type(system).rate), _stand_in(system, "rate")
+        namespace["rate_of"], namespace["rate_self"] = compiled(type(system).rate), _checked(system, "rate").stand_in()
         exec("def rate(x):\n    return rate_of(rate_self, x)", namespace)
     exec("\n".join(_field_lines(nx, nu, constant=constant)), namespace)
     namespace |= {name: compiled(namespace[name]) for name in ("field", "rate")}
@@ -142,36 +160,94 @@ def compiled_step(system: System) -> Step:
         return end if end[0] == end[0] else advance(system, x, u, w, dt)
 
     rng = np.random.default_rng(0)
-    n, u_max, scale = _TRIALS // 2, np.array(system.u_max), np.array(system.scale) / system.pace
-    low, high = np.array(system.bounds, dtype=float).T
-    for x in np.concatenate([system.draw_starts(rng, n), rng.uniform(low, high, (n, nx))]):
-        at = tuple(x.tolist()), (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
-        if not np.array_equal(step(*at, system.dt), advance(system, *at, system.dt), equal_nan=True):
-            raise ValueError(f"it rounds otherwise than Python at x = {list(at[0])}")
+    u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for x in _trials(system, rng):
+            u, w = (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
+            try:
+                if not system.rate(x) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
+                    continue
+                end = kernel(*x, *u, *w, system.dt)
+            except Exception:  # Python takes the step
+                continue
+            if end[0] == end[0] and tuple(end) != tuple(advance(system, x, u, w, system.dt)):
+                raise ValueError(f"it rounds otherwise than Python at x = {list(x)}")
     return step
 
 
-def _equations(system: System, name: str) -> Any:
-    """A method's function, without powers; ValueError if it holds some."""
-    function = getattr(type(system), name)
-    if any("**" in instruction.argrepr for instruction in dis.get_instructions(function)):
-        raise ValueError(f"{name} has a power; products, such as x * x for x**2, would be compiled")
-    return function
+def _trials(system: System, rng: np.random.Generator) -> list[tuple[float, ...]]:
+    """States to compare at: random ones within X and within the bounds, and where equations tend to branch."""
+    n, low, high = _TRIALS // 3, *np.array(system.bounds, dtype=float).T
+    random = [rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))]
+    special = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])
+    return [tuple(x) for x in np.concatenate([*random, special]).tolist()]
 
 
-def _stand_in(system: System, name: str) -> Any:
-    """What a method finds on self, as far as these are numbers, in a type that Numba knows."""
-    numbers = {key: value for key, value in _numbers_read(system, name).items() if hasattr(system, key)}
-    return namedtuple("numbers", numbers)(**numbers)
+class _Read:
+    """What a method reads beside its arguments: numbers, by name, and what else there is."""
+
+    def __init__(self, system: System, function: Any) -> None:
+        self.on_self, self.of_module = dict[str, float](), dict[str, float]()
+        self.others, self.attributes = dict[str, Any](), list[str]()
+        if not isinstance(function, FunctionType) or function in (System.f, System.g, System.rate):
+            return
+        value: Any
+        for instruction in dis.get_instructions(function):
+            name = instruction.argval
+            if instruction.opname == "LOAD_GLOBAL":
+                value = function.__globals__.get(name, getattr(builtins, str(name), None))
+                (self.of_module if _is_number(value) else self.others)[name] = value
+            elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+                value = inspect.getattr_static(system, name, None)
+                if _is_number(value):
+                    self.on_self[name] = value
+                else:
+                    self.attributes.append(name)
+
+    def stand_in(self) -> Any:
+        """What takes the place of self, in a type that Numba knows."""
+        return namedtuple("numbers", self.on_self)(**self.on_self)
 
 
-def _numbers_read(system: System, name: str) -> dict[str, float]:
-    """Numbers that a method may read beside its arguments, by their name: on self, or else in its module."""
-    function = getattr(type(system), name)
+def _is_number(value: Any) -> bool:
+    return type(value) in (float, int)
+
+
+def _checked(system: System, name: str) -> _Read:
+    """What a method reads; ValueError if it does what Numba might not do to the last bit, or is long.
+
+    The rate says how many substeps there are, so that its last bit does not matter.
+    """
+    function: Any = getattr(type(system), name)
     if not isinstance(function, FunctionType):
-        return {}
-    found = {key: getattr(system, key, function.__globals__.get(key)) for key in function.__code__.co_names}
-    return {key: value for key, value in found.items() if isinstance(value, float | int)}
+        raise ValueError(f"{name} is no plain method")
+    code, exact = function.__code__, name != "rate"
+    instructions = list(dis.get_instructions(function))
+    if len(instructions) > _MOST_INSTRUCTIONS:
+        raise ValueError(f"{name} is too long to compile in seconds")
+    if code.co_freevars or code.co_cellvars or any(isinstance(each, CodeType) for each in code.co_consts):
+        raise ValueError(f"{name} makes functions, or is made by one")
+    for instruction in instructions:
+        if instruction.opname == "BINARY_OP":
+            operator = instruction.argrepr.rstrip("=")
+            if operator == "**" and exact:
+                raise ValueError(f"{name} has a power; products, such as x * x for x**2, would be compiled")
+            if operator not in _OPERATORS and operator != "**":
+                raise ValueError(f"{name} has the operator {operator}")
+        elif instruction.opname == "STORE_GLOBAL":
+            raise ValueError(f"{name} writes to its module")
+    read = _Read(system, function)
+    known: list[Any] = [each for each in vars(elementary).values() if isinstance(each, FunctionType)]
+    known += [elementary, abs] if exact else [elementary, abs, max, min, math]
+    for other, value in read.others.items():
+        if not any(value is each for each in known):
+            raise ValueError(f"{name} uses {other}, which is neither a number nor of kkl_gym.elementary")
+    homes = [value for value in read.others.values() if value in (elementary, math)]
+    for attribute in read.attributes:
+        if not any(hasattr(home, attribute) for home in homes):
+            raise ValueError(f"{name} reads {attribute}, which is no plain number of the system")
+    return read
 
 
 def _field_lines(nx: int, nu: int, *, constant: bool) -> list[str]:

@@ -134,6 +134,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._noise: list[tuple[list[float], list[float]]] = []
         self._sample = self._samples = 0  # since reset, and before it
         self._advance: Callable[..., Components] = partial(advance, self.system)
+        self._steps = self.system  # the system whose step that is
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
@@ -182,7 +183,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._samples += self._sample
         self._sample = 0
         if self._samples >= SOON:
-            self._advance = single_step(self.system).advance
+            self._advance, self._steps = single_step(self.system).advance, self.system
         self._u = None
         self._trail.clear()
         self._trail.append(self._x)
@@ -223,6 +224,8 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset() before step()")
         u = self._input(action)
         w, v = self._next_noise()
+        if self._steps is not self.system:  # somebody has given it another
+            self._advance, self._steps = partial(advance, self.system), self.system
         x = self._advance(self._x, u, w, self.dt)
         escaped = not self._inside(x)
         if escaped:  # unless that is but an error of the method

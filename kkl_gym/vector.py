@@ -137,6 +137,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
         self._trails = None if render_mode is None else Trails(self.num_envs)
         self._canvas: Canvas | None = None
+        self._step: BatchStep | None = None
+        self._steps = self.system  # the system whose step that is
 
     @property
     def compiled(self) -> bool:
@@ -297,7 +299,7 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def __getstate__(self) -> dict[str, Any]:
         # What cannot be copied is made anew.
-        return {name: value for name, value in self.__dict__.items() if name != "_advance"} | {"_canvas": None}
+        return {**self.__dict__, "_step": None, "_canvas": None}
 
     @property  # type: ignore[override]
     def np_random(self) -> tuple[np.random.Generator, ...]:
@@ -342,9 +344,11 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._sample[rows] = 0
         self._terminated[rows] = self._truncated[rows] = False
 
-    @functools.cached_property
+    @property
     def _advance(self) -> BatchStep:
-        return batch_step(self.system)
+        if self._step is None or self._steps is not self.system:
+            self._step, self._steps = batch_step(self.system), self.system
+        return self._step
 
     def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Advance some rows by a sampling interval; returns their rewards."""
