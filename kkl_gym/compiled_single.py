@@ -80,16 +80,16 @@ def single_step(system: System) -> SingleStep:
         made_of = _made_of(system)
     except Exception as error:
         return SingleStep(in_python, _reason(error))
-    if made_of not in _shared:
-        while len(_shared) >= _KEPT:
-            _shared.pop(next(iter(_shared)))
+    found = _shared.get(made_of)
+    if found is None:
         try:
-            _shared[made_of] = SingleStep(compiled_step(system))
+            found = SingleStep(compiled_step(system))
         except Exception as error:  # anything may come out of Numba for a user's equations, which Python then takes
-            obstacle = _reason(error)
-            logger.info("single steps of %s stay in Python: %s", system.name, obstacle)
-            _shared[made_of] = SingleStep(in_python, obstacle)
-    found = _shared[made_of]
+            found = SingleStep(in_python, _reason(error))
+            logger.info("single steps of %s stay in Python: %s", system.name, found.obstacle)
+        while len(_shared) >= _KEPT:
+            _shared.pop(next(iter(_shared)), None)
+        _shared[made_of] = found
     return found if found.obstacle is None else SingleStep(in_python, found.obstacle)
 
 
@@ -192,22 +192,32 @@ class _Read:
         self.others, self.attributes = dict[str, Any](), list[str]()
         if not isinstance(function, FunctionType) or function in (System.f, System.g, System.rate):
             return
-        value: Any
-        for instruction in dis.get_instructions(function):
-            name = instruction.argval
-            if instruction.opname == "LOAD_GLOBAL":
-                value = function.__globals__.get(name, getattr(builtins, str(name), None))
-                (self.of_module if _is_number(value) else self.others)[name] = value
-            elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
-                value = inspect.getattr_static(system, name, None)
-                if _is_number(value):
-                    self.on_self[name] = value
-                else:
-                    self.attributes.append(name)
+        of_module, attributes = _names(function)
+        for name in of_module:
+            value: Any = function.__globals__.get(name, getattr(builtins, name, None))
+            (self.of_module if _is_number(value) else self.others)[name] = value
+        for name in attributes:
+            value = inspect.getattr_static(system, name, None)
+            if _is_number(value):
+                self.on_self[name] = value
+            else:
+                self.attributes.append(name)
 
     def stand_in(self) -> Any:
         """What takes the place of self, in a type that Numba knows."""
         return namedtuple("numbers", self.on_self)(**self.on_self)
+
+
+@functools.lru_cache(maxsize=256)
+def _names(function: FunctionType) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names that a function looks up in its module, and on objects. Kept, as every reset asks."""
+    of_module, attributes = dict[str, None](), dict[str, None]()
+    for instruction in dis.get_instructions(function):
+        if instruction.opname == "LOAD_GLOBAL":
+            of_module[instruction.argval] = None
+        elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            attributes[instruction.argval] = None
+    return tuple(of_module), tuple(attributes)
 
 
 def _is_number(value: Any) -> bool:
