@@ -8,6 +8,7 @@ import shutil
 import tomllib
 import types
 
+import numpy as np
 import pytest
 from gymnasium.utils.play import PlayableGame, play
 from pages import PAGES, ROOT, Page, name
@@ -65,6 +66,11 @@ def play_briefly(env, **options):
     env.close()
 
 
+def numbers(text):
+    """All numbers in a text."""
+    return [float(one) for one in re.findall(r"-?\d+(?:\.\d*)?(?:e[+-]?\d+)?", text)]
+
+
 def run(blocks, page):
     """Run blocks one after the other, in one namespace."""
     module = types.ModuleType("__main__")
@@ -79,9 +85,16 @@ def run(blocks, page):
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if own(page)], ids=ids)
-def test_code_runs(page, playground):
+def test_code_runs(page, playground, capsys):
     """All blocks of a page in one namespace, but for those that train, of which the names are looked up."""
     run([block for block in own(page) if not block.needs_training], page)
+    printed = numbers(capsys.readouterr().out)
+    for block in Page(page).blocks:
+        if "printed" in block.said:
+            shown = numbers(block.text)
+            starts = range(len(printed) - len(shown) + 1)
+            furthest = [np.abs(np.subtract(printed[first:][: len(shown)], shown)).max() for first in starts]
+            assert min(furthest, default=np.inf) <= float(block.said["printed"]), f"{printed} was printed"
     for block in own(page):
         if block.needs_training:
             look_up(block)

@@ -153,7 +153,7 @@ def draw_noise_levels(path: Path, *, ours: pd.DataFrame, rivals: pd.DataFrame) -
         axes = figure.subplots(1, len(SYSTEMS), sharey=True)
         for ax, name in zip(axes, SYSTEMS, strict=True):
             for observer, line, color, label in (
-                (name, "o-", ESTIMATE, "kkl-gym default"),
+                (name, "o-", ESTIMATE, "default maps"),
                 (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
                 (f"{name}-spinn", "o-", TARGET, "SPINN"),
             ):

@@ -16,7 +16,7 @@ PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 BLOCK = re.compile(r"((?:^<!--(?:(?!-->).)*-->\n+)*)^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-COMMENT = re.compile(r"<!--\s*(slow|continues|small|first)\b:?\s*(.*?)\s*-->", re.DOTALL)
+COMMENT = re.compile(r"<!--\s*(slow|continues|small|first|printed)\b:?\s*(.*?)\s*-->", re.DOTALL)
 
 
 def name(page):

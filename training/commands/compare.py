@@ -48,7 +48,7 @@ LABELS = {
     "ekf": "EKF estimate",
     "x_hat": "x̂",
     "x_hat_std": "x̂ and its standard deviations",
-    "z": "ẑ",
+    "z": "z",
     "stacked": "8 y and actions",
     "y": "y",
     "recurrent": "y, recurrent agent",

@@ -98,7 +98,7 @@ class Default(KKLMethod):
     """
 
     name: ClassVar[str] = "default"
-    label: ClassVar[str] = "kkl-gym default"
+    label: ClassVar[str] = "T_inv alone"
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
         """The package's pipeline."""
@@ -110,14 +110,14 @@ class WrongDefault(WrongParameters, Default):
     """The package's own, trained with every parameter 10 % too large."""
 
     name: ClassVar[str] = "default-wrong"
-    label: ClassVar[str] = "kkl-gym default, model 10 % off"
+    label: ClassVar[str] = "T_inv alone, model 10 % off"
 
 
 class Shipped(KKLMethod):
     """The maps that ship, whatever they cost: ``kkl-gym benchmark --methods training.methods.kkl:Shipped``."""
 
     name: ClassVar[str] = "shipped"
-    label: ClassVar[str] = "kkl-gym, as shipped"
+    label: ClassVar[str] = "default maps, as shipped"
     suffix: ClassVar[str] = ""
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -137,7 +137,7 @@ class ShippedStatic(Shipped):
     """T_inv alone, likewise: ``kkl-gym benchmark --methods training.methods.kkl:ShippedStatic``."""
 
     name: ClassVar[str] = "shipped-static"
-    label: ClassVar[str] = "kkl-gym, T_inv alone, as shipped"
+    label: ClassVar[str] = "T_inv alone, as shipped"
     suffix: ClassVar[str] = "-static"
 
 
