@@ -9,9 +9,9 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 
-from kkl_gym.compiled_single import SOON, single_step
+from kkl_gym.compiled import single_step
 from kkl_gym.equations import complex_motion, components, target_of
-from kkl_gym.plant import Plant
+from kkl_gym.plant import OfPlant, Plant
 from kkl_gym.rendering import (
     ARRAYS_AND_WINDOWS,
     TRAIL,
@@ -24,13 +24,14 @@ from kkl_gym.rendering import (
 from kkl_gym.simulate import advance, followed
 from kkl_gym.system import Box, Components, System
 from observers.checks import integer, mapping, real_array, shown
+from observers.thresholds import SOON
 
 _KEYS = (("a", "d"), ("s", "w"))  # for people who play: low and high end of the first inputs
 _INTEGER, _FLOAT32 = np.dtype(np.int64), np.dtype(np.float32)
 _ACTIONS = (_FLOAT32, np.dtype(np.float64))  # that a step takes as they are
 
 
-class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
+class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     r"""One system, seen through noise.
 
     x' = f(x) + g(x) u + w, y_k = h(x(t_k)) + v_k, simulated with the input and the process noise held over each
@@ -122,19 +123,17 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         )
         check_render_mode(render_mode, ARRAYS_AND_WINDOWS)
         self.render_mode, self.metadata = render_mode, render_metadata(self.plant.dt, ARRAYS_AND_WINDOWS)
-        self.system, self.dt, self.observe = self.plant.system, self.plant.dt, observe
-        self.process_noise, self.measurement_noise = self.plant.process_noise, self.plant.measurement_noise
+        self.observe = observe
         self.observation_space, self.action_space = self.plant.observation_space, self.plant.action_space
 
         # What every step reads, as Python numbers
-        self._nx, self._nu = self.system.nx, self.system.nu
-        self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
+        self._nu = self.system.nu
+        self._advance: Callable[..., Components]
+        self._exchanged()
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
         self._sample = self._samples = 0  # since reset, and before it
-        self._advance: Callable[..., Components] = partial(advance, self.system)
-        self._steps = self.system  # the system whose step that is
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
@@ -183,7 +182,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
         self._samples += self._sample
         self._sample = 0
         if self._samples >= SOON:
-            self._advance, self._steps = single_step(self.system).advance, self.system
+            self._advance = single_step(self.system).advance
         self._u = None
         self._trail.clear()
         self._trail.append(self._x)
@@ -224,9 +223,7 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
             raise gym.error.ResetNeeded("call reset() before step()")
         u = self._input(action)
         w, v = self._next_noise()
-        if self._steps is not self.system:  # somebody has given it another
-            self._advance, self._steps = partial(advance, self.system), self.system
-        x = self._advance(self._x, u, w, self.dt)
+        x = self._advance(self._x, u, w, self.plant.dt)
         escaped = not self._inside(x)
         if escaped:  # unless that is but an error of the method
             x = followed(self.system, self._x, u, w, dt=self.dt, end=x)
@@ -329,6 +326,10 @@ class KKLEnv(gym.Env[np.ndarray, np.ndarray]):
     def __getstate__(self) -> dict[str, Any]:
         # What cannot be copied is made anew, when it is asked for or at a reset.
         return {**self.__dict__, "_canvas": None, "_window": None, "_advance": partial(advance, self.system)}
+
+    def _exchanged(self) -> None:
+        self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
+        self._advance = partial(advance, self.system)
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:

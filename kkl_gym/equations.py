@@ -134,13 +134,22 @@ def check_equations(system: Any) -> None:
     starts = _checked_starts(system)
     for name in names:
         equations, n = getattr(system, name), len(starts)
-        alone = np.array([_values(system, name, x) for x in map(tuple, starts.tolist())], dtype=float)
+        each = [_values(system, name, x) for x in map(tuple, starts.tolist())]
+        for value in each[0]:
+            if isinstance(value, np.floating) and value.itemsize < 8:
+                found = f"{value!r}, and would make a whole motion that coarse: write constants as Python's numbers"
+                raise returned(equations, "floats of double precision", found)
+        alone = np.array(each, dtype=float)
         wrong = ~np.isfinite(alone).all(1) | ((alone < 0).any(1) if name == "rate" else False)
         if wrong.any():
             at = int(wrong.argmax())
             wanted = "finite numbers within X" + (", not below zero" if name == "rate" else "")
             raise returned(equations, wanted, f"{alone[at].tolist()}; {held(starts[at])}")
-        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, starts.T)]).reshape(-1, n).T
+        x = starts.T.copy()
+        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, x)]).reshape(-1, n).T
+        if not np.array_equal(x, starts.T):
+            found = "something, and changed the state that it was given: write a = a + b in place of a += b"
+            raise returned(equations, "what x makes of it", found)
         rounding = 1e-6 * np.abs(alone).max(initial=0.0)
         if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
             wanted = "for each state of a batch what it returns for that state alone, and always the same"

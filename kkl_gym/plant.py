@@ -12,6 +12,7 @@ from kkl_gym.system import Box, System
 from kkl_gym.systems import get_system
 from observers.checks import check_dt, choice, noise_level, noise_levels, real_array, shown
 
+_MOST_POINTS = 1000  # at which outputs are evaluated for their bounds, of each kind
 NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single draws cost more than the simulation
 
 
@@ -178,6 +179,43 @@ class Plant:
         return start
 
 
+class OfPlant:
+    """What single and vector environments say of their plant."""
+
+    plant: Plant
+
+    @property
+    def system(self) -> System:
+        """The system. Between two steps another may take its place, as ``env.system.replace(...)`` makes it."""
+        return self.plant.system
+
+    @system.setter
+    def system(self, system: System) -> None:
+        if type(system) is not type(self.plant.system):
+            raise ValueError(f"the system can be exchanged for another {self.plant.system.name!r}, got {shown(system)}")
+        self.plant.system = system
+        self._exchanged()
+
+    def _exchanged(self) -> None:
+        """Take over what follows from another system."""
+        raise NotImplementedError
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval in seconds."""
+        return self.plant.dt
+
+    @property
+    def process_noise(self) -> float:
+        """Bound of the process noise, in multiples of the system's ``scale`` per second."""
+        return self.plant.process_noise
+
+    @property
+    def measurement_noise(self) -> float | tuple[float, ...]:
+        """Standard deviation of the measurement noise, of all outputs or each."""
+        return self.plant.measurement_noise
+
+
 def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]:
     ends = real_array("start_box", system.X if box is None else box).copy()  # it is kept
     low, high = np.array(system.bounds).T
@@ -193,7 +231,8 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the output h(x) over the declared bounds of the state.
 
-    Evaluated at the corners, the faces' centres and the centre, which is exact for outputs monotone in each state.
+    Evaluated at random states, and at corners, faces' centres and the centre: all of them for up to six states, and
+    some beyond. The latter are exact for outputs that are monotone in each state.
 
     Parameters
     ----------
@@ -212,8 +251,13 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     EquationError
         If an output is no number somewhere there.
     """
-    ends = [(low, (low + high) / 2, high) for low, high in system.bounds]
-    x = np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, system.nx)
+    low, high = np.array(system.bounds, dtype=float).T
+    rng, nx = np.random.default_rng(0), system.nx
+    if 3**nx <= _MOST_POINTS:
+        marked = np.indices((3,) * nx).reshape(nx, -1).T
+    else:
+        marked = rng.integers(0, 3, (_MOST_POINTS, nx))
+    x = low + (high - low) / 2 * np.concatenate([marked, 2.0 * rng.random((_MOST_POINTS, nx))])
     with np.errstate(all="ignore"):
         y = system.output(x)
     lost = np.isnan(y).any(1)

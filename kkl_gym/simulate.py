@@ -6,13 +6,13 @@ on whole arrays for batches (:func:`advance_batch`). They agree to rounding, 1e-
 
 import functools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from kkl_gym.equations import blame
-from kkl_gym.system import Components, System
+from kkl_gym.system import Components, System, dot
 from observers.checks import check_dt
 
 # rate * substep stays below this. Chosen so that every shipped system keeps the error of 10 s below 1e-5 of the
@@ -117,19 +117,12 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
         if len(u) == 1:
             u0 = u[0]
             return system.f, [gi * u0 + wi for (gi,), wi in zip(system.G, w)]
-        return system.f, [wi + _dot(row, u) for row, wi in zip(system.G, w, strict=True)]
+        return system.f, [wi + dot(row, u) for row, wi in zip(system.G, w, strict=True)]
 
     def field(x: Components) -> list[Any]:
-        return [fi + _dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)]
+        return [fi + dot(row, u) for fi, row in zip(system.f(x), system.g(x), strict=True)]
 
     return field, w
-
-
-def _dot(row: Iterable[Any], u: Components) -> Any:
-    total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
-    for gij, uj in zip(row, u, strict=True):
-        total = total + gij * uj
-    return total
 
 
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
@@ -165,23 +158,39 @@ def advance(system: System, x: Components, u: Components, w: Components, dt: flo
         try:
             if system.discrete:
                 return [xi + wi * dt for xi, wi in zip(system.step(x, u), w, strict=True)]
-            need = system.rate(x) * dt * PER_RATE
+            need = system.rate_under(x, u) * dt * PER_RATE
             if need <= MOST_EQUAL:
                 n = 1
                 while n < need:
                     n *= 2
                 field, d = forced(system, u, w)
                 end = runge_kutta(len(x))(field, x, d, dt / n, n)
-                if system.rate(end) * dt * PER_RATE <= GROWTH * n:
+                if system.rate_under(end, u) * dt * PER_RATE <= GROWTH * n:
                     return end
         except ArithmeticError:  # Python's **, / and math functions raise where arrays get inf
-            pass
+            found = _on_arrays(system, x, u, w, dt)
+            if found is not None:
+                return found
         return followed(system, x, u, w, dt=dt, end=end)
     except SubstepsError:
         raise
     except Exception as error:
         blame(error, system, x, u)
         raise
+
+
+def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: float) -> Components | None:
+    """What a batch of this state makes of it, where :func:`kkl_gym.elementary.where` may leave out what is infinite.
+
+    None if that escapes, too, or the equations are for floats alone.
+    """
+    try:
+        twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
+        end, again = equal_substeps(system, twice[0], twice[1], twice[2], dt)
+    except Exception:
+        return None
+    found: list[float] = end[:, 0].tolist()
+    return found if np.isfinite(found).all() and not again.any() else None
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:
@@ -224,7 +233,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
                 return end
             if left <= 0.0:
                 return x
-            rate = system.rate(x)
+            rate = system.rate_under(x, u)
             if not math.isfinite(rate):
                 return end
             h = left if rate * left <= RATE_STEP else RATE_STEP / rate
@@ -314,7 +323,7 @@ def equal_substeps(
         Rows for which one length does not do: the rate grew too much, or is too high.
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        need = np.broadcast_to(system.rate(x) * dt * PER_RATE, x.shape[1:])
+        need = np.broadcast_to(system.rate_under(x, u) * dt * PER_RATE, x.shape[1:])
         if (need <= 1).all():
             substeps: Any = 1
             out = _step_batch(system, x, u, w, dt)
@@ -326,7 +335,7 @@ def equal_substeps(
             for k in range(2, substeps.max() + 1):
                 rows = np.flatnonzero(substeps >= k)
                 out[:, rows] = _step_batch(system, out[:, rows], u[:, rows], w[:, rows], h[rows])
-        end = np.broadcast_to(system.rate(out) * dt * PER_RATE, x.shape[1:])
+        end = np.broadcast_to(system.rate_under(out, u) * dt * PER_RATE, x.shape[1:])
         out[:, ~(need <= MOST_EQUAL)] = np.nan
         return out, ~((end <= GROWTH * substeps) & (need <= MOST_EQUAL))
 
@@ -490,7 +499,7 @@ def check_interval(system: System, dt: float) -> None:
         If the system is in discrete time and has another one; SubstepsError, if it is too long at the middle of X.
     """
     if not system.discrete:
-        rate = float(system.rate(tuple(np.mean(system.X, axis=1).tolist())))
+        rate = float(system.rate_under(tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:
             raise SubstepsError(
                 f"{system.name} changes at a rate of {rate:.4g}/s in the middle of X, for which dt = {dt:g} s would "

@@ -8,7 +8,7 @@ import functools
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
@@ -96,8 +96,9 @@ class System:
         complete(cls, System)
 
     def __post_init__(self) -> None:
+        own = vars(type(self)).get("__dataclass_fields__", {})
         for name, kind in inspect.get_annotations(type(self)).items():
-            if name not in self.parameters and "ClassVar" not in str(kind):
+            if name not in own and "ClassVar" not in str(kind):
                 raise TypeError(f"{type(self).__name__} has a parameter {name}, but lacks @dataclass(frozen=True)")
         for name, value in self.parameters.items():
             if not is_finite(value):
@@ -180,7 +181,7 @@ class System:
 
     @property
     def typical_rate(self) -> float:
-        """Median of :meth:`rate` over a thousand starts, in 1/s; ValueError if that is zero or not finite."""
+        """Median of :meth:`rate_under` over a thousand starts and the largest input, in 1/s; ValueError if it is 0."""
         return _typical_rate(self)
 
     def f(self, x: Components) -> Components:
@@ -334,13 +335,26 @@ class System:
         float, or of the kind that the components of ``x`` are
             The rate in 1/s.
         """
-        steps = [5e-7 * (high - low) for low, high in self.X]
-        fx = self.f(x)
-        total = 0.0
-        for j, step in enumerate(steps):
-            moved = self.f([*x[:j], x[j] + step, *x[j + 1 :]])
-            total = total + sum(((b - a) / unit) ** 2 for a, b, unit in zip(fx, moved, steps, strict=True))
-        return total**0.5
+        return slope(self.f, x, self.X)
+
+    def rate_under(self, x: Components, u: Components) -> Any:
+        """How fast f(x) + g(x) u changes under a held input, in 1/s: where g is constant, :meth:`rate`.
+
+        Parameters
+        ----------
+        x : sequence of length nx
+            Components of the state.
+        u : sequence of length nu
+            Input.
+
+        Returns
+        -------
+        float, or of the kind that the components of ``x`` are
+            The rate in 1/s; the sum of both parts' where g depends on the state.
+        """
+        if type(self).g is System.g:
+            return self.rate(x)
+        return self.rate(x) + slope(lambda x: [dot(row, u) for row in self.g(x)], x, self.X)
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
@@ -422,6 +436,53 @@ def _starts(system: System) -> np.ndarray:
     return system.draw_starts(np.random.default_rng(0), 1000)
 
 
+def dot(row: Iterable[Any], u: Components) -> Any:
+    """A row of the input matrix times u.
+
+    Parameters
+    ----------
+    row : iterable of length nu
+        Of g(x).
+    u : sequence of length nu
+        Input.
+
+    Returns
+    -------
+    float, or of the kind that the components are
+        Their product, added up from the left.
+    """
+    total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
+    for gij, uj in zip(row, u, strict=True):
+        total = total + gij * uj
+    return total
+
+
+def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
+    """A norm of a vector field's derivative, differentiated numerically, with each state in units of X's half-width.
+
+    Parameters
+    ----------
+    field : callable
+        From nx components of the state to as many.
+    x : sequence of length nx
+        Components of the state.
+    X : tuple of (float, float), length nx
+        The box.
+
+    Returns
+    -------
+    float, or of the kind that the components of ``x`` are
+        The norm.
+    """
+    steps = [5e-7 * (high - low) for low, high in X]
+    fx = field(x)
+    total = 0.0
+    for j, step in enumerate(steps):
+        moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
+        total = total + sum(((b - a) / unit) ** 2 for a, b, unit in zip(fx, moved, steps, strict=True))
+    return total**0.5
+
+
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes.
 
@@ -430,7 +491,7 @@ def typical_rate(system: System, starts: np.ndarray) -> float:
     system : System
         The system.
     starts : ndarray, shape (n, nx)
-        States at which ``system.rate`` is asked.
+        States at which ``system.rate_under`` is asked, with the largest input.
 
     Returns
     -------
@@ -442,7 +503,8 @@ def typical_rate(system: System, starts: np.ndarray) -> float:
     ValueError
         If the rate is zero or not finite.
     """
-    rate = float(np.median(np.broadcast_to(rate_at(system, starts.T), len(starts))))
+    rate_at(system, starts.T)  # or say what is wrong with it
+    rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))
     if not 0 < rate < math.inf:
         raise ValueError(f"{system.name}.rate(x) is {rate} in X: override it to say how fast f changes")
     return rate

@@ -238,7 +238,8 @@ def get_system(system: "str | System | type[System]", parameters: Mapping[str, f
         except TypeError as error:  # not decorated as a dataclass
             raise ValueError(str(error)) from error
     if not isinstance(system, System) or type(system) is System:
-        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}")
+        hint = "; in a spec's JSON write it as 'script.py:Class'" if isinstance(system, Mapping) else ""
+        raise ValueError(f"the system must be the name of one or a kkl_gym.System, got {shown(system)}{hint}")
     found = system.replace(mapping("parameters", parameters))
     if type(found) not in SYSTEMS.values():
         check_equations(found)

@@ -10,9 +10,9 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from kkl_gym.compiled import BatchStep, batch_step
+from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.equations import components, target_of
-from kkl_gym.plant import NOISE_BLOCK, Plant
+from kkl_gym.plant import NOISE_BLOCK, OfPlant, Plant
 from kkl_gym.rendering import ARRAYS, Canvas, Trails, check_render_mode, render_metadata
 from kkl_gym.rows import held, judged
 from kkl_gym.simulate import followed_rows
@@ -24,7 +24,7 @@ ROWS_AT_ONCE = 64  # whose noise is drawn and then transposed, small enough for 
 MOST_ENVS = 1_000_000  # of which 256 samples of noise are kept, some 10 kB each
 
 
-class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """``num_envs`` copies of :class:`KKLEnv` with equal parameters, simulated as one batch.
 
     Row i behaves as a :class:`KKLEnv` under a time limit and with the same seed would: the same starts and noise, and
@@ -57,7 +57,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     render_mode : {None, "rgb_array"}
         Whether :meth:`render` draws.
     max_episode_steps : int, optional
-        Steps after which an episode is truncated; ``gym.make_vec`` passes what is registered.
+        Steps after which an episode is truncated; None or -1 is never. ``gym.make_vec`` passes what is registered where
+        it is left out there.
     autoreset_mode : str or gymnasium.vector.AutoresetMode
         One of Gymnasium's, see above.
 
@@ -96,6 +97,8 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
     ) -> None:
         num_envs = integer("num_envs", num_envs, 1, MOST_ENVS)
+        if max_episode_steps == -1:  # as gym.make has it
+            max_episode_steps = None
         if max_episode_steps is not None:
             max_episode_steps = integer("max_episode_steps", max_episode_steps, 1)
         self.plant = Plant(
@@ -118,11 +121,9 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
 
-        self.system, self.dt = self.plant.system, self.plant.dt
         nx, ny = self.system.nx, self.system.ny
-        low, high = np.array(self.system.bounds, dtype=float).T.copy()
-        self._u_max, target = (np.array(each, dtype=float) for each in (self.system.u_max, target_of(self.system)))
-        self._judged = functools.partial(judged, bounds=(low, high), target=target, weights=self.plant.weights)
+        self._u_max = np.array(self.system.u_max, dtype=float)
+        self._exchanged()
         self._rngs: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         # A block of noise for each row, not yet scaled, and where in its block the row is; at first, past the end.
@@ -137,8 +138,6 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._u = np.zeros((self.system.nu, num_envs))  # kept, as the trails are, for rendering
         self._trails = None if render_mode is None else Trails(self.num_envs)
         self._canvas: Canvas | None = None
-        self._step: BatchStep | None = None
-        self._steps = self.system  # the system whose step that is
 
     @property
     def compiled(self) -> bool:
@@ -344,10 +343,16 @@ class KKLVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._sample[rows] = 0
         self._terminated[rows] = self._truncated[rows] = False
 
+    def _exchanged(self) -> None:
+        low, high = np.array(self.system.bounds, dtype=float).T.copy()
+        target = np.array(target_of(self.system), dtype=float)
+        self._judged = functools.partial(judged, bounds=(low, high), target=target, weights=self.plant.weights)
+        self._step: SamplingStep[np.ndarray] | None = None
+
     @property
-    def _advance(self) -> BatchStep:
-        if self._step is None or self._steps is not self.system:
-            self._step, self._steps = batch_step(self.system), self.system
+    def _advance(self) -> SamplingStep[np.ndarray]:
+        if self._step is None:
+            self._step = batch_step(self.system)
         return self._step
 
     def _move(self, rows: np.ndarray, u: np.ndarray) -> np.ndarray:

@@ -29,6 +29,8 @@ class CompiledCovariance:
         Added to the logarithms of the standard deviations at each of them, and interpolated between.
     largest_log : float
         To which those logarithms are cut before.
+    largest : ndarray, shape (nx,)
+        To which variances are cut.
 
     Raises
     ------
@@ -49,6 +51,7 @@ class CompiledCovariance:
         ages: Sequence[float],
         log_factors: Sequence[float],
         largest_log: float,
+        largest: np.ndarray,
     ) -> None:
         first = first_layer(layers[0], whiten=whiten, offset=offset, conditions=conditions, age=age)
         second = np.ascontiguousarray(np.vstack(layers[1]).T, dtype=float)  # a row for each output, the bias last
@@ -56,7 +59,7 @@ class CompiledCovariance:
         self._shape = (nx, nx)
         self._first, self._activation, self._age = first, activation, age or (1.0, 0.0)
         unit, end = (float(each) for each in self._age)
-        self._one = functools.partial(_covary(activation), first, second, table, unit, end, largest_log)
+        self._one = functools.partial(_covary(activation), first, second, table, unit, end, largest_log, largest)
 
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
         """Evaluate for one sample.
@@ -131,6 +134,7 @@ def _covary(activation: str) -> Callable[..., None]:
         age_unit: float,
         age_max: float,
         largest_log: float,
+        largest: np.ndarray,
         z: np.ndarray,
         age: float,
         out: np.ndarray,
@@ -144,10 +148,15 @@ def _covary(activation: str) -> Callable[..., None]:
         entry = nx
         for i in range(nx):  # D L
             scale = math.exp(min(output(second[i], h), largest_log) + factor)
+            out[i, i], variance = scale, scale * scale
             for j in range(i):
                 out[i, j] = scale * output(second[entry], h)
+                variance += out[i, j] * out[i, j]
                 entry += 1
-            out[i, i] = scale
+            if variance > largest[i]:
+                share = math.sqrt(largest[i] / variance)
+                for j in range(i + 1):
+                    out[i, j] *= share
         for i in range(nx - 1, -1, -1):  # its square takes its place: from the end on, nothing is needed that is gone
             for j in range(i, -1, -1):
                 total = 0.0

@@ -10,8 +10,8 @@ from observers.compiled import CompiledDecoder
 from observers.compiled_covariance import CompiledCovariance
 from observers.inverse import InverseMap
 from observers.network import ACTIVATIONS
-from observers.sparse import MANY_ROWS
 from observers.spread import Covariance
+from observers.thresholds import MANY_ROWS
 
 # Which decoder is asked, in which rows (None for all), the filter's state and its age in seconds there, and where that
 # was computed what the networks are given, and the covariance.

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from observers.checks import check_dt, integer, real_array
-from observers.sparse import MANY_ROWS, SparseUpdate
+from observers.sparse import SparseUpdate
+from observers.thresholds import MANY_ROWS
 
 MOST_INPUTS = 64  # that a filter takes; every one of them adds nz values to its state
 MOST_VALUES = 1024  # of its state, and of the output; beyond them memory and the decomposition of A would be felt

@@ -9,7 +9,7 @@ import numpy as np
 
 from observers.checks import choice, real_array, shown
 from observers.compiled import CompiledNetwork
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 
 
 def _tanh(h: np.ndarray) -> np.ndarray:

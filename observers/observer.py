@@ -17,9 +17,9 @@ from observers.monitor import Monitor
 from observers.names import resolve
 from observers.replacement import check_replacement
 from observers.spread import deviations
+from observers.thresholds import SOON
 from observers.tracker import Tracker
 
-SOON = 1000  # single samples after which a simulation will go on for long enough to wait seconds for the compiler
 _CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 

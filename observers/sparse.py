@@ -11,8 +11,6 @@ from functools import cache, partial
 
 import numpy as np
 
-MANY_ROWS = 128  # fewer gain too little to wait seconds for the compiler
-
 
 class SparseUpdate:
     """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal.

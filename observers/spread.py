@@ -13,15 +13,17 @@ from observers.factors import Factors
 from observers.network import MLP
 
 LARGEST_LOG = 100.0  # of a standard deviation: whatever a network says far from its training, its square stays finite
+LARGEST = 4.0  # of a standard deviation, in multiples of its state's: an estimate is hardly worse than none
 
 
 @dataclass(frozen=True)
 class Spread:
     """The covariance of x - x_hat, as far as what T_inv is told says it.
 
-    It is factor * D L L^T D. The network has the inputs of T_inv's own. Its first nx outputs are the logarithms of D,
-    which is diagonal, the others the entries of L below its diagonal of ones, row by row. All are in scaled units,
-    those of :attr:`observers.InverseMap.x_scale`. The factors are those of :class:`observers.factors.Factors`.
+    It is factor * D L L^T D, with standard deviations cut to ``LARGEST`` times their state's. The network has the
+    inputs of T_inv's own. Its first nx outputs are the logarithms of D, which is diagonal, the others the entries of L
+    below its diagonal of ones, row by row. All are in scaled units, those of :attr:`observers.InverseMap.x_scale`. The
+    factors are those of :class:`observers.factors.Factors`.
 
     Parameters
     ----------
@@ -53,13 +55,17 @@ class Spread:
         """Number of states."""
         return (math.isqrt(8 * self.mlp.outputs + 1) - 1) // 2
 
+    def largest_variances(self, scale: np.ndarray) -> np.ndarray:
+        """What variances are cut to, (nx,), in units of states of a scale."""
+        return np.square(LARGEST * _positive(scale[: self.nx]))
+
     def in_units(self, scale: np.ndarray) -> MLP:
         """The network with the scale of the states in its last biases: the logarithms are of D in their units.
 
         Behind the states there may be parameters, of whose errors nothing is said.
         """
         *biases, bias = (np.array(each, dtype=float) for each in self.mlp.biases)
-        bias[: self.nx] += np.log(np.maximum(np.abs(scale[: self.nx]), np.finfo(float).tiny))
+        bias[: self.nx] += np.log(_positive(scale[: self.nx]))
         return MLP(self.mlp.weights, [*biases, bias], self.mlp.activation)
 
 
@@ -78,6 +84,7 @@ class Covariance:
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
         self._nx, self._mlp = spread.nx, spread.in_units(scale)
+        self._largest = spread.largest_variances(scale)
         self._ages = spread.ages.tolist()
         self._log_factors = Factors(spread.levels, spread.ages, spread.factors).log_roots(*levels).tolist()
 
@@ -98,7 +105,8 @@ class Covariance:
         """
         nx, out = self._nx, self._mlp(inputs)
         if out.ndim == 1:  # a single sample: every call would be felt
-            return np.array(_entries(out.tolist(), nx, self._log_factor(float(age)))).reshape(nx, nx)
+            entries = _entries(out.tolist(), nx, self._log_factor(float(age)))
+            return np.array(_cut(entries, self._largest.tolist())).reshape(nx, nx)
         values = np.moveaxis(out, -1, 0).astype(float, order="C")
         np.minimum(values[:nx], LARGEST_LOG, out=values[:nx])
         values[:nx] += np.interp(age, self._ages, self._log_factors)
@@ -106,7 +114,11 @@ class Covariance:
         covariance = np.empty((*out.shape[:-1], nx * nx))
         for i, entry in enumerate(_product(values[:nx], values[nx:])):
             covariance[..., i] = entry
-        return covariance.reshape(*out.shape[:-1], nx, nx)
+        variances = covariance[..., :: nx + 1]
+        too_large = variances > self._largest
+        shares = np.sqrt(self._largest / np.where(too_large, variances, self._largest)) if too_large.any() else None
+        covariance = covariance.reshape(*out.shape[:-1], nx, nx)
+        return covariance if shares is None else covariance * (shares[..., None] * shares[..., None, :])
 
     def compiled(self, **inputs: Any) -> CompiledCovariance | None:
         """The same for single samples as machine code; None without Numba, or for a network of other than two layers.
@@ -125,6 +137,7 @@ class Covariance:
                 ages=self._ages,
                 log_factors=self._log_factors,
                 largest_log=LARGEST_LOG,
+                largest=self._largest,
                 **inputs,
             )
         except ImportError:
@@ -165,6 +178,20 @@ def _entries(values: list[float], nx: int, factor: float) -> list[float]:
     return _product([exp(min(value, end) + factor) for value in values[:nx]], values[nx:])
 
 
+def _cut(entries: list[float], largest: list[float]) -> list[float]:
+    """A covariance, row by row, with variances that are no larger than these, and the same correlations."""
+    nx = len(largest)
+    variances = entries[:: nx + 1]
+    if not any(variance > end for variance, end in zip(variances, largest, strict=True)):
+        return entries
+    shares = [math.sqrt(end / max(variance, end)) for variance, end in zip(variances, largest, strict=True)]
+    return [entry * (shares[i // nx] * shares[i % nx]) for i, entry in enumerate(entries)]
+
+
+def _positive(scale: np.ndarray) -> np.ndarray:
+    return np.maximum(np.abs(scale), np.finfo(float).tiny)
+
+
 def _product(scales: Any, lower: Any) -> list[Any]:
     """D L L^T D row by row, from D and what L has below its diagonal: of numbers, or of arrays that hold a batch."""
     nx, k = len(scales), 0
@@ -190,4 +217,4 @@ def deviations(covariance: np.ndarray) -> np.ndarray:
     return np.sqrt(covariance.diagonal(0, -2, -1))
 
 
-__all__ = ["LARGEST_LOG", "Covariance", "Spread", "deviations"]
+__all__ = ["LARGEST", "LARGEST_LOG", "Covariance", "Spread", "deviations"]

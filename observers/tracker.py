@@ -12,7 +12,7 @@ from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
 from observers.factors import Factors
 from observers.flow import Flow
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
 # A filter is lost where innovations are as large as that by chance: the normal distribution's quantile for 1e-5. Their

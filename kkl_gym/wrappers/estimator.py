@@ -100,27 +100,32 @@ class Estimator(Protocol):
 
 
 class KKLEstimator:
-    """A learned observer for a plant, one sample or a batch at a time, and the space of what it shows.
+    """A learned observer, one sample or a batch at a time, and the space of what it shows.
 
     Parameters
     ----------
-    plant : Plant
-        What is observed.
-    observer : str or path or Artifact or None
-        A shipped name, a path if it ends in ``.safetensors``, or what is behind one; None takes the map shipped for the
-        plant's system.
+    artifact : Artifact
+        The observer.
+    space : gymnasium.spaces.Box
+        Of what is shown of a row.
     estimate : {"x", "z"}
         Whether the state estimate is shown, or the filter's state.
     measurement_noise : float, sequence of float or None
-        The noise level that the observer assumes, of all outputs or each; None takes the plant's.
+        The noise level that the observer assumes, of all outputs or each; None takes the artifact's.
+    process_noise : float, optional
+        Likewise of the motion.
+    blind : bool
+        Whether inputs act that the map does not know of.
     ignore_input : bool
-        Whether to use a map that knows no inputs although the agent acts.
+        Whether it is used even so.
     monitor : bool
         Whether to keep the score.
     known_start : bool
         Whether the observer is told the true state at the start of an episode, and only there.
     uncertainty : bool
         Whether standard deviations are shown behind the state estimate.
+    compiled : bool, optional
+        As for :class:`observers.KKLObserver`.
 
     Attributes
     ----------
@@ -129,20 +134,46 @@ class KKLEstimator:
     estimate : str
         As given.
     space : gymnasium.spaces.Box
-        Of the estimate shown.
+        As given.
 
     Raises
     ------
     ValueError
-        If ``estimate`` is unknown, a flag is no bool, no map ships for the system, the noise level is beyond the
-        map's range, or ``uncertainty`` is asked for beside z.
+        If ``estimate`` is unknown, a flag is no bool, the noise level is beyond the map's range, or ``uncertainty`` is
+        asked for beside z.
     observers.ArtifactError
-        If the file is missing or damaged, was made for another system, other parameters or another dt, or holds no
-        forward map or flow and ``known_start`` is asked for, or no error bars and ``uncertainty``.
+        If the artifact holds no forward map or flow and ``known_start`` is asked for, or no error bars and
+        ``uncertainty``.
     """
 
     def __init__(
         self,
+        artifact: Artifact,
+        space: gym.spaces.Box,
+        *,
+        estimate: str,
+        measurement_noise: float | Sequence[float] | None,
+        process_noise: float | None = None,
+        blind: bool = False,
+        ignore_input: bool = False,
+        monitor: bool,
+        known_start: bool,
+        uncertainty: bool,
+        compiled: bool | None = None,
+    ) -> None:
+        choice("estimate", estimate, ("x", "z"))
+        self._uncertainty = flag("uncertainty", uncertainty)
+        self._ignore_input = flag("ignore_input", ignore_input)
+        self._known_start = flag("known_start", known_start)
+        self._monitor = flag("monitor", monitor)
+        self.estimate, self.space, self._blind = estimate, space, blind
+        self.observer = KKLObserver(
+            self._asked(artifact), measurement_noise, process_noise=process_noise, monitor=monitor, compiled=compiled
+        )
+
+    @classmethod
+    def of_plant(
+        cls,
         plant: Plant,
         observer: str | os.PathLike[str] | Artifact | None,
         *,
@@ -152,36 +183,55 @@ class KKLEstimator:
         monitor: bool,
         known_start: bool,
         uncertainty: bool,
-    ) -> None:
-        choice("estimate", estimate, ("x", "z"))
-        self._uncertainty = flag("uncertainty", uncertainty)
-        self._ignore_input = flag("ignore_input", ignore_input)
-        self._known_start = flag("known_start", known_start)
-        self._monitor = flag("monitor", monitor)
+        compiled: bool | None = None,
+    ) -> "KKLEstimator":
+        """An observer that was learned for a plant, at the plant's levels of noise.
+
+        Parameters
+        ----------
+        plant : Plant
+            What is observed.
+        observer : str or path or Artifact or None
+            A shipped name, a path if it ends in ``.safetensors``, or what is behind one; None takes the map shipped for
+            the plant's system.
+        estimate, measurement_noise, ignore_input, monitor, known_start, uncertainty, compiled
+            As for the class; without a level of measurement noise the plant's.
+
+        Returns
+        -------
+        KKLEstimator
+            The observer.
+
+        Raises
+        ------
+        ValueError
+            As the class, and if no map ships for the system.
+        observers.ArtifactError
+            As the class, and if the file is missing or damaged, or was made for another system, other parameters or
+            another dt.
+        """
         system = plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))
         artifact.check(system.name, system.parameters, dt=plant.dt, ny=system.ny, nu=system.nu)  # before noise
-        if known_start:
-            artifact.require_known_start()  # an error now, not at the first reset
-        self._require_error_bars(artifact, estimate)
-        self.estimate = estimate
-        artifact = self._asked(artifact)
-        noise = plant.measurement_noise if measurement_noise is None else measurement_noise
-        self.observer = KKLObserver(artifact, noise, process_noise=plant.process_noise, monitor=monitor)
-        self._blind = self.observer.artifact.nu == 0 and system.nu > 0
-        self.space = plant.state_space if estimate == "x" else _filter_space(plant, self.observer)
+        space = _filter_space(plant, artifact.filter) if estimate == "z" else plant.state_space
         if uncertainty:
-            low, high = with_deviations(plant.state_space.low, plant.state_space.high)
-            self.space = gym.spaces.Box(low, high, dtype=np.float32)
-
-    def _require_error_bars(self, artifact: Artifact, estimate: str) -> None:
-        """Raise ValueError if standard deviations are to be shown, and cannot."""
-        if self._uncertainty and estimate != "x":
-            raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {estimate!r}")
-        if self._uncertainty:
-            artifact.require_spread()
+            low, high = with_deviations(space.low, space.high)
+            space = gym.spaces.Box(low, high, dtype=np.float32)
+        return cls(
+            artifact,
+            space,
+            estimate=estimate,
+            measurement_noise=plant.measurement_noise if measurement_noise is None else measurement_noise,
+            process_noise=plant.process_noise,
+            blind=artifact.nu == 0 < system.nu,
+            ignore_input=ignore_input,
+            monitor=monitor,
+            known_start=known_start,
+            uncertainty=uncertainty,
+            compiled=compiled,
+        )
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
         """Take other maps for the same filter, which goes on.
@@ -200,13 +250,16 @@ class KKLEstimator:
             they are shown.
         """
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
-        if self._known_start:
-            artifact.require_known_start()
-        self._require_error_bars(artifact, self.estimate)
         self.observer.replace(self._asked(artifact))
 
     def _asked(self, artifact: Artifact) -> Artifact:
-        """The artifact without a flow where only z is shown: nobody asks for the estimate that it would carry on."""
+        """The artifact if it has what is asked for, without its flow where nobody asks for what that estimates."""
+        if self._known_start:
+            artifact.require_known_start()  # an error now, not at the first reset
+        if self._uncertainty and self.estimate != "x":
+            raise ValueError(f"uncertainty=True is about x_hat: it needs estimate='x', got {self.estimate!r}")
+        if self._uncertainty:
+            artifact.require_spread()
         if self.estimate == "x" or self._monitor or self._known_start:
             return artifact
         return dataclasses.replace(artifact, flow=None)
@@ -381,12 +434,11 @@ def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.n
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
 
 
-def _filter_space(plant: Plant, observer: KKLObserver) -> gym.spaces.Box:
+def _filter_space(plant: Plant, linear: LinearFilter) -> gym.spaces.Box:
     """Bounds of the filter's state under outputs within the output space and inputs within their bounds.
 
     A known start may lie outside for a while, where the motion that led to it did; what is shown is then clipped.
     """
-    linear = observer.artifact.filter
     y_max = np.maximum(np.abs(plant.output_space.low), np.abs(plant.output_space.high)).astype(float)
     bound = reach(linear, y_max, np.array(plant.system.u_max[: linear.nu])).astype(np.float32)
     return gym.spaces.Box(-bound, bound, dtype=np.float32)

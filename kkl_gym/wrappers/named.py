@@ -10,8 +10,7 @@ from kkl_gym.identity import check_identity, source_of
 from kkl_gym.named import InputReader, Reader, observed, resolved
 from kkl_gym.signals import Inputs
 from kkl_gym.wrappers.estimator import KKLEstimator, reach, with_deviations
-from observers import Artifact, ArtifactError, KKLObserver
-from observers.checks import choice, flag
+from observers import Artifact, ArtifactError
 
 
 class NamedEstimator(KKLEstimator):
@@ -35,6 +34,8 @@ class NamedEstimator(KKLEstimator):
         Whether an observer that tracks is told the hidden signals at the reset, which have to be shown there.
     uncertainty : bool
         Whether standard deviations are shown behind the estimates.
+    compiled : bool, optional
+        As for :class:`observers.KKLObserver`.
 
     Attributes
     ----------
@@ -61,37 +62,36 @@ class NamedEstimator(KKLEstimator):
         monitor: bool,
         known_start: bool,
         uncertainty: bool,
+        compiled: bool | None = None,
     ) -> None:
-        choice("estimate", estimate, ("x", "z"))
-        self._monitor, self._known_start, self._blind = (
-            flag("monitor", monitor),
-            flag("known_start", known_start),
-            False,
-        )
-        self._uncertainty = flag("uncertainty", uncertainty)
         check_identity(artifact, env)
-        self._require_error_bars(artifact, estimate)
-        if known_start:
-            artifact.require_known_start()
-        self.observer = KKLObserver(artifact, measurement_noise, monitor=monitor)
-        self.estimate = estimate
         try:
             _check_actions(env, action_space)
             self.samples = Samples(artifact, observation_space, action_space, source=source_of(env))
         except ValueError as error:
             raise ArtifactError(f"the observer {artifact.system!r} does not fit: {error}") from error
         measured, inputs = self.samples.outputs, self.samples.inputs
-        if estimate == "x":
-            low, high = _bounds(artifact, observation_space)
-            if uncertainty:
-                low, high = with_deviations(low, high)
-        else:
+        if estimate == "z":
             with np.errstate(over="ignore"):
                 high = reach(artifact.filter, np.maximum(abs(measured.low), abs(measured.high)), inputs.largest)
             low = -high
+        else:
+            low, high = _bounds(artifact, observation_space)
+            if uncertainty:
+                low, high = with_deviations(low, high)
         low, high = np.concatenate([measured.low, low]), np.concatenate([measured.high, high])
         with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
-            self.space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+            space = gym.spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+        super().__init__(
+            artifact,
+            space,
+            estimate=estimate,
+            measurement_noise=measurement_noise,
+            monitor=monitor,
+            known_start=known_start,
+            uncertainty=uncertainty,
+            compiled=compiled,
+        )
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples; see :class:`KKLEstimator`."""

@@ -88,6 +88,10 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         Whether the observation is [x_hat, std], with the standard deviation of each state's error behind the estimate.
         ``info`` gains ``x_cov``, the covariance of x - x_hat, shape (nx, nx). It needs a map with error bars, which
         ``kkl-gym errorbars`` makes.
+    compiled : bool, optional
+        Whether Numba runs the observer's steps, as :class:`observers.KKLObserver` has it. None compiles them at a reset
+        after a thousand samples; from there on estimates are rounded in another way. True or False make what is seen
+        the same in every episode of the same seed.
 
     Attributes
     ----------
@@ -132,6 +136,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
         monitor: bool = False,
         known_start: bool = False,
         uncertainty: bool = False,
+        compiled: bool | None = None,
     ) -> None:
         if not isinstance(env, gym.Env):
             raise ValueError(
@@ -151,10 +156,11 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 monitor=monitor,
                 known_start=known_start,
                 uncertainty=uncertainty,
+                compiled=compiled,
             )
             samples = estimator.samples
         elif isinstance(base, KKLEnv):
-            estimator = KKLEstimator(
+            estimator = KKLEstimator.of_plant(
                 base.plant,
                 artifact,
                 estimate=estimate,
@@ -163,6 +169,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
                 monitor=monitor,
                 known_start=known_start,
                 uncertainty=uncertainty,
+                compiled=compiled,
             )
             samples = _SystemSamples()
         else:
@@ -180,6 +187,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             monitor=bool(monitor),
             known_start=bool(known_start),
             uncertainty=bool(uncertainty),
+            compiled=compiled,
         )
         gym.Wrapper.__init__(self, env)
         self._estimator, self._samples = estimator, samples
@@ -365,13 +373,6 @@ class ActionRepeat(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], 
             if terminated or truncated:
                 break
         return obs, total, terminated, truncated, info
-
-
-def _plain(level: Any) -> Any:
-    """A level of noise, or one for each output, without NumPy's types and in a tuple; the rest is left to others."""
-    if isinstance(level, np.ndarray | np.floating):
-        level = level.tolist()
-    return tuple(map(_plain, level)) if isinstance(level, list | tuple) else level
 
 
 __all__ = ["ActionRepeat", "KKLObservation"]

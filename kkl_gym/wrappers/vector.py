@@ -362,7 +362,7 @@ class KKLVectorObservation(VectorEstimate):
             )
             env = _Telling(env, estimator.samples)
         else:
-            estimator = KKLEstimator(
+            estimator = KKLEstimator.of_plant(
                 plant_of(env),
                 artifact,
                 estimate=estimate,

@@ -114,7 +114,7 @@ def test_other_environments_are_refused(saved):
     with pytest.raises(ValueError, match=r"needs a gymnasium\.Env"):
         KKLObservation("CartPole-v1")
     with pytest.raises(ArtifactError, match="holds no flow; kkl-gym tracking"):
-        KKLObservation(gym.make("Pendulum-v1"), path, known_start=True)
+        KKLObservation(gym.make("Pendulum-v1"), saved(PENDULUM()), known_start=True)
 
 
 def test_arguments_that_no_file_can_hold(saved):

@@ -10,7 +10,8 @@ from kinked_systems import SYSTEMS as KINKED
 
 import kkl_gym
 from kkl_gym import SYSTEMS, EquationError, System, get_system
-from kkl_gym.compiled import batch_step, compiled_step
+from kkl_gym.compiled import batch_step
+from kkl_gym.compiled.batch import compiled_step
 from kkl_gym.elementary import cos, sin, tanh
 from kkl_gym.simulate import advance, advance_batch
 

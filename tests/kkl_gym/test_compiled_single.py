@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from kinked_systems import SYSTEMS as KINKED
 
-import kkl_gym.compiled_single
-from kkl_gym import SYSTEMS, KKLEnv, System, get_system
-from kkl_gym.compiled_single import SOON, single_step
+import kkl_gym.compiled.step
+from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, System, get_system
+from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.elementary import clip, cos, exp, log, maximum, minimum, sign, sin, sqrt, tan, tanh, where
-from kkl_gym.simulate import advance
+from kkl_gym.simulate import advance, advance_batch
+from observers.thresholds import SOON
 
 GRAVITY = 9.81
 
@@ -141,6 +142,17 @@ class Calls(Elementary):
 TUPLE, MODULE = (1.0, 2.0), np
 
 
+class CallsOthers(Elementary):
+    name = "calls_others"
+
+    def f(self, x):
+        return falling(x[0]), -x[1], -x[2]
+
+
+def falling(x):
+    return -TUPLE[0] * x
+
+
 class Tuples(Elementary):
     name = "tuples"
 
@@ -188,11 +200,44 @@ def test_what_cannot_be_compiled_stays_in_python_and_the_log_says_why(kind, why,
     assert record.getMessage().startswith(f"single steps of {kind.name} stay in Python: ")
 
 
+@pytest.mark.parametrize("step_of", [single_step, batch_step])
+@pytest.mark.parametrize(
+    ("where", "name", "value"),
+    [
+        (Pendulum, "length", 3),
+        (Pendulum, "X", ((-1.0, 1.0), (-0.5, 0.5))),
+        (sys.modules[__name__], "GRAVITY", 3.7),
+    ],
+)
+def test_what_the_equations_read_is_looked_up_anew(step_of, where, name, value, monkeypatch):
+    before = step_of(Pendulum())
+    assert before.obstacle is None
+    assert step_of(Pendulum()) is before
+    monkeypatch.setattr(where, name, value)
+    after = step_of(Pendulum())
+    assert after is not before
+    x, u, w = ([[0.3], [0.4]], [[0.5], [0.2]], [[0.0], [0.0]])
+    if step_of is batch_step:
+        found = after(*(np.array(values) for values in (x, u, w)), 0.01)
+        np.testing.assert_allclose(found, advance_batch(Pendulum(), *map(np.array, (x, u, w)), 0.01), rtol=1e-12)
+    else:
+        single = [tuple(value for (value,) in values) for values in (x, u, w)]
+        assert tuple(after(*single, 0.01)) == tuple(advance(Pendulum(), *single, 0.01))
+
+
+def test_a_function_that_equations_call_is_looked_up_anew(monkeypatch):
+    system = CallsOthers()
+    assert batch_step(system).obstacle is None
+    monkeypatch.setattr(sys.modules[__name__], "TUPLE", (4.0, 0.5))
+    x, u, w = np.array([[0.3], [0.6], [0.1]]), np.zeros((0, 1)), np.zeros((3, 1))
+    np.testing.assert_allclose(batch_step(system)(x, u, w, 0.01), advance_batch(system, x, u, w, 0.01), rtol=1e-12)
+
+
 def test_without_numba_it_stays_in_python(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    kkl_gym.compiled_single._shared.clear()
+    kkl_gym.compiled.step._kept.clear()
     assert single_step(get_system("lorenz")).obstacle.startswith("ModuleNotFoundError")
-    kkl_gym.compiled_single._shared.clear()
+    kkl_gym.compiled.step._kept.clear()
 
 
 def episode(env, seed, steps, gain=0.5):
@@ -280,7 +325,25 @@ def test_an_environment_that_is_given_another_system_takes_its_equations():
     one.reset(seed=1, options={"x0": [1.0, 2.0, 20.0]})
     other.reset(seed=1, options={"x0": [1.0, 2.0, 20.0]})
     one.system = other.system
-    assert (one.step([0.3])[4]["x"] == other.step([0.3])[4]["x"]).all()
+    (_, reward, *_, info), (_, expected, *_, there) = one.step([0.3]), other.step([0.3])
+    assert (info["x"] == there["x"]).all()
+    assert reward == expected  # at the other's target
+    with pytest.raises(ValueError, match="exchanged for another 'lorenz', got Rossler"):
+        one.system = get_system("rossler")
+    for name in ("dt", "measurement_noise", "process_noise"):
+        with pytest.raises(AttributeError):
+            setattr(one, name, 0.1)
+
+
+def test_a_vector_that_is_given_another_system_takes_its_equations():
+    one, other = (KKLVectorEnv("lorenz", 200, parameters={"rho": rho}) for rho in (28.0, 20.0))
+    for env in (one, other):
+        env.reset(seed=1, options={"x0": [1.0, 2.0, 20.0]})
+    assert one.compiled
+    one.system = other.system
+    (_, reward, *_, info), (_, expected, *_, there) = (env.step(np.full((200, 1), 0.3)) for env in (one, other))
+    np.testing.assert_array_equal(info["x"], there["x"])
+    np.testing.assert_array_equal(reward, expected)
 
 
 def test_a_method_that_is_replaced_is_compiled_anew(monkeypatch):

@@ -11,7 +11,8 @@ import pytest
 from wrong_systems import Branching, Late, Wide
 
 from kkl_gym import EquationError, KKLEnv, KKLVectorEnv, System, elementary, get_system
-from kkl_gym.compiled import batch_step, compiled_step
+from kkl_gym.compiled import batch_step
+from kkl_gym.compiled.batch import compiled_step
 from kkl_gym.equations import components
 from kkl_gym.simulate import advance, advance_batch, simulate
 from kkl_gym.system import on_states

@@ -5,7 +5,7 @@ import pytest
 
 import kkl_gym.rows
 from kkl_gym.rows import clipped, held, judged
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 
 
 @pytest.fixture(params=[True, False], ids=["compiled", "NumPy"])

@@ -17,8 +17,7 @@ from observers import compiled as machine
 from observers import compiled_covariance
 from observers.artifact import Artifact
 from observers.names import resolve
-from observers.observer import SOON
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS, SOON
 
 pytest.importorskip("numba")
 

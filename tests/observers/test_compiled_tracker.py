@@ -12,8 +12,7 @@ from random_tracking import JUMPS, a_flow, signals, tracking
 import observers
 from observers import Expression, KKLObserver, LinearFilter, tracker_kernels
 from observers.compiled_tracker import CompiledTracker
-from observers.observer import SOON
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS, SOON
 from observers.unscented import corrected, predicted
 
 pytest.importorskip("numba")

@@ -11,7 +11,7 @@ from safetensors import safe_open
 
 from observers import MLP, Artifact, ArtifactError, KKLObserver, Spread
 from observers.decoder import Both
-from observers.spread import Covariance
+from observers.spread import LARGEST, Covariance
 
 CLOSE = {"rtol": 1e-4, "atol": 1e-6}  # the networks work in float32
 OPTIONS = {"process": True, "free_inverse": True}
@@ -30,7 +30,9 @@ def by_hand(inverse, z, age, level, process_noise):
     if tables.ndim == 3:
         tables = (1 - share) * tables[0] + share * tables[1]
     by_age = [np.interp(level / inverse.measurement_noise_max, LEVELS, column) for column in tables.T]
-    return np.exp(np.interp(age, AGES, by_age)) * D @ L @ L.T @ D
+    P = np.exp(np.interp(age, AGES, by_age)) * D @ L @ L.T @ D
+    cut = np.diag(np.minimum(1.0, LARGEST * inverse.x_scale / np.sqrt(np.diag(P))))
+    return cut @ P @ cut
 
 
 @pytest.mark.parametrize("system", ["van_der_pol", "lorenz"])
@@ -75,6 +77,7 @@ def test_any_number_of_states(nx):
     np.testing.assert_allclose(singles, found, rtol=1e-4)
     np.testing.assert_array_equal(singles, singles.mT)
     assert (np.linalg.eigvalsh(found / np.outer(scale, scale)) > 0).all()
+    assert (found.diagonal(0, -2, -1) <= np.square(LARGEST * scale) * (1 + 1e-12)).all()
 
 
 @pytest.mark.parametrize("nx", [1, 2, 3, 4])

@@ -6,7 +6,7 @@ import pytest
 
 import observers.sparse
 from observers import LinearFilter
-from observers.sparse import MANY_ROWS
+from observers.thresholds import MANY_ROWS
 
 DIAGONAL = -np.diag([0.5, 2.0, 7.0])
 PAIR = np.array([[-1.0, 5.0, 0.0], [-5.0, -1.0, 0.5], [0.0, 0.0, -3.0]])

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from kkl_gym import EquationError
-from kkl_gym.compiled_single import single_step
+from kkl_gym.compiled import single_step
 from kkl_gym.equations import components, input_matrix, rate_at
 from kkl_gym.system import System
 from training.checking.finding import Finding, Verdict, number, percent

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kkl_gym.compiled import BatchStep, batch_step
+from kkl_gym.compiled import SamplingStep, batch_step
 from kkl_gym.equations import input_matrix
 from kkl_gym.simulate import RATE_STEP, SubstepsError, simulate
 from kkl_gym.system import System
@@ -85,7 +85,7 @@ class Subject:
     policy: Controller | None = None
 
     @property
-    def step(self) -> BatchStep:
+    def step(self) -> SamplingStep[np.ndarray]:
         """What moves batches of it, compiled where it can be."""
         return batch_step(self.system)
 
@@ -193,7 +193,7 @@ class Subject:
         return motions.x[:, motions.stays & motions.rows("X")]
 
     def substeps(self, x: np.ndarray) -> np.ndarray:
-        """The substeps that sampling intervals ask for, not rounded, and one at least.
+        """The substeps that sampling intervals ask for under the largest input, not rounded, and one at least.
 
         Parameters
         ----------
@@ -206,7 +206,11 @@ class Subject:
             Mean over states, so that what ignites now and then hardly counts.
         """
         with np.errstate(all="ignore"):
-            need = np.broadcast_to(self.system.rate(np.moveaxis(x, -1, 0)), x.shape[:-1]) * self.dt / RATE_STEP
+            need = (
+                np.broadcast_to(self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max), x.shape[:-1])
+                * self.dt
+                / RATE_STEP
+            )
         return np.asarray(np.nan_to_num(need, nan=1.0, posinf=1.0).clip(1.0).mean(-1))
 
     def affordable(self) -> float:

@@ -125,7 +125,10 @@ class Train:
                 self._in_environment(folder, progress)
                 return
             if self.information not in INFORMATION:
-                raise ValueError(f"an agent of a system knows {', '.join(INFORMATION)}; got {self.information!r}")
+                raise ValueError(
+                    f"an agent of a system knows {', '.join(INFORMATION)}; got {self.information!r}, which is for "
+                    "environments, such as Pendulum-v1 (and recurrent agents of systems for kkl-gym agent compare)"
+                )
             agent = learn(
                 task,
                 self.information,

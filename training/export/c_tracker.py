@@ -62,6 +62,8 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
     ]
     for label, spread in _spreads(exported).items():
         parts.append(f"\n/* How sure T_inv is, of {label} motion: logarithms of standard deviations, and rises. */\n")
+        largest = spread.largest_variances(exported.maps[label].x_scale) / flow.x_scale**2
+        parts.append(array("double", f"{label}_largest", largest))
         parts += network_arrays(f"{label}_bars", spread.mlp)
         parts += [array("double", f"{label}_{name}", getattr(spread, name)) for name in ("ages", "levels")]
         rises = np.log(spread.factors.reshape(-1, len(spread.ages))) / 2

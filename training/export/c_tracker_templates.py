@@ -34,9 +34,15 @@ static void {map}_covariance(const {NAME}_observer *observer, unsigned long age,
 {process}    const real *below = {last} + {nx};
     for (size_t i = 0; i < {nx}; i++) {{
         double scale = exp(({last}[i] < {largest} ? {last}[i] : {largest}) + rise[0]) / flow_x_scale[i];
-        for (size_t j = 0; j < i; j++)
+        double variance = scale * scale;
+        for (size_t j = 0; j < i; j++) {{
             P[i][j] = scale * *below++;
+            variance += P[i][j] * P[i][j];
+        }}
         P[i][i] = scale;
+        if (variance > {map}_largest[i])
+            for (size_t j = 0; j <= i; j++)
+                P[i][j] *= sqrt({map}_largest[i] / variance);
     }}
     for (size_t i = {nx}; i-- > 0;) {{ /* its square takes its place: from the end on, nothing is needed that is gone */
         for (size_t j = i + 1; j-- > 0;) {{

@@ -150,7 +150,9 @@ class InverseMap {
     const rows = [];
     for (let i = 0, k = nx; i < nx; i++) {
       const scale = Math.exp(Math.min(out[i], 100) + factor);
-      rows.push([...Array.from({ length: i }, () => scale * out[k++]), scale]);
+      const row = [...Array.from({ length: i }, () => scale * out[k++]), scale];
+      const variance = row.reduce((sum, value) => sum + value * value, 0), largest = (4 * this.x_scale.data[i]) ** 2; // as observers.spread has it
+      rows.push(variance > largest ? row.map((value) => value * Math.sqrt(largest / variance)) : row);
     }
     const entry = (a, b) => a.reduce((sum, value, m) => sum + value * (b[m] ?? 0), 0);
     return rows.map((row) => rows.map((other) => entry(row, other)));

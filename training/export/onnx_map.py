@@ -106,10 +106,16 @@ class Maps:
         values = graph.columns(out, bars.outputs)
         rise, below = self._rise(inverse, age), iter(values[nx:])
         rows: list[list[str]] = []
-        for value, unit in zip(values, scale.tolist(), strict=False):
+        largest = inverse.spread.largest_variances(inverse.x_scale) / scale**2
+        for value, unit, end in zip(values, scale.tolist(), largest.tolist(), strict=False):
             log = graph("Add", graph("Min", value, graph.constant([LARGEST_LOG])), rise)
             D = graph("Div", graph("Exp", log), graph.constant([unit]))
-            rows.append([*(graph("Mul", D, next(below)) for _ in rows), D])
+            row = [*(graph("Mul", D, next(below)) for _ in rows), D]
+            squares = [graph("Mul", each, each) for each in row]
+            variance = squares[0] if len(squares) == 1 else graph("Sum", *squares)
+            most = graph.constant([end])
+            share = graph("Sqrt", graph("Div", most, graph("Max", variance, most)))
+            rows.append([graph("Mul", each, share) for each in row])
         entries = [[""] * nx for _ in range(nx)]
         for i, row in enumerate(rows):
             for j, other in enumerate(rows[: i + 1]):

@@ -366,8 +366,9 @@ def _vector_wrapper(env: VecEnv) -> KKLVectorObservation | None:
 
 
 def _together(errors: RecordedErrors) -> float:
-    """Root mean square of the errors of all hidden signals."""
-    return float(np.sqrt(np.mean(np.square(list(errors.relative.values())))))
+    """Root mean square of the errors of all hidden signals that move; NaN if none does."""
+    known = [error for error in errors.relative.values() if not math.isnan(error)]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else math.nan
 
 
 __all__ = ["KKLTrainingCallback", "Refit", "rehearsed"]

@@ -15,7 +15,7 @@ import kkl_gym.compiled
 import training.checking.subject
 import training.smoothness
 from kkl_gym import SYSTEMS, System, get_system
-from kkl_gym.compiled import BatchStep
+from kkl_gym.compiled import SamplingStep
 from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance_batch
@@ -30,7 +30,7 @@ DURATION = 2.0
 @pytest.fixture(autouse=True)
 def _nothing_is_compiled(monkeypatch):
     in_numpy = functools.partial(functools.partial, advance_batch)
-    monkeypatch.setattr(training.checking.subject, "batch_step", lambda system: BatchStep(in_numpy(system)))
+    monkeypatch.setattr(training.checking.subject, "batch_step", lambda system: SamplingStep(in_numpy(system)))
 
 
 def findings(system, name=None, *, dt=None, duration=DURATION, policy=None):

@@ -11,7 +11,7 @@ import pytest
 from linear_system import Oscillator
 
 import training.checking.subject
-from kkl_gym.compiled import BatchStep
+from kkl_gym.compiled import SamplingStep
 from kkl_gym.simulate import advance_batch
 from training.cli import main
 
@@ -33,7 +33,7 @@ class Named(Oscillator):
 @pytest.fixture(autouse=True)
 def _nothing_is_compiled(monkeypatch):
     in_numpy = functools.partial(functools.partial, advance_batch)
-    monkeypatch.setattr(training.checking.subject, "batch_step", lambda system: BatchStep(in_numpy(system)))
+    monkeypatch.setattr(training.checking.subject, "batch_step", lambda system: SamplingStep(in_numpy(system)))
 
 
 def test_a_table_of_what_was_found(capsys, tmp_path, monkeypatch):

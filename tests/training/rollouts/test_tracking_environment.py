@@ -13,6 +13,7 @@ from kkl_gym import KKLObservation, KKLVectorObservation
 from observers import Artifact
 from training import KKLTrainingCallback
 from training.recorded import errorbars, tracking
+from training.recorded.errors import RecordedErrors
 from training.rollouts import callback
 
 FIT = {"members": 1, "inverse_steps": 100, "width": 16, "samples": 10, "windows": 500, "batch": 128}
@@ -87,14 +88,20 @@ def test_a_refit_without_enough_held_out_is_left_out(path):
         model.learn(10, KKLTrainingCallback(220, held_out=0.0))
 
 
-def test_an_observer_is_taught_again(path):
+@pytest.mark.parametrize("better", [True, False])
+def test_an_observer_is_taught_again(path, better, monkeypatch):
     first, told = Artifact.read(path), []
+    errors = iter([0.5, 1.0] if better else [1.0, 0.5])  # of the new one, and of the old one
+    monkeypatch.setattr(
+        callback, "recorded_errors", lambda *_, **__: RecordedErrors({"moves": next(errors), "rests": np.nan}, 0.0, 1.0)
+    )
     env = make_vec_env(lambda: KKLObservation(gym.make("Pendulum-v1"), path), 4, seed=0)
     model = PPO("MlpPolicy", env, seed=0, n_steps=64, batch_size=256, n_epochs=1, device="cpu")
     model.learn(1300, KKLTrainingCallback(1200, on_refit=told.append, inverse_steps=50))
     (refit,) = told
     assert refit.artifact.flow is not None
     assert refit.artifact.inverse.spread is not None
-    assert not refit.taken or refit.artifact.flow.low[2] != first.flow.low[2]  # from other rollouts
+    assert (refit.artifact.flow.low[2] != first.flow.low[2]) == refit.taken == better  # from other rollouts
+    assert (refit.before, refit.error) == ((1.0, 0.5) if better else (0.5, 0.5))
     in_use = [observer.artifact for observer in env.get_attr("observer")]
-    assert (in_use == [refit.artifact] * 4) == refit.taken
+    assert [artifact is refit.artifact for artifact in in_use] == [better] * 4

@@ -6,57 +6,29 @@ to the last bit. That holds of +, -, * and /, of comparisons and of :mod:`kkl_gy
 else, such as powers and NumPy's functions, which compilers round in their own ways, stay in Python.
 """
 
-import builtins
 import dis
 import functools
-import inspect
-import logging
 import math
-import re
 import warnings
-from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass
 from types import CodeType, FunctionType
 from typing import Any
 
 import numpy as np
 
 from kkl_gym import elementary
+from kkl_gym.compiled.reading import Read
+from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance, runge_kutta
 from kkl_gym.system import Components, System
-from observers.observer import SOON
 
-_TRIALS = 1000  # states at which both are compared
+_TRIALS = 200  # states of each kind at which both are compared
 _MOST_SUBSTEPS = 64  # of a state that is compared: Python would take long for more
 _MOST_INSTRUCTIONS = 600  # of Python's, in f, g and rate each; beyond, compiling takes many seconds
 _OPERATORS = ("+", "-", "*", "/", "&", "|")
-_KEPT = 64  # compiled steps
-_shared: dict[Any, "SingleStep"] = {}  # by all that they were made of
-
-Step = Callable[[Components, Components, Components, float], Components]
-"""(x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance` of a system."""
-
-logger = logging.getLogger("kkl_gym")
 
 
-@dataclass(frozen=True)
-class SingleStep:
-    """One sampling interval of a single state.
-
-    Parameters
-    ----------
-    advance : callable
-        From (x, u, w, dt) to the next x, as :func:`kkl_gym.simulate.advance` of the system.
-    obstacle : str, optional
-        Why Python takes the step; None where compiled code does.
-    """
-
-    advance: Step
-    obstacle: str | None = None
-
-
-def single_step(system: System) -> SingleStep:
+def single_step(system: System) -> SamplingStep[Components]:
     """One sampling interval of a single state: compiled if Numba is there and takes the equations, else in Python.
 
     The equations must depend on nothing but state, input, parameters, and numbers in attributes and in their module.
@@ -70,44 +42,14 @@ def single_step(system: System) -> SingleStep:
 
     Returns
     -------
-    SingleStep
+    SamplingStep
         The step, and why it is not compiled where it is not.
     """
-    in_python = functools.partial(advance, system)
-    if system.discrete:
-        return SingleStep(in_python, f"{system.name} makes its step itself")
-    try:
-        made_of = _made_of(system)
-    except Exception as error:
-        return SingleStep(in_python, _reason(error))
-    found = _shared.get(made_of)
-    if found is None:
-        try:
-            found = SingleStep(compiled_step(system))
-        except Exception as error:  # anything may come out of Numba for a user's equations, which Python then takes
-            found = SingleStep(in_python, _reason(error))
-            logger.info("single steps of %s stay in Python: %s", system.name, found.obstacle)
-        while len(_shared) >= _KEPT:
-            _shared.pop(next(iter(_shared)), None)
-        _shared[made_of] = found
-    return found if found.obstacle is None else SingleStep(in_python, found.obstacle)
+    said = f"single steps of {system.name} stay in Python"
+    return shared_step(system, compiled_step, advance, said=said)
 
 
-def _made_of(system: System) -> tuple[Any, ...]:
-    """All that a compiled step depends on; floats as text, for 0.0 is not -0.0."""
-    functions = tuple(getattr(type(system), name) for name in ("f", "g", "rate"))
-    numbers = (repr((found.on_self, found.of_module)) for found in (_Read(system, each) for each in functions))
-    return type(system), *functions, repr((system.parameters, system.G, system.X, system.bounds, system.dt)), *numbers
-
-
-def _reason(error: Exception) -> str:
-    """What went wrong, in one line: Numba writes a page, in colours, of which a line says what it cannot take."""
-    lines = re.sub(r"\x1b\[\d*m", "", str(error)).splitlines()
-    said = [line for line in lines if line.strip() and not line.startswith("Failed in ")]
-    return f"{type(error).__name__}: {said[0] if said else ''}"
-
-
-def compiled_step(system: System) -> Step:
+def compiled_step(system: System) -> Advance[Components]:
     """The compiled step of :func:`single_step`.
 
     Parameters
@@ -141,11 +83,17 @@ def compiled_step(system: System) -> Step:
         function = getattr(type(system), name)
         namespace[name], namespace[f"{name}_self"] = compiled(function), _checked(system, name).stand_in()
     if type(system).rate is System.rate:
-        exec("\n".join(_rate_lines(system)), namespace)
+        exec("\n".join(_slope_lines("rate_alone", "f(f_self, {})", system)), namespace)
     else:
         namespace["rate_of"], namespace["rate_self"] = compiled(type(system).rate), _checked(system, "rate").stand_in()
-        exec("def rate(x):\n    return rate_of(rate_self, x)", namespace)
+        exec("def rate_alone(x, u):\n    return rate_of(rate_self, x)", namespace)
     exec("\n".join(_field_lines(nx, nu, constant=constant)), namespace)
+    if constant:
+        namespace["rate"] = namespace["rate_alone"]
+    else:
+        exec("\n".join(_slope_lines("slope", "driven({}, u)", system)), namespace)
+        exec("def rate(x, u):\n    return rate_alone(x, u) + slope(x, u)", namespace)
+        namespace |= {name: compiled(namespace[name]) for name in ("driven", "slope", "rate_alone")}
     namespace |= {name: compiled(namespace[name]) for name in ("field", "rate")}
     namespace["integrate"] = compiled(runge_kutta(nx if constant else nx + nu))
     exec("\n".join(_kernel_lines(system, constant=constant)), namespace)
@@ -163,10 +111,10 @@ def compiled_step(system: System) -> Step:
     u_max, scale = np.array(system.u_max), np.array(system.scale) / system.pace
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        for x in _trials(system, rng):
+        for x in map(tuple, np.concatenate(trial_states(system, _TRIALS, rng)).tolist()):
             u, w = (u_max * rng.uniform(-1, 1, nu)).tolist(), (scale * rng.uniform(-1, 1, nx)).tolist()
             try:
-                if not system.rate(x) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
+                if not system.rate_under(x, u) * system.dt * PER_RATE <= _MOST_SUBSTEPS:
                     continue
                 end = kernel(*x, *u, *w, system.dt)
             except Exception:  # Python takes the step
@@ -176,55 +124,7 @@ def compiled_step(system: System) -> Step:
     return step
 
 
-def _trials(system: System, rng: np.random.Generator) -> list[tuple[float, ...]]:
-    """States to compare at: random ones within X and within the bounds, and where equations tend to branch."""
-    n, low, high = _TRIALS // 3, *np.array(system.bounds, dtype=float).T
-    random = [rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))]
-    special = np.choose(rng.choice(3, (n, system.nx)), [low, np.zeros(system.nx), high])
-    return [tuple(x) for x in np.concatenate([*random, special]).tolist()]
-
-
-class _Read:
-    """What a method reads beside its arguments: numbers, by name, and what else there is."""
-
-    def __init__(self, system: System, function: Any) -> None:
-        self.on_self, self.of_module = dict[str, float](), dict[str, float]()
-        self.others, self.attributes = dict[str, Any](), list[str]()
-        if not isinstance(function, FunctionType) or function in (System.f, System.g, System.rate):
-            return
-        of_module, attributes = _names(function)
-        for name in of_module:
-            value: Any = function.__globals__.get(name, getattr(builtins, name, None))
-            (self.of_module if _is_number(value) else self.others)[name] = value
-        for name in attributes:
-            value = inspect.getattr_static(system, name, None)
-            if _is_number(value):
-                self.on_self[name] = value
-            else:
-                self.attributes.append(name)
-
-    def stand_in(self) -> Any:
-        """What takes the place of self, in a type that Numba knows."""
-        return namedtuple("numbers", self.on_self)(**self.on_self)
-
-
-@functools.lru_cache(maxsize=256)
-def _names(function: FunctionType) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names that a function looks up in its module, and on objects. Kept, as every reset asks."""
-    of_module, attributes = dict[str, None](), dict[str, None]()
-    for instruction in dis.get_instructions(function):
-        if instruction.opname == "LOAD_GLOBAL":
-            of_module[instruction.argval] = None
-        elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
-            attributes[instruction.argval] = None
-    return tuple(of_module), tuple(attributes)
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (float, int)
-
-
-def _checked(system: System, name: str) -> _Read:
+def _checked(system: System, name: str) -> Read:
     """What a method reads; ValueError if it does what Numba might not do to the last bit, or is long.
 
     The rate says how many substeps there are, so that its last bit does not matter.
@@ -247,7 +147,7 @@ def _checked(system: System, name: str) -> _Read:
                 raise ValueError(f"{name} has the operator {operator}")
         elif instruction.opname == "STORE_GLOBAL":
             raise ValueError(f"{name} writes to its module")
-    read = _Read(system, function)
+    read = Read(system, function)
     known: list[Any] = [each for each in vars(elementary).values() if isinstance(each, FunctionType)]
     known += [elementary, abs] if exact else [elementary, abs, max, min, math]
     for other, value in read.others.items():
@@ -265,23 +165,25 @@ def _field_lines(nx: int, nu: int, *, constant: bool) -> list[str]:
     if constant:
         return ["def field(x):", "    return f(f_self, x)"]
     state, held = ("(" + "".join(f"x[{i}], " for i in these) + ")" for these in (range(nx), range(nx, nx + nu)))
-    lines = ["def field(x):", f"    x, u = {state}, {held}", "    fx, gx = f(f_self, x), g(g_self, x)"]
-    driven = [f"fx[{i}] + {_dot(f'gx[{i}]', nu)}" for i in range(nx)]
-    return [*lines, f"    return {', '.join(driven + ['0.0'] * nu)},"]
+    driven = ["def driven(x, u):", "    gx = g(g_self, x)"]
+    driven += ["    return " + "".join(_dot(f"gx[{i}]", nu) + ", " for i in range(nx))]
+    field = ["def field(x):", f"    x, u = {state}, {held}", "    fx, gu = f(f_self, x), driven(x, u)"]
+    field += ["    return " + "".join(f"fx[{i}] + gu[{i}], " for i in range(nx)) + "0.0, " * nu]
+    return driven + field
 
 
 def _dot(row: str, nu: int) -> str:
-    """A row of the input matrix times u, added up as :func:`kkl_gym.simulate.forced` does."""
+    """A row of the input matrix times u, added up as :func:`kkl_gym.system.dot` does."""
     return "(0.0" + "".join(f" + {row}[{j}] * u[{j}]" for j in range(nu)) + ")"
 
 
-def _rate_lines(system: System) -> list[str]:
-    """Python of the rate that :meth:`System.rate` finds numerically, written out."""
+def _slope_lines(name: str, field: str, system: System) -> list[str]:
+    """Python of :func:`kkl_gym.system.slope` of a vector field, written out."""
     steps = [5e-7 * (high - low) for low, high in system.X]
-    lines = ["def rate(x):", "    fx, total = f(f_self, x), 0.0"]
+    lines = [f"def {name}(x, u):", f"    fx, total = {field.format('x')}, 0.0"]
     for j, step in enumerate(steps):
         moved = "".join(f"x[{i}] + {step!r}, " if i == j else f"x[{i}], " for i in range(system.nx))
-        lines += [f"    fm, part = f(f_self, ({moved})), 0.0"]
+        lines += [f"    fm, part = {field.format(f'({moved})')}, 0.0"]
         for i, unit in enumerate(steps):
             lines += [f"    part += ((fm[{i}] - fx[{i}]) / {unit!r}) ** 2"]
         lines += ["    total += part"]
@@ -301,15 +203,15 @@ def _kernel_lines(system: System, *, constant: bool) -> list[str]:
         d = [f"{wi} + {_dot(f'({row!r})', nu)}" for row, wi in zip(system.G, w, strict=True)]
     return [
         f"def kernel({', '.join([*x, *u, *w, 'dt'])}):",
-        *([f"    u = ({held})"] if nu else []),
-        f"    need = rate(({', '.join(x)},)) * dt * {PER_RATE!r}",
+        f"    u = ({held})",
+        f"    need = rate(({', '.join(x)},), u) * dt * {PER_RATE!r}",
         f"    if need <= {MOST_EQUAL}:",
         "        n = 1",
         "        while n < need:",
         "            n *= 2",
         f"        end = integrate(field, ({', '.join(start)},), ({', '.join(d)},), dt / n, n)",
         f"        x = ({''.join(f'end[{i}], ' for i in range(nx))})",
-        f"        if rate(x) * dt * {PER_RATE!r} <= {GROWTH} * n:",
+        f"        if rate(x, u) * dt * {PER_RATE!r} <= {GROWTH} * n:",
         "            return x",
         f"    return ({'nan, ' * nx})",
     ]
@@ -337,6 +239,3 @@ def _teach_elementary() -> None:
     minimum, maximum = known(taught["minimum"].on_numbers), known(taught["maximum"].on_numbers)
     overload(elementary.clip)(lambda x, low, high: lambda x, low, high: minimum(maximum(x, low), high))
     overload(elementary.where)(lambda condition, a, b: lambda condition, a, b: a if condition else b)
-
-
-__all__ = ["SOON", "SingleStep", "Step", "compiled_step", "single_step"]

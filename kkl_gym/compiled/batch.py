@@ -6,61 +6,22 @@ process. Rows go through it many at a time, one in each lane of the processor's 
 """
 
 import functools
-import logging
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.equations import components, input_matrix, rate_at
-from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, Step, advance_batch, equal_substeps, runge_kutta
+from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance_batch, equal_substeps, runge_kutta
 from kkl_gym.system import System
 
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
+_TRIALS = 200  # states of each kind at which both are compared
 _LANES = 32  # rows that make a step together: a few of the processor's vectors
 
-logger = logging.getLogger("kkl_gym")
 
-
-@dataclass(frozen=True)
-class BatchStep:
-    """One sampling interval of a batch, called as ``step(x, u, w, dt)``.
-
-    Parameters
-    ----------
-    advance : callable
-        Takes the step, as :func:`kkl_gym.simulate.advance_batch` does.
-    obstacle : str, optional
-        Why NumPy takes the step; None where compiled code does.
-    """
-
-    advance: Step
-    obstacle: str | None = None
-
-    def __call__(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-        """Take the step.
-
-        Parameters
-        ----------
-        x : ndarray, shape (nx, n)
-            States, component first.
-        u : ndarray, shape (nu, n)
-            Inputs, held over the interval.
-        w : ndarray, shape (nx, n)
-            Process noise, held over the interval.
-        dt : float
-            Length of the interval in seconds.
-
-        Returns
-        -------
-        ndarray, shape (nx, n)
-            The next states; columns that escape are not finite.
-        """
-        return self.advance(x, u, w, dt)
-
-
-def batch_step(system: System) -> BatchStep:
+def batch_step(system: System) -> SamplingStep[np.ndarray]:
     """One sampling interval of a batch: compiled if Numba and sympy are there and take the equations, else NumPy.
 
     The two agree to rounding. Equations that sympy cannot read, such as those with NumPy functions or ``if``, go on
@@ -76,28 +37,14 @@ def batch_step(system: System) -> BatchStep:
 
     Returns
     -------
-    BatchStep
+    SamplingStep
         The step, and why it is not compiled where it is not.
     """
-    return _shared_step(type(system), tuple(system.parameters.items()))  # type: ignore[arg-type]
+    said = f"{system.name} goes on with NumPy, not compiled"
+    return shared_step(system, compiled_step, advance_batch, said=said)
 
 
-@functools.lru_cache(maxsize=64)
-def _shared_step(kind: type[System], parameters: tuple[tuple[str, float], ...]) -> BatchStep:
-    system = kind(**dict(parameters))
-    if system.discrete:
-        return BatchStep(functools.partial(advance_batch, system), f"{system.name} makes its step itself")
-    try:
-        return BatchStep(compiled_step(system))
-    # Anything may come out of a user's equations on symbols, or of Numba. NumPy then takes the equations as they are,
-    # and raises by itself what is wrong with them on numbers, too.
-    except Exception as error:
-        obstacle = f"{type(error).__name__}: {error}"
-        logger.info("%s goes on with NumPy, not compiled: %s", system.name, obstacle)
-        return BatchStep(functools.partial(advance_batch, system), obstacle)
-
-
-def compiled_step(system: System) -> Step:
+def compiled_step(system: System) -> Advance[np.ndarray]:
     """The compiled step of :func:`batch_step`.
 
     Parameters
@@ -108,7 +55,7 @@ def compiled_step(system: System) -> Step:
     Returns
     -------
     callable
-        From (x, u, w, dt) to the next states, as :class:`BatchStep`.
+        From (x, u, w, dt) to the next states, as :class:`SamplingStep`.
 
     Raises
     ------
@@ -140,10 +87,11 @@ def compiled_step(system: System) -> Step:
         raise ValueError(f"{system.name}: the equations take too long to compile")
     # The input is held: a part of the state whose derivative is zero.
     field = sympy.lambdify([(*x, *u)], (*forced, *[sympy.Float(0)] * nu), "math", cse=True)
-    rate = sympy.sympify(rate_at(system, x)).replace(_is_root, lambda power: sympy.sqrt(power.base))
+    rate_at(system, x)  # or say what is wrong with it
+    rate = sympy.sympify(system.rate_under(x, u)).replace(_is_root, lambda power: sympy.sqrt(power.base))
     namespace: dict[str, Any] = {
         "field": inlined(field),
-        "rate": inlined(sympy.lambdify([(*x,)], rate, "math", cse=True)),
+        "rate": inlined(sympy.lambdify([(*x, *u)], rate, "math", cse=True)),
         "integrate": inlined(runge_kutta(nx + nu)),
         "inf": math.inf,
         "nan": math.nan,
@@ -176,9 +124,9 @@ def compiled_step(system: System) -> Step:
     # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.
     u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None]
     rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
-    for points in _trials(system):
-        rng, n = np.random.default_rng(0), points.shape[1]
-        at = points, u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n)), system.dt
+    for points in trial_states(system, _TRIALS, np.random.default_rng(0)):
+        rng, n = np.random.default_rng(0), len(points)
+        at = points.T, u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n)), system.dt
         found, expected = substeps(*at)[0], in_numpy(*at)[0]
         if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
             raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
@@ -213,7 +161,7 @@ def _kernel_lines(nx: int, nu: int) -> list[str]:
         f"    n, s = x.shape[1], np.empty({len(lanes) * _LANES})",
         "    needs, order, counts = np.empty(n), np.empty(n, np.int64), np.empty(n)",
         "    for row in range(n):",
-        f"        needs[row] = rate({tupled(held[:nx])}) * dt * {PER_RATE!r}",
+        f"        needs[row] = rate({tupled(held[: nx + nu])}) * dt * {PER_RATE!r}",
         "    found, least, most = 0, -inf, 1.0",
         f"    while found < n and most <= {MOST_EQUAL}:",
         "        for row in range(n):",
@@ -234,7 +182,7 @@ def _kernel_lines(nx: int, nu: int) -> list[str]:
         f"                end, unfinished = {moved}, done < {substeps}",
         *[f"                {value} = end[{i}] if unfinished else {value}" for i, value in enumerate(states)],
         f"        for j in range({_LANES}):",
-        f"            {length} = rate({tupled(states)}) * dt * {PER_RATE!r}",
+        f"            {length} = rate({tupled(lanes[: nx + nu])}) * dt * {PER_RATE!r}",
         f"        for j in range(min({_LANES}, found - first)):",
         "            row = order[first + j]",
         f"            if {length} <= {GROWTH} * {substeps}:",
@@ -244,12 +192,3 @@ def _kernel_lines(nx: int, nu: int) -> list[str]:
         "                lost = True",
         "    return lost",
     ]
-
-
-def _trials(system: System) -> tuple[np.ndarray, np.ndarray]:
-    """States (nx, n) to compare at: random ones within X and within the bounds, and where equations tend to branch."""
-    rng = np.random.default_rng(0)
-    low, high = np.array(system.bounds).T
-    random = np.concatenate([rng.uniform(*system.box(), (200, system.nx)), rng.uniform(low, high, (200, system.nx))])
-    special = rng.choice(3, (200, system.nx))
-    return random.T, np.choose(special, [low, 0.0, high]).T

@@ -1,0 +1,104 @@
+"""What a system's equations read beside their arguments: machine code is made anew where any of it has changed."""
+
+import builtins
+import dis
+import functools
+import inspect
+from collections import namedtuple
+from types import FunctionType
+from typing import Any
+
+import numpy as np
+
+from kkl_gym import elementary
+from kkl_gym.system import System
+
+_SEQUENCES = (tuple, list, np.ndarray, np.generic)
+
+
+def made_of(system: System) -> tuple[Any, ...]:
+    """All that a compiled step depends on.
+
+    Parameters
+    ----------
+    system : System
+        Whose equations are compiled.
+
+    Returns
+    -------
+    tuple
+        The functions, with those that they call, and the numbers that these read, as text: 0.0 is not -0.0.
+    """
+    functions = [getattr(type(system), name) for name in ("f", "g", "rate")]
+    values = [repr((system.parameters, system.G, system.X, system.bounds, system.dt))]
+    for function in functions:  # which grow on the way
+        read = Read(system, function)
+        others = {**read.others, **read.attributes}
+        values.append(repr((read.on_self, read.of_module)))
+        values += [f"{name} {_written(value)}" for name, value in others.items() if isinstance(value, _SEQUENCES)]
+        called = (getattr(value, "__func__", value) for value in others.values())  # of a static method, too
+        functions += [
+            each
+            for each in called
+            if isinstance(each, FunctionType) and each not in functions and each.__module__ != elementary.__name__
+        ]
+    return type(system), *functions, *values
+
+
+class Read:
+    """What a method reads beside its arguments.
+
+    Parameters
+    ----------
+    system : System
+        What the method is called on.
+    function : callable
+        The method, or a function that it calls.
+
+    Attributes
+    ----------
+    on_self, of_module : dict of str to float
+        Numbers by name: of the system, and of the function's module.
+    attributes, others : dict of str to object
+        All else by name, likewise.
+    """
+
+    def __init__(self, system: System, function: Any) -> None:
+        self.on_self, self.of_module = dict[str, float](), dict[str, float]()
+        self.others, self.attributes = dict[str, Any](), dict[str, Any]()
+        if not isinstance(function, FunctionType) or function in (System.f, System.g, System.rate):
+            return
+        of_module, attributes = _names(function)
+        for name in of_module:
+            value: Any = function.__globals__.get(name, getattr(builtins, name, None))
+            (self.of_module if _is_number(value) else self.others)[name] = value
+        for name in attributes:
+            value = inspect.getattr_static(system, name, None)
+            if _is_number(value):
+                self.on_self[name] = value
+            else:
+                self.attributes[name] = value
+
+    def stand_in(self) -> Any:
+        """What takes the place of self, in a type that Numba knows."""
+        return namedtuple("numbers", self.on_self)(**self.on_self)
+
+
+@functools.lru_cache(maxsize=256)
+def _names(function: FunctionType) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names that a function looks up in its module, and on objects. Kept, as every reset asks."""
+    of_module, attributes = dict[str, None](), dict[str, None]()
+    for instruction in dis.get_instructions(function):
+        if instruction.opname == "LOAD_GLOBAL":
+            of_module[instruction.argval] = None
+        elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
+            attributes[instruction.argval] = None
+    return tuple(of_module), tuple(attributes)
+
+
+def _written(value: Any) -> str:
+    return repr(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
+
+
+def _is_number(value: Any) -> bool:
+    return type(value) in (float, int)
