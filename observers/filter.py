@@ -108,6 +108,11 @@ class LinearFilter:
         """Number of components of the filter's state, nz * (1 + nu)."""
         return len(self.transition)
 
+    @property
+    def slowest(self) -> float:
+        """Rate in 1/s at which the slowest mode forgets: the least size of a real part of A's eigenvalues."""
+        return float(np.abs(np.linalg.eigvals(self.A).real).min())
+
     def start(self, y0: np.ndarray) -> np.ndarray:
         """Return the state that a constant output would have led to: z_y = -A^-1 B y0, z_u = 0.
 

@@ -34,6 +34,27 @@ def test_defaults_follow_from_the_box():
     assert cls.X_centre == (1.0, 0.0)
 
 
+def test_a_parameter_that_is_not_declared_anew_is_refused():
+    with pytest.raises(TypeError, match=r"Softer: mu = 1\.0 does not change the parameter mu: write mu: float = 1\.0"):
+
+        class Softer(VanDerPol):
+            name = "softer"
+            mu = 1.0
+
+    class Annotated(VanDerPol):
+        name = "annotated"
+        mu: float = 1.0
+
+    with pytest.raises(TypeError, match="Annotated has a parameter mu, but lacks @dataclass"):
+        Annotated()
+    assert dataclass(frozen=True)(Annotated)().mu == 1.0
+
+
+def test_what_a_constructor_sets_would_be_lost():
+    with pytest.raises(TypeError, match="Tank defines __init__, and would be made anew without what that sets"):
+        declared(__init__=lambda self: None)
+
+
 def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
     cls = declared(
         X=np.array([[-1, 1], [-1.5, 1]]),

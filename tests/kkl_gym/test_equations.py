@@ -374,6 +374,62 @@ def test_outputs_that_leave_the_real_numbers():
         env.step(np.zeros(1))
 
 
+def test_equations_that_write_to_the_state(tank):
+    path = tank(more="def g(self, x):\n    a, b = x\n    a *= 0.0\n    return (a,), (1.0 + a,)", h="(x[0] + 0.0,)")
+    with pytest.raises(EquationError, match=r"g\(x\) of 'tank' .* changed the state that it was given: write a = a"):
+        KKLEnv(f"{path}:Tank")
+
+
+def test_constants_of_single_precision(tank):
+    path = tank(f="x[1], np.float32(-2.0) * x[0]")
+    with pytest.raises(EquationError, match="would make a whole motion that coarse: write constants as Python's"):
+        KKLEnv(f"{path}:Tank")
+
+
+def test_where_leaves_out_what_is_divided_by_zero():
+    class Cardinal(System):
+        name = "cardinal"
+        X = ((-3, 3), (-1, 1))
+        bounds = ((-20, 20), (-20, 20))
+
+        def f(self, x):
+            return x[1], -elementary.where(x[0] != 0.0, elementary.sin(x[0]) / x[0], 1.0) * x[0]
+
+        def rate(self, x):
+            return 1.5
+
+        def h(self, x):
+            return (x[0],)
+
+    system = Cardinal()
+    single = advance(system, (0.0, 1.0), [], [0.0, 0.0], 0.01)
+    batch = advance_batch(system, np.array([[0.0], [1.0]]), np.zeros((0, 1)), np.zeros((2, 1)), 0.01)
+    np.testing.assert_allclose(single, batch[:, 0], rtol=1e-14)
+    assert single[0] == pytest.approx(math.sin(0.01), abs=1e-7)
+
+
+def test_symbols_are_not_equal_to_whole_numbers():
+    class Geared(System):
+        """A state that is 0, 1 or 2 and stays so; of a symbol ``x == 1.0`` would be False."""
+
+        name = "geared"
+        X = ((0, 10), (0, 2))
+        bounds = ((-50, 50), (0, 2))
+
+        def f(self, x):
+            return -elementary.where(x[1] == 1.0, 2.0, 0.1) * x[0], 0.0
+
+        def rate(self, x):
+            return 2.0
+
+        def h(self, x):
+            return (x[0],)
+
+    step = batch_step(Geared())
+    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((0, 2)), np.zeros((2, 2)), 0.5)
+    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-5)
+
+
 class Blinking(Draining):
     """An output that is lost away from X, which a look at the bounds does not find."""
 

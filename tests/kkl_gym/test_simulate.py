@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
-from kkl_gym.compiled import batch_step
+from kkl_gym.compiled import batch_step, single_step
 from kkl_gym.elementary import exp, sin
 from kkl_gym.simulate import (
     GROWTH,
@@ -50,6 +50,24 @@ class Steered(System):
 
     def h(self, x):
         return x[0], x[1]
+
+
+class Flushed(System):
+    """A reactor whose input dilutes it: x' = -0.02 x + (1 - x) u, which the input alone makes fast."""
+
+    name = "flushed"
+    X = ((0.0, 1.0),)
+    bounds = ((-5.0, 5.0),)
+    u_max = (400.0,)
+
+    def f(self, x):
+        return (-0.02 * x[0],)
+
+    def g(self, x):
+        return ((1.0 - x[0],),)
+
+    def h(self, x):
+        return (x[0],)
 
 
 @dataclass(frozen=True)
@@ -424,6 +442,21 @@ def test_wrong_arguments_raise(wrong, match):
         simulate(Lorenz(), **arguments)
 
 
+@pytest.mark.parametrize("u", [0.8, 4.0, 40.0, 400.0])
+def test_what_an_input_speeds_up_is_followed(u):
+    """The closed form: x runs to u / (u + 0.02) at the rate u + 0.02."""
+    system, dt, x0 = Flushed(), 1.0, 0.2
+    end = u / (u + 0.02)
+    expected = end + (x0 - end) * math.exp(-(u + 0.02) * dt)
+    steps = [advance, lambda system, *at: single_step(system)(*at)]
+    for step in steps:
+        assert step(system, (x0,), [u], [0.0], dt)[0] == pytest.approx(expected, rel=1e-6)
+    for step in (batch_step(system), functools.partial(advance_batch, system)):
+        found = step(np.full((1, 3), x0), np.full((1, 3), u), np.zeros((1, 3)), dt)
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # from which the default dt follows
+
+
 @pytest.mark.parametrize("dt", [0, -0.01, math.nan, math.inf, "0.01", None])
 def test_check_dt(dt):
     with pytest.raises(ValueError, match="dt must be a positive, finite number of seconds"):
@@ -431,9 +464,10 @@ def test_check_dt(dt):
 
 
 def test_check_dt_takes_numbers():
-    check_dt(1)
-    check_dt(np.float64(0.01))
-    check_dt(np.float32(0.01))
+    for dt, expected in ((1, 1.0), (np.float64(0.01), 0.01), (np.float32(0.25), 0.25)):
+        found = check_dt(dt)
+        assert type(found) is float
+        assert found == expected
 
 
 def test_long_simulations_tell_how_far_they_are():

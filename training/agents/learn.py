@@ -138,7 +138,6 @@ def learn_recurrent(
     *,
     seed: int = 0,
     timesteps: int | None = None,
-    progress: Progress | None = None,
 ) -> Callable[[], Policy]:
     """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before.
 
@@ -154,8 +153,6 @@ def learn_recurrent(
         Seed of networks, exploration and episodes.
     timesteps : int, optional
         Actions in all rows together; by default what hyperparameters/ppo_lstm.yml says.
-    progress : rich.progress.Progress, optional
-        Where a bar is shown.
 
     Returns
     -------
@@ -178,7 +175,7 @@ def learn_recurrent(
         timesteps=timesteps,
         seed=seed,
         folder=folder,
-        progress=progress,
+        progress=None,
         description=f"{get_system(task.system).name} recurrent {of}",
     )
 

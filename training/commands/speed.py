@@ -311,23 +311,23 @@ def _has_error_bars(one: Shown) -> bool:
 
 
 def _others(one: Shown) -> dict[str, str]:
-    """What ships for a system beside its default, by kind: the small map, and the one that tracks."""
+    """What ships for a system beside its default, by kind: the small map, and T_inv alone."""
     names = {kind: f"{one.system.name}-{kind}" for kind in OTHERS}
     there = shipped_maps() if one.observer is None and one.observed else {}
     return {kind: name for kind, name in names.items() if name in there}
 
 
-def _repeated(task: Callable[[], object], repeats: int = 10) -> float:
-    """CPU seconds that a task takes."""
+def _repeated(task: Callable[[], object]) -> float:
+    """CPU seconds that a task takes, the mean of ten."""
     began = time.process_time()
-    for _ in range(repeats):
+    for _ in range(10):
         task()
-    return (time.process_time() - began) / repeats
+    return (time.process_time() - began) / 10
 
 
-def _share(task: Callable[[], object], whole: float, repeats: int = 50) -> str:
+def _share(task: Callable[[], object], whole: float) -> str:
     times = []
-    for _ in range(repeats):
+    for _ in range(50):
         started = time.process_time()
         task()
         times.append(time.process_time() - started)

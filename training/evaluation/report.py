@@ -94,7 +94,7 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: Un
     ax.set(xlabel="measurement noise", ylabel="SMAPE in %", yscale="log", title="median error after the transient")
 
 
-def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 150) -> None:
+def draw_residual(ax: Any, artifact: Artifact, system: System) -> None:
     """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X.
 
     Parameters
@@ -105,8 +105,6 @@ def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 
         An observer with a forward map.
     system : System
         What it was made for.
-    points : int
-        Along each axis.
 
     Raises
     ------
@@ -115,6 +113,7 @@ def draw_residual(ax: Any, artifact: Artifact, system: System, *, points: int = 
     """
     from matplotlib.colors import LogNorm
 
+    points = 150  # along each axis
     first, second = (i % system.nx for i in system.portrait)
     x = np.tile(np.mean(system.X, axis=1), (points**2, 1))
     grids = [np.linspace(*system.X[i], points) for i in (first, second)]

@@ -12,6 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
+from training.kalman import LEAST_PROCESS_NOISE, NOISE_FLOOR
 from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
@@ -20,9 +21,7 @@ from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
-LEAST_PROCESS_NOISE = 0.005  # that is assumed, at the system's pace: a tenth of the environments' default
-LEAST_MEASUREMENT_NOISE = 0.02  # that is assumed, in multiples of the usual
-OF_OUTPUT = 1e-4  # the same in multiples of each output's standard deviation: below, covariances would be rounding
+OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -177,7 +176,7 @@ def _learned(
     low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
     usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
     outputs = np.nanstd(system.output(increments.x), axis=0)
-    least = np.maximum(LEAST_MEASUREMENT_NOISE * usual, OF_OUTPUT * outputs)
+    least = np.maximum(NOISE_FLOOR * usual, OF_OUTPUT * outputs)
     flow = fit_flow(
         increments,
         u_scale,

@@ -283,7 +283,7 @@ def _filter(system: System, records: Sequence[Record], dt: float, observer: Arti
 
 def memory(linear: LinearFilter) -> float:
     """Seconds after which a filter has forgotten its start well enough for a first guess of the state."""
-    return math.log(1 / FORGOTTEN) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    return math.log(1 / FORGOTTEN) / linear.slowest
 
 
 def _self_consistent(

@@ -75,5 +75,4 @@ def spread(z: np.ndarray) -> np.ndarray:
 
 def settling_time(linear: LinearFilter) -> float:
     """Time in seconds after which the filter has forgotten its start to one part in a thousand."""
-    slowest = float(np.abs(np.linalg.eigvals(linear.A).real).min())
-    return float(SETTLED / slowest)
+    return float(SETTLED / linear.slowest)

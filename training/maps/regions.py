@@ -178,7 +178,6 @@ def distances_along(
     u: np.ndarray,
     *,
     level: float | tuple[float, ...],
-    process_noise: float | None = None,
     ages: np.ndarray,
 ) -> np.ndarray:
     """Run an observer from its reset on, and compare its errors with its own covariances.
@@ -193,8 +192,6 @@ def distances_along(
         Inputs.
     level : float or tuple of float, length ny
         Of the noise on the samples, as the observer is told it.
-    process_noise : float, optional
-        The same of the motion; by default what the observer assumes.
     ages : ndarray of int, shape (m,)
         Samples since the reset at which they are compared, sorted.
 
@@ -203,7 +200,7 @@ def distances_along(
     ndarray, shape (m, n)
         Squared distances of the errors in units of the covariance.
     """
-    observer = KKLObserver(artifact, level, process_noise=process_noise)
+    observer = KKLObserver(artifact, level)
     return np.array(
         [squared_distance(x[k] - observer.decode(), observer.covariance) for k in _at(observer, y, u, ages)]
     )
@@ -223,8 +220,10 @@ def errors_along(
 
     Parameters
     ----------
-    artifact, x, y, u, level, process_noise, ages
+    artifact, x, y, u, level, ages
         As for :func:`distances_along`.
+    process_noise : float, optional
+        Level that the observer is told of the motion; by default what it assumes.
 
     Returns
     -------

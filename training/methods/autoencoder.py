@@ -158,8 +158,9 @@ class _Problem(nn.Module):
             "physics": physics.detach(),
         }
 
-    def best_cutoff(self, n: int = 1000, candidates: int = 25) -> float:
-        """The cutoff of least sensitivity x (noise gain + transient gain), among some over the range, on n states."""
+    def best_cutoff(self) -> float:
+        """The cutoff of least sensitivity x (noise gain + transient gain), of 25 over the range, on many states."""
+        n = 1000
         x = self.draw(n, torch.Generator(self._states.device).manual_seed(0))
         frequencies = np.geomspace(1e-3, 1e3, 400)
         eye = np.eye(len(self.D))
@@ -167,7 +168,7 @@ class _Problem(nn.Module):
         energy = float(np.trace(solve_continuous_lyapunov(self.D, -eye)))
         jacobian: Callable[..., Any] = torch.func.vmap(torch.func.jacrev(self.decode))
         scores = {}
-        for cutoff in np.geomspace(self.slowest, self.fastest, candidates).tolist():
+        for cutoff in np.geomspace(self.slowest, self.fastest, 25).tolist():
             w = torch.full((n, 1), cutoff, dtype=x.dtype, device=x.device)
             with torch.no_grad():
                 z = self.encode((x - self._xo) / self._xs, w)

@@ -8,7 +8,7 @@ import numpy as np
 
 from kkl_gym.system import System
 from observers import Artifact
-from training.evaluation.certificates.gains import envelope, slowest
+from training.evaluation.certificates.gains import envelope
 from training.evaluation.certificates.generalisation import (
     forward_samples,
     generalisation_term,
@@ -208,7 +208,7 @@ def certify_forward(
         forward_term=generalisation_term(largest, pseudo_dimension=dimension, samples=samples, delta=delta),
         start_error=start_error,
         envelope=dict(zip(ages.tolist(), left.tolist(), strict=True)),
-        forgets_start=max(0.0, math.log(added / math.sqrt(error)) / slowest(linear)) if added * error > 0 else math.inf,
+        forgets_start=max(0.0, math.log(added / math.sqrt(error)) / linear.slowest) if added * error > 0 else math.inf,
         bound=2 * total,
         forward_share=forward_part / total if total > 0 else math.nan,
         noisy_bound=told_bound + 2 * noise_error**2,

@@ -10,12 +10,7 @@ from training.maps.smooth import decoder
 
 def theorem_gain(linear: LinearFilter) -> float:
     """Most that a bounded noise may move z by the paper's theorem 4 (sec. 7): cond(V) |B| / |lambda_min(A)|."""
-    return _conditioning(linear) * float(np.linalg.norm(linear.B, 2)) / slowest(linear)
-
-
-def slowest(linear: LinearFilter) -> float:
-    """Slowest rate at which the filter forgets, |lambda_min(A)| in 1/s: the least |Re| of its eigenvalues."""
-    return float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    return _conditioning(linear) * float(np.linalg.norm(linear.B, 2)) / linear.slowest
 
 
 def envelope(linear: LinearFilter, ages: np.ndarray, *, start: float, disturbance: float = 0.0) -> np.ndarray:
@@ -37,7 +32,7 @@ def envelope(linear: LinearFilter, ages: np.ndarray, *, start: float, disturbanc
     ndarray, shape (m,)
         cond(V) e^{-|lambda_min| t} start + gain (1 - e^{-|lambda_min| t}) disturbance, gain being the theorem's.
     """
-    left = np.exp(-slowest(linear) * ages)
+    left = np.exp(-linear.slowest * ages)
     return np.asarray(_conditioning(linear) * left * start + theorem_gain(linear) * (1.0 - left) * disturbance)
 
 
@@ -56,16 +51,16 @@ def _conditioning(linear: LinearFilter) -> float:
     return float(np.linalg.cond(np.linalg.eig(linear.A)[1]))
 
 
-def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
+def h_infinity(linear: LinearFilter) -> float:
     """H-infinity norm of the sampled filter from v to z: the largest amplification of a noise's energy.
+
+    The greatest gain is looked for among frequencies up to Nyquist's and some more about each pole, and then refined
+    about the best one.
 
     Parameters
     ----------
     linear : LinearFilter
         The filter.
-    points : int, default 2000
-        Frequencies up to Nyquist's, beside some more about each pole, among which the greatest gain is looked for; it
-        is then refined about the best one.
 
     Returns
     -------
@@ -75,7 +70,7 @@ def h_infinity(linear: LinearFilter, points: int = 2000) -> float:
     poles = np.linalg.eigvals(linear.A) * linear.dt
     near = np.geomspace(1e-2, 1e2, 40)
     resonances = np.abs(poles.imag) + np.outer([*-near, 0.0, *near], np.abs(poles.real))
-    grid = np.concatenate([[0.0], np.geomspace(min(1e-3, 0.01 * np.abs(poles).min()), np.pi, points)])
+    grid = np.concatenate([[0.0], np.geomspace(min(1e-3, 0.01 * np.abs(poles).min()), np.pi, 2000)])
     grid = np.unique(np.concatenate([grid, np.clip(resonances.ravel(), 0.0, np.pi)]))
     gains = np.array([_gain(linear, w) for w in grid])
     best = int(gains.argmax())

@@ -101,7 +101,7 @@ def record_settled(
     rng = generator(Stream.CERTIFICATE, seed)
     linear = artifact.filter
     dt = linear.dt
-    settled = -math.log(SETTLED) / float(np.abs(np.linalg.eigvals(linear.A).real).min())
+    settled = -math.log(SETTLED) / linear.slowest
     first = math.ceil(settled / dt)
     steps = first + round(RECORDED * system.pace / dt)
     ages = np.arange(first, steps + 1, EVERY)
