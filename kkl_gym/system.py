@@ -457,6 +457,15 @@ def dot(row: Iterable[Any], u: Components) -> Any:
     return total
 
 
+def difference_steps(X: Box) -> list[tuple[float, float]]:
+    """For each state a millionth of X's half-width, and how far it is moved to differentiate numerically.
+
+    That is as much, or more where X lies so far from zero that floats would hardly tell it.
+    """
+    units = [5e-7 * (high - low) for low, high in X]
+    return [(unit, max(unit, 2e-8 * max(map(abs, box)))) for unit, box in zip(units, X, strict=True)]
+
+
 def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     """A norm of a vector field's derivative, differentiated numerically, with each state in units of X's half-width.
 
@@ -474,12 +483,12 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     float, or of the kind that the components of ``x`` are
         The norm.
     """
-    steps = [5e-7 * (high - low) for low, high in X]
+    steps = difference_steps(X)
     fx = field(x)
     total = 0.0
-    for j, step in enumerate(steps):
-        moved = field([*x[:j], x[j] + step, *x[j + 1 :]])
-        total = total + sum(((b - a) / unit) ** 2 for a, b, unit in zip(fx, moved, steps, strict=True))
+    for j, (own, step) in enumerate(steps):
+        moved, far = field([*x[:j], x[j] + step, *x[j + 1 :]]), step / own
+        total = total + sum(((b - a) / (unit * far)) ** 2 for a, b, (unit, _) in zip(fx, moved, steps, strict=True))
     return total**0.5
 
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from training.config import Config
-    from training.evaluation.calibration import calibrate
     from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from training.presets import preset
     from training.rollouts import learn
     from training.rollouts.callback import KKLTrainingCallback
+    from training.teaching.monitor import calibrate
 
 __all__ = [
     "Certificate",
@@ -46,7 +46,7 @@ _MODULES = {
     "Observability": "observable",
     "Result": "pipeline",
     "adapt": "identification.learning",
-    "calibrate": "evaluation.calibration",
+    "calibrate": "teaching.monitor",
     "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
     "identify": "identification.learning",

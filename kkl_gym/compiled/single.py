@@ -20,7 +20,7 @@ from kkl_gym import elementary
 from kkl_gym.compiled.reading import Read
 from kkl_gym.compiled.step import Advance, SamplingStep, shared_step, trial_states
 from kkl_gym.simulate import GROWTH, MOST_EQUAL, PER_RATE, advance, runge_kutta
-from kkl_gym.system import Components, System
+from kkl_gym.system import Components, System, difference_steps
 
 _TRIALS = 200  # states of each kind at which both are compared
 _MOST_SUBSTEPS = 64  # of a state that is compared: Python would take long for more
@@ -179,13 +179,13 @@ def _dot(row: str, nu: int) -> str:
 
 def _slope_lines(name: str, field: str, system: System) -> list[str]:
     """Python of :func:`kkl_gym.system.slope` of a vector field, written out."""
-    steps = [5e-7 * (high - low) for low, high in system.X]
+    steps = difference_steps(system.X)
     lines = [f"def {name}(x, u):", f"    fx, total = {field.format('x')}, 0.0"]
-    for j, step in enumerate(steps):
+    for j, (own, step) in enumerate(steps):
         moved = "".join(f"x[{i}] + {step!r}, " if i == j else f"x[{i}], " for i in range(system.nx))
         lines += [f"    fm, part = {field.format(f'({moved})')}, 0.0"]
-        for i, unit in enumerate(steps):
-            lines += [f"    part += ((fm[{i}] - fx[{i}]) / {unit!r}) ** 2"]
+        for i, (unit, _) in enumerate(steps):
+            lines += [f"    part += ((fm[{i}] - fx[{i}]) / {unit * (step / own)!r}) ** 2"]
         lines += ["    total += part"]
     return [*lines, "    return total ** 0.5"]
 

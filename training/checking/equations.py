@@ -14,6 +14,7 @@ from training.checking.finding import Finding, Verdict, number, percent
 from training.checking.subject import Subject, of_bounds, of_X
 
 COMPARED = 100  # points of X, and as many of the bounds, at which the kinds of numbers are compared
+COARSE = 1e-3  # of X, from which on the spacing of float32 shows in what agents see
 LEAST_EFFECT = 1e-9  # of an input at its bound, in half-widths of X over 1 / rate
 
 Evaluation = Callable[[Any], list[Any]]
@@ -40,6 +41,11 @@ def declaration(system: System) -> Iterator[Finding]:
     if system.discrete:
         found.append(f"steps of {system.dt:g} s of its own")
     yield Finding("system", "ok", "; ".join(found))
+    for name, (low, high), ends in zip(system.state_names, system.X, system.bounds, strict=True):
+        spacing = float(np.spacing(np.float32(np.abs(ends).max())))
+        if spacing > COARSE * (high - low):
+            told = f"agents see float32, which tells {name} to {spacing:.2g}, {percent(spacing / (high - low))} of X"
+            yield Finding("system", "note", told, "let the state be what it differs by from a value in the middle")
 
 
 def starts(system: System) -> Iterator[Finding]:
@@ -76,7 +82,7 @@ def kinds_of_numbers(system: System) -> Iterator[Finding]:
             continue
         if expected is None:
             expected = values
-        apart = _apart(expected, values)
+        apart = _apart(expected, values, rate=not system.discrete)
         if apart.any():
             where = np.array2string(x[int(apart.argmax())], separator=", ", precision=4)
             yield Finding(
@@ -201,14 +207,16 @@ def _symbols(evaluation: Evaluation, x: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(np.asarray(value, dtype=float), len(x)) for value in values], axis=-1)
 
 
-def _apart(expected: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """At which points (n,) two kinds of numbers disagree, where both give numbers."""
+def _apart(expected: np.ndarray, values: np.ndarray, *, rate: bool) -> np.ndarray:
+    """At which points (n,) two kinds of numbers disagree, where both give numbers; of a rate, the last, digits do."""
     if expected.shape != values.shape:
         return np.ones(len(expected), dtype=bool)
     size = np.nanmax(np.where(np.isfinite(expected), np.abs(expected), 0.0), axis=0)
     both = np.isfinite(expected) & np.isfinite(values)
     with np.errstate(invalid="ignore"):
-        return np.asarray((both & (np.abs(expected - values) > 1e-6 * np.abs(expected) + 1e-9 * size)).any(1))
+        part = np.full(expected.shape[1], 1e-6)
+        part[-1:] = 1e-3 if rate else 1e-6
+        return np.asarray((both & (np.abs(expected - values) > part * np.abs(expected) + 1e-9 * size)).any(1))
 
 
 def _separating(system: System, x: np.ndarray, good: np.ndarray) -> str:

@@ -48,8 +48,8 @@ class ErrorBars(Teaching):
         ValueError
             If the observer cannot be had or has no error bars to learn, or a number makes no sense.
         """
-        from training.evaluation.errorbars import learn_error_bars  # torch takes seconds that help need not wait for
         from training.recorded.errorbars import learn_recorded_error_bars
+        from training.teaching.errorbars import learn_error_bars  # torch takes seconds that help need not wait for
 
         out = Path("runs/errorbars") / resolve(self.observer).name if self.out is None else self.out
         return self.taught(

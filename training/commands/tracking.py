@@ -55,8 +55,8 @@ class Tracking(Teaching):
         ValueError
             If the observer cannot be had, has no error bars or serves a range of plants, or a number makes no sense.
         """
-        from training.evaluation.tracking import learn_tracking  # torch takes seconds that help need not wait for
         from training.recorded.tracking import learn_recorded_tracking
+        from training.teaching.tracking import learn_tracking  # torch takes seconds that help need not wait for
 
         name = re.sub(r"-v\d+$", "", resolve(self.observer).stem)
         out = Path(f"runs/tracking/{name}.safetensors") if self.out is None else self.out

@@ -213,7 +213,7 @@ def find_limits(
     progress : ProgressBars
         Where progress is shown.
     """
-    from training.evaluation.calibration import PARTS, calibrate
+    from training.teaching.monitor import PARTS, calibrate
 
     artifact = result.artifact
     try:

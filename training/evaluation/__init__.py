@@ -1,1 +1,1 @@
-"""Judging an observer: errors on unseen trajectories, limits of monitors, faults, certificates, reports."""
+"""Judging an observer: errors on unseen trajectories, coverage, faults, certificates, reports."""

@@ -8,10 +8,10 @@ import pandas as pd
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from training.evaluation.calibration import sound_trajectories
 from training.evaluation.levels import Level
 from training.seeds import Stream, generator
 from training.systems import profile
+from training.teaching.monitor import sound_trajectories
 from training.trajectories.controllers import Controller
 
 Fault = Literal["none", "bias", "drop-out", "freeze"]
@@ -53,7 +53,7 @@ def simulate_faults(
     seed : int
         Seed of starts, inputs and noise.
     policy : callable, optional
-        Acts on the system, as for :func:`training.evaluation.calibration.calibrate`.
+        Acts on the system, as for :func:`training.teaching.monitor.calibrate`.
     report : callable, optional
         Told how many of the ``PARTS`` of the work are done.
 

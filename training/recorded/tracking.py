@@ -47,7 +47,7 @@ def learn_recorded_tracking(
 
     T_inv and its error bars stay as they are. A small network, beside a linear fit, learns how the states change from
     one recorded sample to the next. What it is usually off by on the records that were held out counts as noise of the
-    motion. The rest is as :func:`training.evaluation.tracking.learn_tracking` has it.
+    motion. The rest is as :func:`training.teaching.tracking.learn_tracking` has it.
 
     A tracker compares each sample with what it expects. So the measured signals have to be among the hidden ones, or
     be sums of them; an artifact that says so already, by its C, is taken at its word.

@@ -9,10 +9,10 @@ import pandas as pd
 import pytest
 
 import training.commands.faults
-import training.evaluation.calibration
 import training.evaluation.certificates.certificate
 import training.evaluation.certificates.gains
 import training.evaluation.faults
+import training.teaching.monitor
 from kkl_gym import VanDerPol
 from kkl_gym.elementary import sin
 from observers import Artifact, KKLObserver, Limits
@@ -69,7 +69,7 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
         process_noise = 0.12  # not what such an observer takes by default, 0.2
 
     system = Noisy()
-    monkeypatch.setattr(training.evaluation.calibration, "KKLObserver", Spy)
+    monkeypatch.setattr(training.teaching.monitor, "KKLObserver", Spy)
     monkeypatch.setattr(training.evaluation.faults, "KKLObserver", Spy)
     artifact = dataclasses.replace(make_artifact(process=True, free_inverse=True), C=np.array([[1.0, 0.0]]))
     calibrated = training.calibrate(artifact, system, duration=6.0, false_alarms=0.5)
@@ -197,7 +197,7 @@ def test_faults_of_an_output_that_is_not_linear():
             return (sin(x[0]),)
 
     blind = dataclasses.replace(linear_system.exact_observer(), C=None, measurement_noise=0.01)
-    calibrated = training.evaluation.calibration.calibrate(blind, Sine(), duration=10.0, false_alarms=0.1)
+    calibrated = training.teaching.monitor.calibrate(blind, Sine(), duration=10.0, false_alarms=0.1)
     rows = simulate_faults(calibrated, Sine(), trajectories=10, duration=20.0, measurement_noise=0.01, seed=0)
     alarms = rows.assign(alarm=rows.delay < np.inf).groupby("fault").alarm.mean()
     assert alarms["none"] <= 0.2

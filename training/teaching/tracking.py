@@ -11,12 +11,12 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
-from training.evaluation.calibration import PARTS, WINDOW, calibrate, sound_trajectories
 from training.kalman import LEAST_PROCESS_NOISE, NOISE_FLOOR
 from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
+from training.teaching.monitor import PARTS, WINDOW, calibrate, sound_trajectories
 from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN

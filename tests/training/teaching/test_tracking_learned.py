@@ -12,15 +12,15 @@ from kkl_gym import get_system
 from observers import MLP, Artifact, KKLObserver, Limits, load
 from observers.polynomial import monomials
 from training.commands.tracking import Tracking
-from training.evaluation import tracking
 from training.evaluation.certificates.certificate import certify
 from training.evaluation.coverage import coverage
-from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import errors, unseen_trajectories
-from training.evaluation.tracking import learn_tracking
 from training.guided import GuidedKalmanFilter
 from training.maps import flow, regions
 from training.progress import progress_bars
+from training.teaching import tracking
+from training.teaching.errorbars import learn_error_bars
+from training.teaching.tracking import learn_tracking
 from training.trajectories.controllers import linear_quadratic
 from training.trajectories.noise import draw_process_noise
 

@@ -11,13 +11,13 @@ from kkl_gym.system import System
 from observers import Artifact, InverseMap
 from observers.decoder import Decoders
 from training.config import Config, settings_of
-from training.evaluation.calibration import sound_trajectories
 from training.maps.regions import LEVELS, Regions, level_of, squared_distance
 from training.maps.samplers import TrajectorySampler
 from training.maps.spread import with_spread
 from training.pipeline import LEAD_IN_SHARE
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
+from training.teaching.monitor import sound_trajectories
 from training.trajectories.controllers import Controller
 from training.trajectories.parameters import blind, uncertain_plant
 from training.trajectories.record import Motions, record, recording_ages

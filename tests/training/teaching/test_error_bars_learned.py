@@ -9,10 +9,10 @@ from scipy.stats import chi2
 
 from observers import MLP, KKLObserver
 from training.evaluation.coverage import REGIONS, coverage, kalman_coverage
-from training.evaluation.errorbars import learn_error_bars
 from training.evaluation.errors import unseen_trajectories
 from training.filter_noise import stationary_covariance
 from training.maps.regions import chi_square, squared_distance
+from training.teaching.errorbars import learn_error_bars
 
 
 class Noiseless(Oscillator):

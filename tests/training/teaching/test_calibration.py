@@ -8,7 +8,7 @@ from linear_system import Oscillator, TwoOutputs, exact_observer
 
 from kkl_gym.elementary import sin
 from observers import ArtifactError, Expression, KKLObserver
-from training.evaluation.calibration import PARTS, WARM_UP, calibrate, sound_trajectories
+from training.teaching.monitor import PARTS, WARM_UP, calibrate, sound_trajectories
 
 
 class Noiseless(Oscillator):
