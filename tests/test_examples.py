@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from training.cli import main
-from training.evaluation import calibration
+from training.teaching import monitor
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -94,7 +94,7 @@ def test_the_system_on_the_page_is_that_of_the_example():
 def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     shutil.copytree(EXAMPLES, tmp_path / "examples")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
+    monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
     own, agent, registered = re.findall(r"```python\n(.*?)```", USED, re.DOTALL)
     done = set()
     for line in "".join(re.findall(r"```sh\n(.*?)```", TRAINED + USED, re.DOTALL)).splitlines():

@@ -16,7 +16,7 @@ from kkl_gym.simulate import simulate
 from training import train
 from training.benchmark.protocol import run
 from training.cli import main
-from training.evaluation import calibration
+from training.teaching import monitor
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.trajectories.derivatives import with_sensitivity
@@ -141,7 +141,7 @@ def test_sensitivity_under_an_input_matrix_that_depends_on_the_state():
 
 def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
+    monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
     main(["train", PENDULUM, *SMALL.split()])
     assert "no limits" not in capsys.readouterr().out
     path = "runs/circle_pendulum/circle_pendulum.safetensors"

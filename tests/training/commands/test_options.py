@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 
 from training.cli import main
-from training.evaluation import calibration
+from training.teaching import monitor
 
 SCRIPT = """
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ SMALL = "--trajectories 20 --duration 5 --samples 20 --width 4 --depth 1 --batch
 
 def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(calibration, "calibrate", partial(calibration.calibrate, duration=6.0))
+    monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
     (tmp_path / "mine.py").write_text(SCRIPT)
     main(["train", "mine.py:Falling", "--policy", "mine.py:hold", *SMALL.split()])
     assert "no limits" not in capsys.readouterr().out
