@@ -16,9 +16,9 @@ from kkl_gym.simulate import simulate
 from training import train
 from training.benchmark.protocol import run
 from training.cli import main
-from training.teaching import monitor
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.teaching import monitor
 from training.trajectories.derivatives import with_sensitivity
 from training.tuning.probe import Probe
 
