@@ -286,9 +286,9 @@ def first_layer(
         long as a hundred multiplications.
     """
     weight, bias = (part.astype(float) for part in layer)
-    modes, told = len(offset), len(offset) + len(conditions)
-    first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[told], whiten @ weight[:modes]])
-    first[0] += offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:told]
+    modes, given = len(offset), len(offset) + len(conditions)
+    first = np.vstack([bias, np.zeros_like(bias) if age is None else weight[given], whiten @ weight[:modes]])
+    first[0] += offset @ weight[:modes] + np.array(conditions, dtype=float) @ weight[modes:given]
     return first
 
 
@@ -311,10 +311,10 @@ def entering_kernel() -> Callable[..., None]:
     import numba
 
     @numba.njit(fastmath=FAST, error_model="numpy")
-    def enter(first: np.ndarray, told: float, z: np.ndarray, sums: np.ndarray) -> None:
+    def enter(first: np.ndarray, age: float, z: np.ndarray, sums: np.ndarray) -> None:
         width, size = len(sums), len(z)
         for j in range(width):
-            sums[j] = first[0, j] + told * first[1, j]
+            sums[j] = first[0, j] + age * first[1, j]
         for i in range(0, size - 1, 2):
             a, b = z[i], z[i + 1]
             for j in range(width):

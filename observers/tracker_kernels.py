@@ -68,7 +68,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
         u: np.ndarray,
         y_next: np.ndarray,
         state: np.ndarray,
-        told: np.ndarray,
+        shown: np.ndarray,
     ) -> None:
         size, layers = len(z), whole[0]
         widths, places = whole[1 : 1 + layers], whole[1 + layers :].reshape(2, (len(whole) - 1 - layers) // 2)
@@ -83,7 +83,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
         end = len(numbers) - places.shape[1]
         gains, mixing = numbers[at:end].reshape((end - at) // size, size), numbers[end:]
 
-        expected, filled, all_rows = told[nx : nx + ny], told[nx + ny : nx + 2 * ny], np.ones(1, np.bool_)
+        expected, filled, all_rows = shown[nx : nx + ny], shown[nx + ny : nx + 2 * ny], np.ones(1, np.bool_)
         step_one(
             states,
             outputs,
@@ -95,14 +95,14 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
             y_next.reshape(1, ny),
             all_rows,
             state,
-            told[:nx].reshape(1, nx),
+            shown[:nx].reshape(1, nx),
             expected.reshape(1, ny),
         )
         for k in range(ny):
             filled[k] = y_next[k]
             if np.isnan(y_next[k]):
                 filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
-        update(gains, places, mixing, z, y, u, filled, told[nx + 2 * ny :])
+        update(gains, places, mixing, z, y, u, filled, shown[nx + 2 * ny :])
 
     @_compiled
     def take(
@@ -112,7 +112,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
         lost: np.ndarray,
         where: np.ndarray,
         state: np.ndarray,
-        told: np.ndarray,
+        shown: np.ndarray,
     ) -> None:
         for k in range(len(where)):
             row, ours, theirs = state[where[k]], 0.0, 0.0
@@ -124,8 +124,8 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
                     s = (x[k, i] - states[i, _OFFSET]) / states[i, _SCALE]
                     s = states[i, _LOW] if s < states[i, _LOW] else s
                     row[i] = states[i, _HIGH] if s > states[i, _HIGH] else s
-                    if len(told) > 0:
-                        told[where[k], i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
+                    if len(shown) > 0:
+                        shown[where[k], i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
                     for j in range(nx):
                         row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
@@ -361,7 +361,7 @@ def _step(
         y: np.ndarray,
         rows: np.ndarray,
         state: np.ndarray,
-        told: np.ndarray,
+        shown: np.ndarray,
         expected: np.ndarray,
     ) -> None:
         n, cut = len(state), nx * nx
@@ -422,7 +422,7 @@ def _step(
                 elif rows[first + r]:
                     row[nx + cut] = np.inf
                 for i in range(nx):
-                    told[first + r, i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
+                    shown[first + r, i] = unscaled(states[i, _OFFSET], states[i, _SCALE], row[i])
 
     return step
 

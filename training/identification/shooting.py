@@ -79,7 +79,7 @@ class Fit:
     starts_by_parameters: np.ndarray
     claims: int
 
-    def errors(self, directions: np.ndarray, told: np.ndarray) -> np.ndarray:
+    def errors(self, directions: np.ndarray, known: np.ndarray) -> np.ndarray:
         """Standard errors along some directions, for white noise or as windows scatter, whichever are larger.
 
         Residuals that hang together, such as those of process noise, make parameters less certain than white ones of
@@ -90,7 +90,7 @@ class Fit:
         ----------
         directions : ndarray, shape (p, k)
             In units of ``unit``.
-        told : ndarray, shape (p, m)
+        known : ndarray, shape (p, m)
             A basis of what the outputs tell, likewise.
 
         Returns
@@ -99,12 +99,12 @@ class Fit:
             The standard errors; what the outputs do not tell of a direction counts nothing.
         """
         kinds = [self.white, self.scattered] if self.used.sum() >= CLUSTERS else [self.white]
-        return np.max([self._errors(directions, told, kind) for kind in kinds], axis=0)
+        return np.max([self._errors(directions, known, kind) for kind in kinds], axis=0)
 
-    def _errors(self, directions: np.ndarray, told: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    def _errors(self, directions: np.ndarray, known: np.ndarray, kind: np.ndarray) -> np.ndarray:
         """From one covariance of the gradient."""
         spread = (
-            told @ np.linalg.pinv(told.T @ self.curvature @ told, rcond=1e-13, hermitian=True) @ told.T @ directions
+            known @ np.linalg.pinv(known.T @ self.curvature @ known, rcond=1e-13, hermitian=True) @ known.T @ directions
         )
         return np.sqrt(np.maximum(np.einsum("ak,ab,bk->k", spread, kind, spread), 0.0))
 
@@ -122,16 +122,16 @@ class Fit:
     @property
     def standard_errors(self) -> np.ndarray:
         """Of the parameters, (p,); infinite where the outputs do not tell one."""
-        told = told_directions(self.relative_information)
-        silent = 1.0 - (told**2).sum(1) > PART**2
-        errors = self.errors(np.eye(len(self.unit)), told * self.size[:, None])
+        known = told_directions(self.relative_information)
+        silent = 1.0 - (known**2).sum(1) > PART**2
+        errors = self.errors(np.eye(len(self.unit)), known * self.size[:, None])
         return np.where(silent, np.inf, self.unit * errors)
 
     @property
     def coloured(self) -> bool:
         """Whether windows scatter more than white residuals let them, of which few windows show nothing."""
-        told = told_directions(self.information)
-        return bool((self.errors(told, told) > COLOURED * self._errors(told, told, self.white)).any())
+        known = told_directions(self.information)
+        return bool((self.errors(known, known) > COLOURED * self._errors(known, known, self.white)).any())
 
 
 def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
@@ -158,8 +158,8 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
     J = problem.derivatives(theta, at, problem.rows)
     _, beyond, by_parameters = _beyond_starts(J, problem.weight, at.x0.shape[1])
     linear = np.isfinite(at.each)
-    told = told_directions(fit.information)
-    for change in (told * np.minimum(fit.errors(told, told), 1.0)).T:
+    known = told_directions(fit.information)
+    for change in (known * np.minimum(fit.errors(known, known), 1.0)).T:
         x0 = at.x0 + shooting.half * (by_parameters @ change)
         off = problem.follow(theta + change * shooting.unit, x0, problem.rows).y - at.y - beyond @ change
         off = np.where(problem.there, off, 0.0) / fit.noise
@@ -320,10 +320,10 @@ def _ordinary(each: np.ndarray) -> np.ndarray:
     sizes = np.einsum("naa->na", each)
     ordinary = (sizes <= CLAIM * np.median(sizes, 0)).all(1)
     values, vectors = np.linalg.eigh(each[ordinary].sum(0))
-    told = values > NOTHING * max(values[-1], 0.0)
-    scaled = vectors[:, told] / np.sqrt(values[told])
+    known = values > NOTHING * max(values[-1], 0.0)
+    scaled = vectors[:, known] / np.sqrt(values[known])
     share = np.linalg.eigvalsh(scaled.T @ each @ scaled).max(1, initial=0.0)
-    return np.asarray(ordinary & (share <= CLAIM * told.sum() / max(ordinary.sum(), 1)))
+    return np.asarray(ordinary & (share <= CLAIM * known.sum() / max(ordinary.sum(), 1)))
 
 
 def _claims(each: np.ndarray) -> int:
@@ -337,8 +337,8 @@ def _claims(each: np.ndarray) -> int:
 def _unknown(information: np.ndarray) -> np.ndarray:
     """Changes (p, k) of parameters that information leaves unknown: a standard error, or the parameter's unit."""
     values, vectors = np.linalg.eigh(information)
-    told = values > NOTHING * max(values[-1], 0.0)
-    return np.asarray(vectors[:, told] / np.sqrt(np.maximum(values[told], 1.0)))
+    known = values > NOTHING * max(values[-1], 0.0)
+    return np.asarray(vectors[:, known] / np.sqrt(np.maximum(values[known], 1.0)))
 
 
 def _left(S: np.ndarray, s: np.ndarray, cost: float) -> float:

@@ -127,8 +127,8 @@ def learn_tracking(
                 begun = table * (1 + len(LEVELS)) + 1
                 report(begun)
                 rng = generator(Stream.CALIBRATION, seed, 8 + table)
-                told = partial(_tell, report, begun)
-                tables.append(_factors(tracking, system, runs, level, regions=regions, rng=rng, report=told))
+                reported = partial(_tell, report, begun)
+                tables.append(_factors(tracking, system, runs, level, regions=regions, rng=rng, report=reported))
         driven, free = ([table[i] for table in tables] for i in range(2))
         flow = dataclasses.replace(
             flow,

@@ -202,14 +202,14 @@ def certify(
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
     report(1)
     measured, sample = recorded.halves()
-    told = decoder(artifact, **noise)
-    lower, at = lipschitz_lower(told, recorded.z)
+    informed = decoder(artifact, **noise)
+    lower, at = lipschitz_lower(informed, recorded.z)
     report(2)
-    upper = lipschitz_upper(told)
+    upper = lipschitz_upper(informed)
     report(WITHOUT_T)
     free = decoder(artifact, 0.0)
-    if all(map(np.array_equal, (*told.mlp.weights, *told.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
-        free = told  # a map that is not told the noise is bounded once
+    if all(map(np.array_equal, (*informed.mlp.weights, *informed.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
+        free = informed  # a map that is not told the noise is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
     l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
@@ -218,7 +218,8 @@ def certify(
         everywhere = np.concatenate([recorded.x, recorded.noisy_x])
         psi = float(np.linalg.norm(np.ptp(everywhere, axis=0))) if process_noise else 0.0
     noise_error = upper * gain * (l_h * psi + math.hypot(*noise_bound))
-    x_hat, noisy_x_hat = free(measured.z), told(measured.noisy_z)
+    moved = informed(recorded.z + recorded.noise)
+    x_hat, noisy_x_hat = free(measured.z), informed(measured.noisy_z)
     losses = squared(measured.x - x_hat)
     samples = inverse_samples(artifact.training)
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
@@ -237,7 +238,7 @@ def certify(
         lipschitz_lower=lower,
         lipschitz_at=tuple(at.tolist()),
         lipschitz_upper=upper,
-        norm_product=norm_product(told),
+        norm_product=norm_product(informed),
         output_lipschitz=l_h,
         controllability=controllability(linear),
         gain_theorem=gain,
@@ -245,7 +246,7 @@ def certify(
         gain_h2=h2(linear),
         noise_term=2 * noise_error**2,
         predicted_noise_error=float(np.sqrt(noise_variance(artifact, recorded.z, **noise).mean())),
-        measured_noise_error=float(np.sqrt(squared(told(recorded.z + recorded.noise) - told(recorded.z)).mean())),
+        measured_noise_error=float(np.sqrt(squared(moved - informed(recorded.z)).mean())),
         inverse_samples=samples,
         inverse_dimension=inverse_dimension,
         inverse_term=generalisation_term(
@@ -255,8 +256,8 @@ def certify(
             artifact,
             system,
             sample,
-            told=Inverse(told, upper),
-            noise_free=Inverse(free, upper if free is told or artifact.forward is None else lipschitz_upper(free)),
+            told=Inverse(informed, upper),
+            noise_free=Inverse(free, upper if free is informed or artifact.forward is None else lipschitz_upper(free)),
             noise_error=noise_error,
             psi=psi,
             error=float(losses.mean()),
