@@ -8,7 +8,7 @@ import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class CompiledNetwork:
     """
 
     def __init__(self, layers: Layers, activation: str) -> None:
-        _kernels(activation)  # or say now that there is no Numba
+        network_kernels(activation)  # or say now that there is no Numba
         self._layers, self.activation, self.bias = layers, activation, layers[-1][1]
         widths = [len(layers[0][0]), *(len(bias) for _, bias in layers)]
         self.outputs, self.widths, self._most = widths[-1], np.array(widths), max(widths)
@@ -80,7 +80,7 @@ class CompiledNetwork:
             Outputs.
         """
         out = np.empty(self.outputs, np.float32)
-        _kernels(self.activation)[1](x, self.packed, self.widths, self.between, out)
+        network_kernels(self.activation).single(x, self.packed, self.widths, self.between, out)
         return out
 
     def batch(self, x: np.ndarray) -> np.ndarray:
@@ -121,7 +121,7 @@ class CompiledNetwork:
             Takes what the last weights make.
         """
         *hidden, (last, _) = self._layers
-        activate, rows = _kernels(self.activation)[0], len(h)
+        activate, rows = network_kernels(self.activation).activate, len(h)
         for i, ((weight, bias), tile) in enumerate(zip(hidden, self._tiles)):
             flat = memory[i % 2, : rows * len(bias)]
             h = np.matmul(h, weight, out=flat.reshape(rows, len(bias)))
@@ -235,7 +235,7 @@ class CompiledDecoder:
             The estimates.
         """
         network, n, width = self._network, len(z), len(self._sums)
-        enter, finish = batch_kernels(network.activation)
+        kernels = batch_kernels(network.activation)
         ages = np.full(n, np.log1p(np.minimum(age, self._age_max) / self._age_unit))  # to Numba, of one type
         x_hat = np.empty((n, network.outputs))
         pieces = network.pieces(n)
@@ -247,9 +247,9 @@ class CompiledDecoder:
                 rows = here.stop - here.start
                 np.matmul(z[here], self._first[2:], out=sums[:rows])
                 entered = memory[1, : rows * width].reshape(rows, width)  # which is free until the second layer
-                enter(sums, self._first, ages[here], entered)
+                kernels.enter(sums, self._first, ages[here], entered)
                 network.piece(entered, memory, out[:rows])
-                finish(out, network.bias, self._units, x_hat[here])
+                kernels.finish(out, network.bias, self._units, x_hat[here])
         return x_hat
 
 
@@ -331,7 +331,7 @@ def _decode(activation: str) -> Callable[..., None]:
     """The first layer on z and age, and the network behind it, for one sample."""
     import numba
 
-    active, evaluate, enter = active_kernel(activation), _kernels(activation)[1], entering_kernel()
+    active, evaluate, enter = active_kernel(activation), network_kernels(activation).single, entering_kernel()
 
     @numba.njit(fastmath=FAST, error_model="numpy")
     def decode(
@@ -358,8 +358,22 @@ def _decode(activation: str) -> Callable[..., None]:
     return decode
 
 
+class BatchKernels(NamedTuple):
+    """What follows the first layer's matrix product, and what follows the last one's."""
+
+    enter: Any
+    finish: Any
+
+
+class NetworkKernels(NamedTuple):
+    """Bias and activation of a batch's layer in place, and a whole network for one sample."""
+
+    activate: Any
+    single: Any
+
+
 @functools.cache
-def batch_kernels(activation: str) -> tuple[Callable[..., None], Callable[..., None]]:
+def batch_kernels(activation: str) -> BatchKernels:
     """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
     import numba
 
@@ -379,7 +393,7 @@ def batch_kernels(activation: str) -> tuple[Callable[..., None], Callable[..., N
             for j in range(len(bias)):
                 out[row, j] = units[0, j] + units[1, j] * (h[row, j] + bias[j])
 
-    return enter, finish
+    return BatchKernels(enter, finish)
 
 
 @functools.cache
@@ -392,7 +406,7 @@ def active_kernel(activation: str) -> Any:
 
 
 @functools.cache
-def _kernels(activation: str) -> tuple[Any, Any]:
+def network_kernels(activation: str) -> NetworkKernels:
     """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
     import numba
 
@@ -438,7 +452,7 @@ def _kernels(activation: str) -> tuple[Any, Any]:
         for j in range(len(out)):
             out[j] = h[j]
 
-    return activate, evaluate
+    return NetworkKernels(activate, evaluate)
 
 
 def _tanh(compiled: Any) -> Callable[[Any], Any]:

@@ -97,7 +97,9 @@ class CompiledCovariance:
         """
         sums, (unit, end) = z @ self._first[2:], self._age
         h = np.empty(sums.shape, np.float32)
-        batch_kernels(self._activation)[0](sums, self._first, np.full(len(z), np.log1p(np.minimum(age, end) / unit)), h)
+        batch_kernels(self._activation).enter(
+            sums, self._first, np.full(len(z), np.log1p(np.minimum(age, end) / unit)), h
+        )
         return h
 
 

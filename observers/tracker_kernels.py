@@ -16,7 +16,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from observers.compiled import UNROLLED, _kernels, active_kernel
+from observers.compiled import UNROLLED, active_kernel, network_kernels
 from observers.polynomial import count, table
 from observers.sparse import single_kernel
 
@@ -187,7 +187,7 @@ def _step(
 
     Its arrays have an entry for each row in the end, or for each sigma point of each row.
     """
-    active, of_one, nx = active_kernel(activation), _kernels(activation)[1], len(used)
+    active, of_one, nx = active_kernel(activation), network_kernels(activation).single, len(used)
     signals, each = nx + nu, 2 * nx
     far, weight, points = math.sqrt(nx), 1 / each, each * lanes
     along, unscaled = _along(signals, degree, used, points), _unscaling()

@@ -34,7 +34,7 @@ REFERENCE = {
 
 def forget():
     """Forgets what has been compiled."""
-    for cache in (machine._kernels, machine._decode, machine.batch_kernels):
+    for cache in (machine.network_kernels, machine._decode, machine.batch_kernels):
         cache.cache_clear()
     for cache in (machine.active_kernel, machine.entering_kernel):
         cache.cache_clear()
@@ -257,7 +257,7 @@ def test_networks(activation, width):
 def test_activations_to_the_last_digits(activation):
     x = np.concatenate([np.linspace(-30, 30, 20001), np.logspace(-30, 1, 2001), [0.0]]).astype(np.float32)
     h = x.copy()
-    machine._kernels(activation)[0](h, np.zeros(7, np.float32))
+    machine.network_kernels(activation).activate(h, np.zeros(7, np.float32))
     expected = REFERENCE[activation](x.astype(float))
     assert (np.abs(h - expected) <= 1e-6 * np.abs(x)).all()  # silu of -30 is a difference, in NumPy as well
     assert (np.abs(h - expected) <= 1e-6 * np.abs(expected))[x >= -1].all()
@@ -265,7 +265,7 @@ def test_activations_to_the_last_digits(activation):
         assert (np.abs(h - expected) <= 3e-7 * np.abs(expected)).all()
         assert np.abs(h).max() <= 1.0
     lost = np.array([np.nan], np.float32)
-    machine._kernels(activation)[0](lost, np.zeros(1, np.float32))
+    machine.network_kernels(activation).activate(lost, np.zeros(1, np.float32))
     assert np.isnan(lost).all()
 
 
@@ -385,7 +385,7 @@ def test_inputs_that_are_read_only_or_have_strides():
 def test_a_batch_compiles_nothing_more_where_rows_restart():
     observer = observers.load("van_der_pol")
     y = np.linspace(-1, 1, MANY_ROWS)[:, None]
-    enter = machine.batch_kernels(observer.artifact.inverse.mlp.activation)[0]
+    enter = machine.batch_kernels(observer.artifact.inverse.mlp.activation).enter
     observer.reset(y)
     observer.step(y, y)
     made = len(enter.signatures)
