@@ -76,17 +76,19 @@ def _check_names(cls: Any, base: Any) -> None:
                 f"{cls.__name__}: {name} is annotated as a parameter, but System.{name} is something else: "
                 f"write {name}: ClassVar = ..., or give the parameter another name"
             )
-    if "__init__" in vars(cls):
+    makers = [each for each in cls.__mro__ if "__init__" in vars(each) and each not in (base, object)]
+    if any("__dataclass_fields__" not in vars(each) for each in makers):
         raise TypeError(
             f"{cls.__name__} defines __init__, and would be made anew without what that sets: write its parameters as "
             "annotated fields under @dataclass(frozen=True), and what follows from them as properties"
         )
-    inherited = {field.name for field in dataclasses.fields(cls)}  # its own come with the decorator, later
-    for name in inherited & vars(cls).keys() - inspect.get_annotations(cls).keys():
-        raise TypeError(
-            f"{cls.__name__}: {name} = {vars(cls)[name]!r} does not change the parameter {name}: write "
-            f"{name}: float = {vars(cls)[name]!r} under @dataclass(frozen=True)"
-        )
+    for name in (field.name for field in dataclasses.fields(cls)):  # its own come with the decorator, later
+        first = next((each for each in cls.__mro__ if name in vars(each)), base)
+        if first is not base and name not in inspect.get_annotations(first):
+            raise TypeError(
+                f"{cls.__name__}: {name} = {vars(first)[name]!r} does not change the parameter {name}: write "
+                f"{name}: float = {vars(first)[name]!r} under @dataclass(frozen=True)"
+            )
     for name in _METHODS:
         if name in vars(cls) and not callable(getattr(cls, name)):
             raise _wrong(cls, name, f"a method; a parameter {name} needs another name")

@@ -134,7 +134,7 @@ def check_equations(system: Any) -> None:
     starts = _checked_starts(system)
     for name in names:
         equations, n = getattr(system, name), len(starts)
-        each = [_values(system, name, x) for x in map(tuple, starts.tolist())]
+        each = [_values(system, name, x, [0.0] * system.nu) for x in map(tuple, starts.tolist())]
         for value in each[0]:
             if isinstance(value, np.floating) and value.itemsize < 8:
                 found = f"{value!r}, and would make a whole motion that coarse: write constants as Python's numbers"
@@ -146,9 +146,11 @@ def check_equations(system: Any) -> None:
             wanted = "finite numbers within X" + (", not below zero" if name == "rate" else "")
             raise returned(equations, wanted, f"{alone[at].tolist()}; {held(starts[at])}")
         x = starts.T.copy()
-        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, x)]).reshape(-1, n).T
-        if not np.array_equal(x, starts.T):
-            found = "something, and changed the state that it was given: write a = a + b in place of a += b"
+        u = np.zeros((system.nu, n))
+        batch = np.array([np.broadcast_to(value, n) for value in _values(system, name, x, u)]).reshape(-1, n).T
+        if u.any() or not np.array_equal(x, starts.T):
+            given = "input" if u.any() else "state"
+            found = f"something, and changed the {given} that it was given: write a = a + b in place of a += b"
             raise returned(equations, "what x makes of it", found)
         rounding = 1e-6 * np.abs(alone).max(initial=0.0)
         if batch.shape != alone.shape or not np.allclose(batch, alone, rtol=1e-3, atol=rounding):
@@ -162,13 +164,13 @@ def check_equations(system: Any) -> None:
             raise
 
 
-def _values(system: Any, name: str, x: Any) -> list[Any]:
+def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
     """All numbers that an equation returns, checked, without input."""
     if name == "g":
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":
         return [rate_at(system, x)]
-    inputs = ([0.0 * x[0]] * system.nu,) if name == "step" else ()
+    inputs = (u,) if name == "step" else ()
     return [*components(getattr(system, name), x, *inputs)]
 
 

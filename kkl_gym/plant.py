@@ -193,8 +193,13 @@ class OfPlant:
     def system(self, system: System) -> None:
         if type(system) is not type(self.plant.system):
             raise ValueError(f"the system can be exchanged for another {self.plant.system.name!r}, got {shown(system)}")
-        self.plant.system = system
-        self._exchanged()
+        check_interval(system, self.plant.dt)
+        before, self.plant.system = self.plant.system, system
+        try:
+            self._exchanged()
+        except Exception:
+            self.plant.system = before
+            raise
 
     def _exchanged(self) -> None:
         """Take over what follows from another system."""
@@ -231,8 +236,9 @@ def _start_box(system: System, box: Box | None) -> tuple[np.ndarray, np.ndarray]
 def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the output h(x) over the declared bounds of the state.
 
-    Evaluated at random states, and at corners, faces' centres and the centre: all of them for up to six states, and
-    some beyond. The latter are exact for outputs that are monotone in each state, and each must have an output.
+    Evaluated at random states, and at corners, faces' centres and the centre, which must have an output. For more than
+    six states these are not all, but for each output the two corners to which it rises and falls from the centre. They
+    are exact for outputs that are monotone in each state.
 
     Parameters
     ----------
@@ -256,7 +262,12 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     if 3**nx <= _MOST_POINTS:
         marked = np.indices((3,) * nx).reshape(nx, -1).T
     else:
-        marked = rng.integers(0, 3, (_MOST_POINTS, nx))
+        steps = np.eye(nx, dtype=int)
+        at_sides = low + (high - low) / 2 * np.concatenate([1 + steps, 1 - steps])
+        with np.errstate(all="ignore"):
+            above, below = np.split(system.output(at_sides), 2)
+        rising = 2 * (above > below).T
+        marked = np.concatenate([rising, 2 - rising, 1 + steps, 1 - steps, rng.integers(0, 3, (_MOST_POINTS, nx))])
     x = low + (high - low) / 2 * np.concatenate([marked, 2.0 * rng.random((_MOST_POINTS, nx))])
     with np.errstate(all="ignore"):
         y = system.output(x)

@@ -186,11 +186,10 @@ def _on_arrays(system: System, x: Components, u: Components, w: Components, dt: 
     """
     try:
         twice = [np.repeat(np.array(values, dtype=float)[:, None], 2, axis=1) for values in (x, u, w)]
-        end, again = equal_substeps(system, twice[0], twice[1], twice[2], dt)
+        found: list[float] = _advance_batch(system, twice[0], twice[1], twice[2], dt)[:, 0].tolist()
     except Exception:
         return None
-    found: list[float] = end[:, 0].tolist()
-    return found if np.isfinite(found).all() and not again.any() else None
+    return found if np.isfinite(found).all() else None
 
 
 def followed(system: System, x: Components, u: Components, w: Components, *, dt: float, end: Components) -> Components:

@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from kkl_gym.declarations import complete
+from kkl_gym.elementary import minimum
 from kkl_gym.equations import components, rate_at
 from kkl_gym.loading import load_class
 from observers.checks import is_finite, mapping, shown
@@ -323,7 +324,8 @@ class System:
         """How fast f changes along its motion, in 1/s: a norm of df/dx, from which the substeps follow.
 
         The default differentiates f numerically, with each state in units of X's half-width, so that it does not depend
-        on the user's units. Override it with a formula where single steps must be fast.
+        on the user's units. Where g depends on the state it is added how fast g(x) u changes (:meth:`rate_under`).
+        Override it with a formula where single steps must be fast; that then stands for both, at the largest input.
 
         Parameters
         ----------
@@ -338,7 +340,9 @@ class System:
         return slope(self.f, x, self.X)
 
     def rate_under(self, x: Components, u: Components) -> Any:
-        """How fast f(x) + g(x) u changes under a held input, in 1/s: where g is constant, :meth:`rate`.
+        """How fast f(x) + g(x) u changes under a held input, in 1/s.
+
+        It is :meth:`rate` where g is constant, and where that is overridden.
 
         Parameters
         ----------
@@ -352,9 +356,15 @@ class System:
         float, or of the kind that the components of ``x`` are
             The rate in 1/s; the sum of both parts' where g depends on the state.
         """
-        if type(self).g is System.g:
-            return self.rate(x)
-        return self.rate(x) + slope(lambda x: [dot(row, u) for row in self.g(x)], x, self.X)
+        rate = self.rate(x)
+        if type(self).g is System.g or type(self).rate is not System.rate:
+            return rate
+
+        def driven(x: Components) -> list[Any]:
+            return [dot(row, u) for row in self.g(x)]
+
+        # The lesser of both sides: of a jump, as of a valve that closes, one side is as steep as there are digits.
+        return rate + minimum(slope(driven, x, self.X), slope(driven, x, self.X, -1))
 
     def box(self, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the training box, or of a multiple of it about ``X_centre``, cut at the bounds.
@@ -466,7 +476,7 @@ def difference_steps(X: Box) -> list[tuple[float, float]]:
     return [(unit, max(unit, 2e-8 * max(map(abs, box)))) for unit, box in zip(units, X, strict=True)]
 
 
-def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
+def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int = 1) -> Any:
     """A norm of a vector field's derivative, differentiated numerically, with each state in units of X's half-width.
 
     Parameters
@@ -477,6 +487,8 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
         Components of the state.
     X : tuple of (float, float), length nx
         The box.
+    side : {1, -1}
+        To which states are moved.
 
     Returns
     -------
@@ -487,7 +499,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box) -> Any:
     fx = field(x)
     total = 0.0
     for j, (own, step) in enumerate(steps):
-        moved, far = field([*x[:j], x[j] + step, *x[j + 1 :]]), step / own
+        moved, far = field([*x[:j], x[j] + side * step, *x[j + 1 :]]), step / own
         total = total + sum(((b - a) / (unit * far)) ** 2 for a, b, (unit, _) in zip(fx, moved, steps, strict=True))
     return total**0.5
 

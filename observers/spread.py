@@ -57,7 +57,7 @@ class Spread:
 
     def largest_variances(self, scale: np.ndarray) -> np.ndarray:
         """What variances are cut to, (nx,), in units of states of a scale."""
-        return np.square(LARGEST * _positive(scale[: self.nx]))
+        return np.maximum(np.square(LARGEST * np.abs(scale[: self.nx])), np.finfo(float).tiny)
 
     def in_units(self, scale: np.ndarray) -> MLP:
         """The network with the scale of the states in its last biases: the logarithms are of D in their units.
@@ -65,7 +65,7 @@ class Spread:
         Behind the states there may be parameters, of whose errors nothing is said.
         """
         *biases, bias = (np.array(each, dtype=float) for each in self.mlp.biases)
-        bias[: self.nx] += np.log(_positive(scale[: self.nx]))
+        bias[: self.nx] += np.log(np.maximum(np.abs(scale[: self.nx]), np.finfo(float).tiny))
         return MLP(self.mlp.weights, [*biases, bias], self.mlp.activation)
 
 
@@ -186,10 +186,6 @@ def _cut(entries: list[float], largest: list[float]) -> list[float]:
         return entries
     shares = [math.sqrt(end / max(variance, end)) for variance, end in zip(variances, largest, strict=True)]
     return [entry * (shares[i // nx] * shares[i % nx]) for i, entry in enumerate(entries)]
-
-
-def _positive(scale: np.ndarray) -> np.ndarray:
-    return np.maximum(np.abs(scale), np.finfo(float).tiny)
 
 
 def _product(scales: Any, lower: Any) -> list[Any]:

@@ -7,6 +7,7 @@ process. Rows go through it many at a time, one in each lane of the processor's 
 
 import functools
 import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,61 @@ from kkl_gym.system import System
 MAX_OPERATIONS = 400  # of f + g u; beyond, such as for a network as f, compiling takes many seconds
 _TRIALS = 200  # states of each kind at which both are compared
 _LANES = 32  # rows that make a step together: a few of the processor's vectors
+
+
+@dataclass(frozen=True)
+class CompiledBatch:
+    """A kernel and the system that it is of, called as ``step(x, u, w, dt)``.
+
+    Parameters
+    ----------
+    system : System
+        Takes the steps that the kernel leaves.
+    kernel : callable
+        Substeps of one length for each row.
+    """
+
+    system: System
+    kernel: Any
+
+    def __call__(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
+        """The next states, (nx, n), from states (nx, n), inputs (nu, n) and process noise (nx, n)."""
+        out, lost = self._substeps(x, u, w, dt)
+        if lost:
+            rows = np.flatnonzero(np.isnan(out[0]))
+            out[:, rows] = advance_batch(self.system, x[:, rows], u[:, rows], w[:, rows], dt)
+        return out
+
+    def check(self) -> None:
+        """Raise ValueError if NumPy makes other steps from any of many states.
+
+        Equations such as ``1 if x[0] == 0 else ...`` mean something else to symbols. And what they read may have
+        changed since they were compiled.
+        """
+        system, nx, nu = self.system, self.system.nx, self.system.nu
+        u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None] / system.pace
+        rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
+        for points in trial_states(system, _TRIALS, np.random.default_rng(0)):
+            rng, n = np.random.default_rng(0), len(points)
+            at = points.T, u_max * rng.uniform(-1, 1, (nu, n)), scale * rng.uniform(-1, 1, (nx, n)), system.dt
+            found, expected = self._substeps(*at)[0], self._in_numpy(*at)[0]
+            expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
+            if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
+                raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
+
+    def _substeps(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+        """What NumPy's substeps of one length make of it, NaN where they do not do, and whether there are such."""
+        out = np.empty(x.shape)
+        try:
+            lost = self.kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
+        except ArithmeticError:  # negative powers of zero, which Numba raises even so
+            return self._in_numpy(x, u, w, dt)
+        return out, lost
+
+    def _in_numpy(self, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
+        out, again = equal_substeps(self.system, x, u, w, dt)
+        out[:, again] = np.nan
+        return out, bool(again.any())
 
 
 def batch_step(system: System) -> SamplingStep[np.ndarray]:
@@ -41,10 +97,18 @@ def batch_step(system: System) -> SamplingStep[np.ndarray]:
         The step, and why it is not compiled where it is not.
     """
     said = f"{system.name} goes on with NumPy, not compiled"
-    return shared_step(system, compiled_step, advance_batch, said=said)
+    return shared_step(system, compiled_step, advance_batch, said=said, again=_again)
 
 
-def compiled_step(system: System) -> Advance[np.ndarray]:
+def _again(step: Advance[np.ndarray], system: System) -> Advance[np.ndarray]:
+    """The kernel of a step for another system that it should be the same of; ValueError if it is not."""
+    assert isinstance(step, CompiledBatch)
+    found = replace(step, system=system)
+    found.check()
+    return found
+
+
+def compiled_step(system: System) -> CompiledBatch:
     """The compiled step of :func:`batch_step`.
 
     Parameters
@@ -54,8 +118,8 @@ def compiled_step(system: System) -> Advance[np.ndarray]:
 
     Returns
     -------
-    callable
-        From (x, u, w, dt) to the next states, as :class:`SamplingStep`.
+    CompiledBatch
+        From (x, u, w, dt) to the next states.
 
     Raises
     ------
@@ -100,38 +164,9 @@ def compiled_step(system: System) -> Advance[np.ndarray]:
     exec("\n".join(_kernel_lines(nx, nu)), namespace)
     kernel = compiled(namespace["kernel"])
 
-    def substeps(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-        """What NumPy's substeps of one length make of it, NaN where they do not do, and whether there are such."""
-        out = np.empty(x.shape)
-        try:
-            lost = kernel(*(np.ascontiguousarray(values, dtype=float) for values in (x, u, w)), dt, out)
-        except ArithmeticError:  # negative powers of zero, which Numba raises even so
-            return in_numpy(x, u, w, dt)
-        return out, lost
-
-    def in_numpy(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> tuple[np.ndarray, bool]:
-        out, again = equal_substeps(system, x, u, w, dt)
-        out[:, again] = np.nan
-        return out, bool(again.any())
-
-    def step(x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-        out, lost = substeps(x, u, w, dt)
-        if lost:
-            rows = np.flatnonzero(np.isnan(out[0]))
-            out[:, rows] = advance_batch(system, x[:, rows], u[:, rows], w[:, rows], dt)
-        return out
-
-    # Compiles, or says why not; and equations such as `1 if x[0] == 0 else ...` mean something else to symbols.
-    u_max, scale = np.array(system.u_max)[:, None], np.array(system.scale)[:, None]
-    rounding = 1e-9 * np.ptp(system.X, axis=1)[:, None]
-    for points in trial_states(system, _TRIALS, np.random.default_rng(0)):
-        rng, n = np.random.default_rng(0), len(points)
-        at = points.T, u_max * rng.uniform(-1, 1, (nu, n)), scale / system.pace * rng.uniform(-1, 1, (nx, n)), system.dt
-        found, expected = substeps(*at)[0], in_numpy(*at)[0]
-        expected[~np.isfinite(expected)] = found[~np.isfinite(found)] = np.nan  # what escapes may be either
-        if not np.allclose(found, expected, rtol=1e-9, atol=rounding, equal_nan=True):
-            raise ValueError(f"{system.name}: what the equations say to symbols is not what they say to numbers")
-    return step
+    found = CompiledBatch(system, kernel)
+    found.check()  # compiles, or says why not
+    return found
 
 
 def _is_root(expression: Any) -> bool:

@@ -8,16 +8,11 @@ from collections import namedtuple
 from types import FunctionType
 from typing import Any
 
-import numpy as np
-
-from kkl_gym import elementary
 from kkl_gym.system import System
-
-_SEQUENCES = (tuple, list, np.ndarray, np.generic)
 
 
 def made_of(system: System) -> tuple[Any, ...]:
-    """All that a compiled step depends on.
+    """All that a compiled step depends on, as far as it can be seen.
 
     Parameters
     ----------
@@ -27,22 +22,11 @@ def made_of(system: System) -> tuple[Any, ...]:
     Returns
     -------
     tuple
-        The functions, with those that they call, and the numbers that these read, as text: 0.0 is not -0.0.
+        The functions, and the numbers that they read, as text: 0.0 is not -0.0.
     """
-    functions = [getattr(type(system), name) for name in ("f", "g", "rate")]
-    values = [repr((system.parameters, system.G, system.X, system.bounds, system.dt))]
-    for function in functions:  # which grow on the way
-        read = Read(system, function)
-        others = {**read.others, **read.attributes}
-        values.append(repr((read.on_self, read.of_module)))
-        values += [f"{name} {_written(value)}" for name, value in others.items() if isinstance(value, _SEQUENCES)]
-        called = (getattr(value, "__func__", value) for value in others.values())  # of a static method, too
-        functions += [
-            each
-            for each in called
-            if isinstance(each, FunctionType) and each not in functions and each.__module__ != elementary.__name__
-        ]
-    return type(system), *functions, *values
+    functions = tuple(getattr(type(system), name) for name in ("f", "g", "rate"))
+    numbers = (repr((found.on_self, found.of_module)) for found in (Read(system, each) for each in functions))
+    return type(system), *functions, repr((system.parameters, system.G, system.X, system.bounds, system.dt)), *numbers
 
 
 class Read:
@@ -94,10 +78,6 @@ def _names(function: FunctionType) -> tuple[tuple[str, ...], tuple[str, ...]]:
         elif instruction.opname in ("LOAD_ATTR", "LOAD_METHOD"):
             attributes[instruction.argval] = None
     return tuple(of_module), tuple(attributes)
-
-
-def _written(value: Any) -> str:
-    return repr(value.tolist() if isinstance(value, np.ndarray | np.generic) else value)
 
 
 def _is_number(value: Any) -> bool:

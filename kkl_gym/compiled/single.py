@@ -82,18 +82,22 @@ def compiled_step(system: System) -> Advance[Components]:
     for name in ("f",) if constant else ("f", "g"):
         function = getattr(type(system), name)
         namespace[name], namespace[f"{name}_self"] = compiled(function), _checked(system, name).stand_in()
-    if type(system).rate is System.rate:
+    own_rate = type(system).rate is not System.rate
+    if not own_rate:
         exec("\n".join(_slope_lines("rate_alone", "f(f_self, {})", system)), namespace)
     else:
         namespace["rate_of"], namespace["rate_self"] = compiled(type(system).rate), _checked(system, "rate").stand_in()
         exec("def rate_alone(x, u):\n    return rate_of(rate_self, x)", namespace)
     exec("\n".join(_field_lines(nx, nu, constant=constant)), namespace)
-    if constant:
+    if not constant:
+        namespace["driven"] = compiled(namespace["driven"])
+    if constant or own_rate:
         namespace["rate"] = namespace["rate_alone"]
     else:
-        exec("\n".join(_slope_lines("slope", "driven({}, u)", system)), namespace)
-        exec("def rate(x, u):\n    return rate_alone(x, u) + slope(x, u)", namespace)
-        namespace |= {name: compiled(namespace[name]) for name in ("driven", "slope", "rate_alone")}
+        for side, name in ((1, "above"), (-1, "below")):
+            exec("\n".join(_slope_lines(name, "driven({}, u)", system, side)), namespace)
+        exec("def rate(x, u):\n    return rate_alone(x, u) + min(above(x, u), below(x, u))", namespace)
+        namespace |= {name: compiled(namespace[name]) for name in ("above", "below", "rate_alone")}
     namespace |= {name: compiled(namespace[name]) for name in ("field", "rate")}
     namespace["integrate"] = compiled(runge_kutta(nx if constant else nx + nu))
     exec("\n".join(_kernel_lines(system, constant=constant)), namespace)
@@ -177,12 +181,12 @@ def _dot(row: str, nu: int) -> str:
     return "(0.0" + "".join(f" + {row}[{j}] * u[{j}]" for j in range(nu)) + ")"
 
 
-def _slope_lines(name: str, field: str, system: System) -> list[str]:
+def _slope_lines(name: str, field: str, system: System, side: int = 1) -> list[str]:
     """Python of :func:`kkl_gym.system.slope` of a vector field, written out."""
     steps = difference_steps(system.X)
     lines = [f"def {name}(x, u):", f"    fx, total = {field.format('x')}, 0.0"]
     for j, (own, step) in enumerate(steps):
-        moved = "".join(f"x[{i}] + {step!r}, " if i == j else f"x[{i}], " for i in range(system.nx))
+        moved = "".join(f"x[{i}] + {side * step!r}, " if i == j else f"x[{i}], " for i in range(system.nx))
         lines += [f"    fm, part = {field.format(f'({moved})')}, 0.0"]
         for i, (unit, _) in enumerate(steps):
             lines += [f"    part += ((fm[{i}] - fx[{i}]) / {unit * (step / own)!r}) ** 2"]

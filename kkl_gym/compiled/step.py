@@ -65,6 +65,7 @@ def shared_step(
     otherwise: Callable[..., Values],
     *,
     said: str,
+    again: Callable[[Advance[Values], System], Advance[Values]] | None = None,
 ) -> SamplingStep[Values]:
     """The compiled step of a system, made once for all systems that it is the same of.
 
@@ -78,6 +79,8 @@ def shared_step(
         From (system, x, u, w, dt) to the next x, where it does.
     said : str
         What the logger then says once, before the reason.
+    again : callable, optional
+        From a compiled step and another system to the same for that; ValueError if its equations say something else.
 
     Returns
     -------
@@ -92,6 +95,11 @@ def shared_step(
     except Exception as error:
         return SamplingStep(plain, _reason(error))
     found = _kept.get(of)
+    if found is not None and found.obstacle is None and again is not None:
+        try:
+            return SamplingStep(again(found.advance, system))
+        except ValueError:  # something has changed that nobody can see
+            found = None
     if found is None:
         try:
             found = SamplingStep(compile_step(system))

@@ -187,7 +187,7 @@ class KKLObservation(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
             monitor=bool(monitor),
             known_start=bool(known_start),
             uncertainty=bool(uncertainty),
-            compiled=compiled,
+            compiled=None if compiled is None else bool(compiled),
         )
         gym.Wrapper.__init__(self, env)
         self._estimator, self._samples = estimator, samples

@@ -55,6 +55,31 @@ def test_what_a_constructor_sets_would_be_lost():
         declared(__init__=lambda self: None)
 
 
+def test_what_parents_would_lose_is_refused_too():
+    class Hardware:
+        mu = 2.0
+
+        def __init__(self):
+            self.drag = 1.0
+
+    class Softer:
+        mu = 2.0
+
+    with pytest.raises(TypeError, match="Boat defines __init__, and would be made anew"):
+        type("Boat", (Hardware, VanDerPol), {"name": "boat"})
+    with pytest.raises(TypeError, match=r"Mixed: mu = 2\.0 does not change the parameter mu"):
+        type("Mixed", (Softer, VanDerPol), {"name": "mixed"})
+
+
+def test_slots_are_taken():
+    @dataclass(frozen=True, slots=True)
+    class Slotted(VanDerPol):
+        mu: float = 2.0
+        name = "slotted"
+
+    assert Slotted(1.5).replace({"mu": 2.5}).mu == 2.5
+
+
 def test_lists_arrays_and_numbers_of_numpy_become_tuples_of_numbers():
     cls = declared(
         X=np.array([[-1, 1], [-1.5, 1]]),

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import kkl_gym
-from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, get_system
+from kkl_gym import ENV_IDS, KKLEnv, Lorenz, Rossler, System, get_system
+from kkl_gym.elementary import sin
 from kkl_gym.plant import NOISE_BLOCK, output_bounds
 from kkl_gym.simulate import SubstepsError, advance
 
@@ -532,3 +533,20 @@ def test_the_prefixed_id_needs_no_import():
 
 def test_public_names_exist():
     assert all(hasattr(kkl_gym, name) for name in kkl_gym.__all__)
+
+
+@pytest.mark.parametrize("n", [3, 6, 7, 20])
+def test_outputs_bounds_hold_all_corners_and_what_lies_between(n):
+    class Chain(System):
+        name = "chain"
+        X, bounds = ((-1, 1),) * n, ((-2, 2),) * n
+
+        def f(self, x):
+            return [-xi for xi in x]
+
+        def h(self, x):
+            return sum(x) - 3.0 * x[0], sin(x[0])
+
+    low, high = output_bounds(Chain(), 0.0)
+    assert high[0] == -low[0] == 2.0 * (n + 1)
+    np.testing.assert_allclose((low[1], high[1]), (-1.0, 1.0), atol=1e-3)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
-from kkl_gym.elementary import exp, sin
+from kkl_gym.elementary import exp, sin, where
 from kkl_gym.simulate import (
     GROWTH,
     MAX_SUBSTEPS,
@@ -455,6 +455,45 @@ def test_what_an_input_speeds_up_is_followed(u):
         found = step(np.full((1, 3), x0), np.full((1, 3), u), np.zeros((1, 3)), dt)
         np.testing.assert_allclose(found, expected, rtol=1e-6)
     assert Flushed().typical_rate == pytest.approx(400.02, rel=1e-6)  # from which the default dt follows
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.1, 1.0])
+def test_a_pump_that_stops_at_zero_takes_no_more_substeps(dt):
+    class Pumped(Flushed):
+        name = "pumped"
+        u_max = (1.0,)
+
+        def g(self, x):
+            return ((where(x[0] > 0, -1.0, 0.0),),)
+
+    system = Pumped()
+    assert system.rate_under((0.0,), (1.0,)) < 0.1
+    for step in (advance, lambda system, *at: single_step(system)(*at)):
+        assert step(system, (0.0,), [1.0], [0.0], dt)[0] == 0.0
+
+
+def test_an_own_rate_stands_for_inputs_too():
+    class Rated(Flushed):
+        name = "rated"
+
+        def rate(self, x):
+            return 7.0
+
+    assert Rated().rate_under((0.3,), (400.0,)) == 7.0
+
+
+def test_a_step_in_discrete_time_that_leaves_out_a_division_by_zero():
+    class Kicked(System):
+        name = "kicked"
+        X, bounds, dt = ((-1, 1),), ((-5, 5),), 0.1
+
+        def step(self, x, u):
+            return (where(abs(x[0]) > 0.1, 0.09 * x[0] / x[0], 1.0 - 0.5 * x[0]),)
+
+        def h(self, x):
+            return (x[0],)
+
+    assert advance(Kicked(), (0.0,), [], [0.0], 0.1)[0] == 1.0
 
 
 @pytest.mark.parametrize("dt", [0, -0.01, math.nan, math.inf, "0.01", None])

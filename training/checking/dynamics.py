@@ -37,8 +37,8 @@ def rate(subject: Subject) -> Iterator[Finding]:
     typical, own = system.typical_rate, type(system).rate is not System.rate
     x = np.concatenate([subject.inner, subject.outer])
     with np.errstate(all="ignore"):
-        worst = float(np.nanmax(system.rate(subject.everywhere.T)))
-        said = np.broadcast_to(np.asarray(system.rate(x.T), dtype=float), len(x))
+        worst = float(np.nanmax(system.rate_under(subject.everywhere.T, system.u_max)))
+        said = np.broadcast_to(np.asarray(system.rate_under(x.T, system.u_max), dtype=float), len(x))
         norm = float(np.nanmedian(System.rate(system, x.T)))
     fastest = np.abs(np.linalg.eigvals(subject.jacobian(x))).max(1)
     found = f"typically {number(typical)}/s in X, at most {number(worst)}/s within the bounds: "
