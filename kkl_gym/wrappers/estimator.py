@@ -210,7 +210,8 @@ class KKLEstimator:
             As the class, and if the file is missing or damaged, or was made for another system, other parameters or
             another dt.
         """
-        system = plant.system
+        choice("estimate", estimate, ("x", "z"))
+        uncertainty, system = flag("uncertainty", uncertainty), plant.system
         if observer is None and system.name not in shipped():
             raise ValueError(f"no map ships for {system.name!r}: train one and pass observer='….safetensors'")
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer or system.name))

@@ -11,6 +11,7 @@ from kkl_gym.named import InputReader, Reader, observed, resolved
 from kkl_gym.signals import Inputs
 from kkl_gym.wrappers.estimator import KKLEstimator, reach, with_deviations
 from observers import Artifact, ArtifactError
+from observers.checks import choice, flag
 
 
 class NamedEstimator(KKLEstimator):
@@ -64,6 +65,8 @@ class NamedEstimator(KKLEstimator):
         uncertainty: bool,
         compiled: bool | None = None,
     ) -> None:
+        choice("estimate", estimate, ("x", "z"))
+        uncertainty = flag("uncertainty", uncertainty)
         check_identity(artifact, env)
         try:
             _check_actions(env, action_space)
