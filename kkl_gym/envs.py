@@ -128,12 +128,12 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
 
         # What every step reads, as Python numbers
         self._nu = self.system.nu
+        self._sample = self._samples = 0  # since reset, and before it, of this system
         self._advance: Callable[..., Components]
         self._exchanged()
         self._bounds, self._u_max = self.system.bounds, self.system.u_max
         self._limits = [*zip(self.observation_space.low.tolist(), self.observation_space.high.tolist(), strict=True)]
         self._noise: list[tuple[list[float], list[float]]] = []
-        self._sample = self._samples = 0  # since reset, and before it
         self._x: tuple[float, ...] | None = None
         self._u: list[float] | None = None  # kept, as the trail is, for rendering
         self._trail: deque[tuple[float, ...]] = deque(maxlen=TRAIL)
@@ -330,6 +330,7 @@ class KKLEnv(OfPlant, gym.Env[np.ndarray, np.ndarray]):
     def _exchanged(self) -> None:
         self._goal = [*zip(target_of(self.system), self.plant.weights.tolist(), strict=True)]
         self._advance = partial(advance, self.system)
+        self._samples = -self._sample  # a system that stays for an episode is not worth to be compiled
 
     def _input(self, action: np.ndarray) -> list[float]:
         if type(action) is not np.ndarray or action.dtype not in _ACTIONS:

@@ -165,7 +165,7 @@ def check_equations(system: Any) -> None:
 
 
 def _values(system: Any, name: str, x: Any, u: Any) -> list[Any]:
-    """All numbers that an equation returns, checked, without input."""
+    """All numbers that an equation returns, checked."""
     if name == "g":
         return [value for row in input_matrix(system, x) for value in row]
     if name == "rate":

@@ -82,9 +82,10 @@ def batch_step(system: System) -> SamplingStep[np.ndarray]:
 
     The two agree to rounding. Equations that sympy cannot read, such as those with NumPy functions or ``if``, go on
     with NumPy. So do those with which the two disagree anywhere they are compared. :mod:`kkl_gym.elementary` has
-    functions that serve both. The equations must depend on nothing but state, input and parameters. The logger
-    ``kkl_gym`` says at level INFO, once for each system, that NumPy goes on and why. Systems in discrete time are not
-    integrated, and make their steps in NumPy.
+    functions that serve both. What the equations read besides must not change while the step is in use: they are
+    compared each time this is called, and compiled anew where they say something else. The logger ``kkl_gym`` says at
+    level INFO, once for each system, that NumPy goes on and why. Systems in discrete time are not integrated, and make
+    their steps in NumPy.
 
     Parameters
     ----------
@@ -162,9 +163,7 @@ def compiled_step(system: System) -> CompiledBatch:
         "np": np,
     }
     exec("\n".join(_kernel_lines(nx, nu)), namespace)
-    kernel = compiled(namespace["kernel"])
-
-    found = CompiledBatch(system, kernel)
+    found = CompiledBatch(system, compiled(namespace["kernel"]))
     found.check()  # compiles, or says why not
     return found
 

@@ -350,6 +350,16 @@ def test_an_environment_that_is_given_another_system_takes_its_equations():
             setattr(one, name, 0.1)
 
 
+def test_systems_that_stay_for_an_episode_are_not_compiled():
+    env = KKLEnv("lorenz")
+    for rho in (26.0, 27.0):
+        env.system = env.system.replace({"rho": rho})
+        episode(env, 0, SOON)
+        assert in_python(env)
+    episode(env, 0, 3)
+    assert not in_python(env)  # it has stayed
+
+
 def test_a_vector_that_is_given_another_system_takes_its_equations():
     one, other = (KKLVectorEnv("lorenz", 200, parameters={"rho": rho}) for rho in (28.0, 20.0))
     for env in (one, other):

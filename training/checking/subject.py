@@ -206,11 +206,8 @@ class Subject:
             Mean over states, so that what ignites now and then hardly counts.
         """
         with np.errstate(all="ignore"):
-            need = (
-                np.broadcast_to(self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max), x.shape[:-1])
-                * self.dt
-                / RATE_STEP
-            )
+            rate = self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max)
+            need = np.broadcast_to(rate, x.shape[:-1]) * self.dt / RATE_STEP
         return np.asarray(np.nan_to_num(need, nan=1.0, posinf=1.0).clip(1.0).mean(-1))
 
     def affordable(self) -> float:

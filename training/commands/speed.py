@@ -292,8 +292,8 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
     shares = {"simulation": "", "network": ""}
     if isinstance(base, kkl_gym.KKLVectorEnv):
         system, x = base.plant.system, info["x"].T.copy()
-        u, w = np.zeros((system.nu, x.shape[1])), np.zeros_like(x)
-        shares["simulation"] = _share(lambda: batch_step(system)(x, u, w, base.plant.dt), step)
+        u, w, advance = np.zeros((system.nu, x.shape[1])), np.zeros_like(x), batch_step(system)
+        shares["simulation"] = _share(lambda: advance(x, u, w, base.plant.dt), step)
     if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
         shares["network"] = _share(lambda: _decoded(env.observer, error_bars="x_cov" in info), step)
     return shares
