@@ -67,17 +67,17 @@ def monomials(q: np.ndarray, degree: int) -> np.ndarray:
     variables = q.shape[-1]
     terms = np.empty((*q.shape[:-1], count(variables, degree)))
     terms[..., 0], terms[..., 1 : 1 + variables] = 1.0, q
-    for new, earlier, by in _products(variables, degree):
+    for new, earlier, by in products(variables, degree):
         np.multiply(terms.take(earlier, -1), q.take(by, -1), out=terms[..., new])
     return terms
 
 
 @functools.cache
-def _products(variables: int, degree: int) -> list[tuple[slice, np.ndarray, np.ndarray]]:
+def products(variables: int, degree: int) -> list[tuple[slice, np.ndarray, np.ndarray]]:
     """Where the monomials of each degree from 2 on lie, and what they are made of."""
     earlier, by = table(variables, degree)
     ends = [count(variables, k) for k in range(1, degree + 1)]
     return [(slice(*span), earlier[slice(*span)], by[slice(*span)]) for span in itertools.pairwise(ends)]
 
 
-__all__ = ["count", "degree_of", "monomials", "table"]
+__all__ = ["count", "degree_of", "monomials", "products", "table"]

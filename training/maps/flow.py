@@ -31,7 +31,7 @@ BATCH, LEARNING_RATE = 1024, 3e-3
 # deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
 # then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
-NARROW, WIDE = (8, 2), (32, 2)  # neurons in each hidden layer, and how many there are
+NARROW, WIDE = (8, 2), (24, 2)  # neurons in each hidden layer, and how many there are
 SMALL_NARROW, SMALL_WIDE = (4, 1), (12, 2)  # of small flows
 # The polynomials of small flows lack terms that move a state by less than that part of what they leave, or than that
 # many standard deviations. The others are then fitted again (S. L. Brunton et al., Proc. Natl. Acad. Sci. 113, 2016).

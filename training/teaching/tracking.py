@@ -12,6 +12,7 @@ from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.kalman import LEAST_PROCESS_NOISE, NOISE_FLOOR
+from training.maps.ahead import draw_courses, learn_ahead
 from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
@@ -22,6 +23,7 @@ from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
 OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
+AHEAD = 0.125  # of the batches that learn single samples, so many learn many samples in a row
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -40,10 +42,10 @@ def learn_tracking(
     """Teach an observer to track: to carry its estimate on by the system's motion, which is learned here.
 
     T_inv and its error bars stay as they are. A polynomial and a small network learn how states change over a sample,
-    on simulated ones about the system's motions. An unscented Kalman filter on that flow is what
-    :class:`observers.KKLObserver` then runs beside z. Its covariances are calibrated on further motions, so that
-    regions of 90 % hold 90 % of the errors, or up to 92 % where a few are far off, and so are the limits of the
-    monitor, if there are any.
+    on simulated ones about the system's motions. They then learn what many samples in a row add up to. An unscented
+    Kalman filter on that flow is what :class:`observers.KKLObserver` then runs beside z. Its covariances are calibrated
+    on further motions, so that regions of 90 % hold 90 % of the errors, or up to 92 % where a few are far off, and so
+    are the limits of the monitor, if there are any.
 
     Parameters
     ----------
@@ -193,6 +195,8 @@ def _learned(
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
+    courses = draw_courses(system, increments.x, increments.u, dt)
+    flow = learn_ahead(flow, courses, steps=round(AHEAD * steps), seed=seed, progress=progress, device=device)
     return dataclasses.replace(flow, error=usual_error(flow, judged), bend=usual_bend(flow, judged))
 
 

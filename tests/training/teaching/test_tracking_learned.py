@@ -137,7 +137,7 @@ def test_a_policy_needs_an_observer_that_knows_of_inputs():
 SHAPES = {  # of networks, where a polynomial leaves much, and of small flows
     (False, False): [8, 8, 2],
     (False, True): [4, 2],
-    (True, False): [32, 32, 2],
+    (True, False): [24, 24, 2],
     (True, True): [12, 12, 2],
 }
 

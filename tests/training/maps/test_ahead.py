@@ -1,0 +1,93 @@
+"""Flows that are late, on a rotation, of which everything is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from linear_system import Oscillator
+from tracking import DT, exact_motion, tracking_observer
+
+from observers.polynomial import monomials
+from training.maps import ahead
+from training.maps.ahead import AheadProblem, draw_courses, learn_ahead
+from training.progress import progress_bars
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ahead, "SAMPLES", 20)
+        patch.setattr(ahead, "JUDGED", 100)
+        yield
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return tracking_observer().flow
+
+
+@pytest.fixture(scope="module")
+def courses():
+    return draw_courses(Oscillator(), np.random.default_rng(0).uniform(-1, 1, (500, 2)), np.zeros((500, 0)), DT)
+
+
+def late(flow, share):
+    """The same motion, by so much of a sample behind."""
+    return dataclasses.replace(flow, polynomial=(1 - share) * flow.polynomial, gain=np.full(2, 1e-2))
+
+
+def learned(flow, courses, steps=300):
+    with progress_bars(None) as progress:
+        return learn_ahead(flow, courses, steps=steps, seed=0, progress=progress)
+
+
+def test_courses_are_motions_of_the_system(courses):
+    Phi, _ = exact_motion()
+    assert courses.x.shape == (21, 500, 2)
+    np.testing.assert_allclose(courses.x[-1], courses.x[0] @ np.linalg.matrix_power(Phi, 20).T, atol=1e-6)
+
+
+def test_what_leaves_the_bounds_is_left_out():
+    (low, high), _ = Oscillator().bounds
+    x = np.array([[0.0, 0.0], [0.99 * high, 10.0 * high], [0.1, 0.1]])
+    assert len(draw_courses(Oscillator(), x, np.zeros((3, 0)), DT).u) < 3
+
+
+def test_errors_are_what_being_late_costs(exact, courses):
+    """Late by a share of each sample is, after k of them, late by k such shares; the root of k is taken off."""
+    problem = AheadProblem(late(exact, 1e-3), courses, device=torch.device("cpu"))
+    squares = problem._squares(torch.arange(200)).detach().numpy()
+    assert squares.shape == (3, 200)
+    np.testing.assert_allclose(np.median(np.sqrt(squares), axis=1), 1e-3 * np.sqrt([1, 10, 20]), rtol=0.1)
+
+
+def test_a_flow_that_is_late_is_mended(exact, courses):
+    flow = late(exact, 3e-3)
+    found = learned(flow, courses)
+    before, after = (AheadProblem(each, courses, device=torch.device("cpu")).judged() for each in (flow, found))
+    assert after < 0.1 * before
+    np.testing.assert_array_equal(found.polynomial == 0, flow.polynomial == 0)
+
+
+def test_a_flow_that_is_hardly_late_stays(exact, courses):
+    assert learned(exact, courses) is exact
+
+
+def test_what_is_not_better_is_not_taken(exact, courses, monkeypatch):
+    monkeypatch.setattr(ahead, "LEARNING_RATE", 10.0)
+    flow = late(exact, 1e-2)
+    assert learned(flow, courses, steps=3) is flow
+
+
+def test_too_few_courses_teach_nothing(exact, courses):
+    flow = late(exact, 1e-2)
+    few = ahead.Courses(courses.x[:, :199], courses.u[:199])
+    assert learned(flow, few) is flow
+    assert learned(flow, courses, steps=0) is flow
+
+
+def test_monomials_are_those_of_numpy(exact, courses):
+    problem = AheadProblem(exact, courses, device=torch.device("cpu"))
+    q = np.random.default_rng(1).normal(size=(7, 2))
+    np.testing.assert_allclose(problem._monomials(torch.tensor(q)).numpy(), monomials(q, exact.degree), rtol=1e-14)
