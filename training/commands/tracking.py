@@ -31,7 +31,7 @@ class Tracking(Teaching):
     size: Size = "default"
     """small: a smaller network, and a polynomial of few terms, for fast simulations and microcontrollers."""
     steps: int = 40_000
-    """Batches for the network."""
+    """Batches for the network. Of a system, an eighth as many follow that learn a hundred samples in a row."""
     trajectories: int = 1600
     """Number of motions on which covariances are calibrated, 50 at least."""
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help_behavior_hint="")] = None

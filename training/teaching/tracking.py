@@ -54,7 +54,7 @@ def learn_tracking(
     system : System
         What it was made for.
     steps : int
-        Batches for the network.
+        Batches for the network. An eighth as many follow, of many samples in a row each.
     small : bool
         Whether network and polynomial are smaller than usual, for small maps.
     trajectories : int
