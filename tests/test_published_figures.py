@@ -109,9 +109,13 @@ def test_the_page_on_accuracy_says_what_noise_does():
     found = pd.read_csv(RESULTS / "benchmark" / "results.csv")
     medians = found[(found.starts == "X") & (found.noise == 0.5)].groupby(["method", "system"]).smape.median()
     behind = {
-        name for name in ("ekf", "ukf") for system in SYSTEMS if medians[name][system] < medians["shipped"][system]
+        (name, system): medians["shipped"][system] / medians[name][system]
+        for name in ("ekf", "ukf")
+        for system in SYSTEMS
+        if medians[name][system] < medians["shipped"][system]
     }
-    assert not behind, "which the page says"
+    assert list(behind) == [("ukf", "reverse_duffing")], "which the page says"
+    assert behind["ukf", "reverse_duffing"] < 1.05, "level"
 
 
 @pytest.mark.parametrize(

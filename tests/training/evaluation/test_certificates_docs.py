@@ -51,8 +51,8 @@ def test_the_sharp_bound():
         assert (low, high) == pytest.approx((min(ratios), max(ratios)), rel=0.05)
     parts = [one["forward"] for one in committed() if one["forward"]]
     ratios = [(part["steep_risk"] / part["propagated_risk"]) ** 0.5 for part in parts]
-    assert "the estimate 152 to 4,310 times less than the sharp bound says" in page()
-    assert (min(ratios), max(ratios)) == pytest.approx((152, 4310), rel=0.05)
+    assert "the estimate 256 to 3,290 times less than the sharp bound says" in page()
+    assert (min(ratios), max(ratios)) == pytest.approx((256, 3290), rel=0.05)
     assert max(part["reconstruction_risk"] / part["steep_risk"] for part in parts) < 1e-5
     shares = [one["forward"]["forward_share"] for one in committed() if one["forward"]]
     assert min(shares) > 0.9  # "Nearly all of the first bound is T's term."
