@@ -98,7 +98,10 @@ def learn_ahead(
     before = problem.judged()
     if before <= ENOUGH:
         return flow
-    optimise_at_once("ahead", problem, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
+    try:
+        optimise_at_once("ahead", problem, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
+    except FloatingPointError:  # motions that part fast enough have gradients that overflow
+        return flow
     return problem.flow() if problem.judged() < before else flow
 
 

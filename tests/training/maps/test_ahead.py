@@ -80,6 +80,15 @@ def test_what_is_not_better_is_not_taken(exact, courses, monkeypatch):
     assert learned(flow, courses, steps=3) is flow
 
 
+def test_gradients_that_overflow_lose_nothing(exact, courses, monkeypatch):
+    def overflowing(problem, generator):
+        return {"loss": problem.correction.sum() * float("nan")}
+
+    monkeypatch.setattr(AheadProblem, "loss", overflowing)
+    flow = late(exact, 1e-2)
+    assert learned(flow, courses, steps=3) is flow
+
+
 def test_too_few_courses_teach_nothing(exact, courses):
     flow = late(exact, 1e-2)
     few = ahead.Courses(courses.x[:, :199], courses.u[:199])
