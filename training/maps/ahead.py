@@ -100,7 +100,7 @@ def learn_ahead(
         return flow
     try:
         optimise_at_once("ahead", problem, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
-    except (FloatingPointError, torch.linalg.LinAlgError):  # motions that part fast enough have gradients that overflow
+    except (FloatingPointError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # gradients overflowed
         return flow
     return problem.flow() if problem.judged() < before else flow
 
