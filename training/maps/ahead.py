@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from kkl_gym.simulate import simulate
+from kkl_gym.simulate import SubstepsError, simulate
 from kkl_gym.system import System
 from observers import Flow
 from observers.polynomial import products
@@ -15,19 +15,19 @@ from training.maps.networks import Network
 from training.maps.optimise import optimise_at_once
 from training.progress import ProgressBars
 
-SAMPLES = 100
-EVERY = 10  # samples, errors are looked at
-COURSES = 20_000
+SAMPLES = 100  # of a course, at most
+EVERY = 10  # samples between looks at the errors
+COURSES = 20_000  # at most
 BATCH, LEARNING_RATE = 128, 2e-4
-LEAST = 0.01  # of the mean square of the steps, added to it: errors where a motion hardly moves are not taken relative
+LEAST = 0.01  # of the mean square of the steps, added to it: where a motion hardly moves, errors are not relative to it
 TAIL = 30.0  # times the usual square, from which errors count less: near a watershed the least one grows without end
-ENOUGH = 2e-4  # of a sample, late by so little, a flow is left as it is
+ENOUGH = 2e-4  # of a sample: a flow that is late by no more is left as it is
 JUDGED = 1000  # courses that are not learned from
 
 
 @dataclass(frozen=True)
 class Courses:
-    """Motions from many states, over ``SAMPLES`` samples, each under an input that is held.
+    """Motions from many states, over up to ``SAMPLES`` samples, each under an input that is held.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class Courses:
     u: np.ndarray
 
 
-def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float) -> Courses:
+def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float, *, samples: int = SAMPLES) -> Courses:
     """Simulate motions.
 
     Parameters
@@ -54,14 +54,19 @@ def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float) -> Cou
         The input of each, or of no columns where none acts.
     dt : float
         Sampling interval in seconds.
+    samples : int
+        How long they are, ``SAMPLES`` at most.
 
     Returns
     -------
     Courses
-        Those that stay within the system's bounds.
+        Those that stay within the system's bounds; none of a system that becomes too fast to be simulated on the way.
     """
-    x, u = x[:COURSES], u[:COURSES]
-    later = simulate(system, x, SAMPLES, dt, u=np.broadcast_to(u, (SAMPLES, *u.shape)) if u.shape[1] else None)
+    x, u, samples = x[:COURSES], u[:COURSES], min(samples, SAMPLES)
+    try:
+        later = simulate(system, x, samples, dt, u=np.broadcast_to(u, (samples, *u.shape)) if u.shape[1] else None)
+    except SubstepsError:
+        return Courses(np.empty((samples + 1, 0, system.nx)), u[:0])
     inside = np.isfinite(later).all((0, 2))
     return Courses(later[:, inside], u[inside])
 
@@ -89,8 +94,8 @@ def learn_ahead(
     Returns
     -------
     Flow
-        One whose network and polynomial say more of the courses that were not learned from. The same flow where it is
-        hardly ever late, nothing is gained, or there are too few courses to judge by.
+        One that is off by less, in the median, on courses that were not learned from. The same flow where it is hardly
+        ever late, nothing is gained, or there are too few courses to judge by.
     """
     if steps < 1 or courses.x.shape[1] < 2 * JUDGED:
         return flow
@@ -140,7 +145,7 @@ class AheadProblem(nn.Module):
         moved = self._s.diff(dim=0).square().mean(-1)
         self._weight = 1.0 / (moved + LEAST * moved.mean()).clamp(min=torch.finfo(torch.float64).tiny)
         made_of = products(flow.nx + flow.nu, flow.degree)
-        self._products = [(torch.tensor(earlier), torch.tensor(by)) for _, earlier, by in made_of]
+        self._products = [tuple(torch.tensor(each, device=device) for each in part[1:]) for part in made_of]
         self._usual = self.judged() ** 2
 
     def flow(self) -> Flow:

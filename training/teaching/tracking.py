@@ -13,7 +13,7 @@ from observers import Artifact, Factors, Flow
 from training.config import settings_of
 from training.kalman import LEAST_PROCESS_NOISE, NOISE_FLOOR
 from training.maps.ahead import draw_courses, learn_ahead
-from training.maps.flow import draw_increments, fit_flow, largest_degree, usual_bend, usual_error
+from training.maps.flow import Increments, draw_increments, fit_flow, largest_degree, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -24,6 +24,7 @@ from training.trajectories.signals import DRIVEN
 
 OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
 AHEAD = 0.125  # of the batches that learn single samples, so many learn many samples in a row
+UNSURE = 1.5  # times what was added to covariances at each sample before: a flow that asks for more is not taken
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -195,9 +196,21 @@ def _learned(
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
-    courses = draw_courses(system, increments.x, increments.u, dt)
-    flow = learn_ahead(flow, courses, steps=round(AHEAD * steps), seed=seed, progress=progress, device=device)
-    return dataclasses.replace(flow, error=usual_error(flow, judged), bend=usual_bend(flow, judged))
+    flow = _judged(flow, judged)
+    ahead = round(AHEAD * steps)
+    if not ahead:
+        return flow
+    with progress.phase("simulating courses"):
+        courses = draw_courses(system, increments.x, increments.u, dt, samples=round(duration / dt))
+    other = learn_ahead(flow, courses, steps=ahead, seed=seed, progress=progress, device=device)
+    other = _judged(other, judged)
+    less_sure = other.variances(0.0, 0.0)[0] > UNSURE**2 * flow.variances(0.0, 0.0)[0]
+    return flow if less_sure.any() else other
+
+
+def _judged(flow: Flow, increments: Increments) -> Flow:
+    """A flow that says what it is off by."""
+    return dataclasses.replace(flow, error=usual_error(flow, increments), bend=usual_bend(flow, increments))
 
 
 def _factors(

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 from linear_system import Oscillator
-from tracking import DT, exact_motion, tracking_observer
+from tracking import DT, exact_flow, exact_motion, tracking_observer
 
+from kkl_gym.simulate import SubstepsError
 from observers.polynomial import monomials
 from training.maps import ahead
 from training.maps.ahead import AheadProblem, draw_courses, learn_ahead
@@ -67,11 +68,49 @@ def test_a_flow_that_is_late_is_mended(exact, courses):
     found = learned(flow, courses)
     before, after = (AheadProblem(each, courses, device=torch.device("cpu")).judged() for each in (flow, found))
     assert after < 0.01 * before
-    np.testing.assert_array_equal(found.polynomial == 0, flow.polynomial == 0)
 
 
 def test_a_flow_that_is_hardly_late_stays(exact, courses):
-    assert learned(exact, courses) is exact
+    flow = late(exact, 2e-5)  # after 10 samples late by so much times the root of 10
+    assert learned(flow, courses) is flow
+    flow = late(exact, 2e-4)
+    assert learned(flow, courses) is not flow
+
+
+def test_terms_that_are_zero_stay_so(exact, courses):
+    polynomial = exact.polynomial.copy()
+    polynomial[0, 0] = 0.0
+    flow = dataclasses.replace(late(exact, 1e-3), polynomial=polynomial)
+    found = learned(flow, courses, steps=20)
+    assert found is not flow
+    np.testing.assert_array_equal(found.polynomial == 0, polynomial == 0)
+
+
+def test_inputs_act_along_courses():
+    """In units of which none is 1: the exact flow is never late, and one that knows of no input is."""
+    rng, system = np.random.default_rng(0), Oscillator()
+    courses = draw_courses(system, rng.uniform(-1, 1, (300, 2)), rng.uniform(-0.5, 0.5, (300, 1)), DT)
+    flow = exact_flow()
+    deaf = dataclasses.replace(flow, polynomial=flow.polynomial * [1, 1, 1, 0])
+    judged = [AheadProblem(each, courses, device=torch.device("cpu")).judged() for each in (flow, deaf)]
+    assert judged[0] < 1e-6
+    assert judged[1] > 0.1
+
+
+def test_a_network_is_mended_too(exact, courses):
+    flow = late(exact, 1e-3)
+    biased = dataclasses.replace(flow, mlp=dataclasses.replace(flow.mlp, biases=[np.zeros(4), np.full(2, 0.01)]))
+    problem = AheadProblem(biased, courses, device=torch.device("cpu"))
+    problem.loss(torch.Generator().manual_seed(0))["loss"].backward()
+    assert problem.network.linear_layers()[-1].bias.grad.abs().min() > 0
+
+
+def test_courses_that_become_too_fast_are_none(monkeypatch):
+    def fails(*_, **__):
+        raise SubstepsError("too fast")
+
+    monkeypatch.setattr(ahead, "simulate", fails)
+    assert draw_courses(Oscillator(), np.zeros((3, 2)), np.zeros((3, 0)), DT).x.shape == (21, 0, 2)
 
 
 def test_what_is_not_better_is_not_taken(exact, courses, monkeypatch):

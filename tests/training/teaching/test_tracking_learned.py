@@ -55,6 +55,22 @@ def test_a_linear_flow_is_found_exactly(learned):
     assert learned.flow.window == pytest.approx(0.5 * Noiseless().pace)
 
 
+@pytest.mark.parametrize("worse", [False, True])
+def test_what_learned_many_samples_is_taken_unless_it_is_less_sure_of_one(worse, monkeypatch):
+    asked = []
+
+    def learn_ahead(flow, courses, *, steps, **_):
+        asked.append((courses.x.shape[0], steps))
+        return dataclasses.replace(flow, gain=flow.gain + 1e-9, polynomial=flow.polynomial * (1.2 if worse else 1.0))
+
+    monkeypatch.setattr(tracking, "learn_ahead", learn_ahead)
+    found = learn_tracking(plain_observer(), Noiseless(), steps=80, trajectories=50).flow
+    assert asked == [(101, 10)]
+    monkeypatch.setattr(tracking, "learn_ahead", lambda flow, *_, **__: flow)
+    without = learn_tracking(plain_observer(), Noiseless(), steps=80, trajectories=50).flow
+    assert (found.gain == without.gain).all() == worse
+
+
 class Slow(Noiseless):
     scale = (2.0, 0.5)
     pace = 4.0
