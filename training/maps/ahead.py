@@ -83,7 +83,7 @@ def learn_ahead(
     courses : Courses
         Motions of the same sampling interval.
     steps : int
-        Batches.
+        Batches, one at least.
     seed : int
         Of the batches.
     progress : ProgressBars
@@ -97,17 +97,16 @@ def learn_ahead(
         One that is off by less, in the median, on courses that were not learned from. The same flow where it is hardly
         ever late, nothing is gained, or there are too few courses to judge by.
     """
-    if steps < 1 or courses.x.shape[1] < 2 * JUDGED:
+    if courses.x.shape[1] < 2 * JUDGED:
         return flow
     problem = AheadProblem(flow, courses, device=device or torch.device("cpu"))
-    before = problem.judged()
-    if before <= ENOUGH:
+    if problem.before <= ENOUGH:
         return flow
     try:
         optimise_at_once("ahead", problem, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)
     except (FloatingPointError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # gradients overflowed
         return flow
-    return problem.flow() if problem.judged() < before else flow
+    return problem.flow() if problem.judged() < problem.before else flow
 
 
 class AheadProblem(nn.Module):
@@ -128,6 +127,11 @@ class AheadProblem(nn.Module):
         What it is to follow, more than ``JUDGED``.
     device : torch.device
         Where it is trained.
+
+    Attributes
+    ----------
+    before : float
+        What :meth:`judged` said of that flow.
     """
 
     def __init__(self, flow: Flow, courses: Courses, *, device: torch.device) -> None:
@@ -146,7 +150,7 @@ class AheadProblem(nn.Module):
         self._weight = 1.0 / (moved + LEAST * moved.mean()).clamp(min=torch.finfo(torch.float64).tiny)
         made_of = products(flow.nx + flow.nu, flow.degree)
         self._products = [tuple(torch.tensor(each, device=device) for each in part[1:]) for part in made_of]
-        self._usual = self.judged() ** 2
+        self.before = self.judged()
 
     def flow(self) -> Flow:
         """The flow as it is now."""
@@ -174,7 +178,7 @@ class AheadProblem(nn.Module):
         """
         rows = torch.randint(JUDGED, self._s.shape[1], (BATCH,), generator=generator, device=self._s.device)
         squares = self._squares(rows)
-        loss = torch.log1p(squares / (TAIL * self._usual)).mean()
+        loss = torch.log1p(squares / (TAIL * self.before**2)).mean()
         return {"loss": loss, "error": squares.detach().median().sqrt()}
 
     def _corrected(self) -> torch.Tensor:
