@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager, suppress
@@ -100,6 +101,27 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def require_writable(folder: str | os.PathLike[str]) -> None:
+    """Make a folder, and find out before long work whether its results can be written there.
+
+    Parameters
+    ----------
+    folder : str or PathLike
+        Where they are to lie.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made, or no file in it; it names the folder.
+    """
+    with naming(Path(folder)):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        try:
+            tempfile.TemporaryFile(dir=folder, prefix=UNFINISHED).close()
+        except OSError as problem:  # which names a file that nobody has asked for
+            raise OSError(problem.errno, problem.strerror, str(folder)) from problem
 
 
 def write(path: str | os.PathLike[str], text: str) -> None:

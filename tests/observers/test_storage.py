@@ -6,6 +6,7 @@ import re
 import stat
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -440,6 +441,18 @@ def test_a_folder_that_one_may_not_write_to(path, monkeypatch):
     with pytest.raises(PermissionError, match=re.escape(f"Permission denied: '{path}'")):
         storage.write(path, "text")
     assert os.listdir(path.parent) == [path.name]
+
+
+def test_a_folder_that_one_may_not_write_to_is_found_out_beforehand(tmp_path, monkeypatch):
+    storage.require_writable(tmp_path / "new" / "folder")
+    assert not os.listdir(tmp_path / "new" / "folder")
+
+    def refuse(**options):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), f"{options['dir']}/.part-1")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    with pytest.raises(PermissionError, match=re.escape(f"Permission denied: '{tmp_path}'")):
+        storage.require_writable(tmp_path)
 
 
 def test_other_errors_while_writing_stay_as_they_are(tmp_path):

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kkl_gym import SYSTEMS, System, get_system
-from observers.storage import is_kind
+from observers.storage import is_kind, require_writable
 from training.agents.agent import Agent
 from training.agents.any_environment.player import KEY, Player
 from training.agents.information import INFORMATION
@@ -208,6 +208,7 @@ class Evaluate:
         task = agent.task
         if task.system not in SYSTEMS and task.system != self.system:  # no file makes us import what it names
             raise ValueError(f"the agent's system is {task.system!r}: if you trust that, give --system {task.system}")
+        require_writable(self.out)
         with progress_bars(console) as progress:
             episodes = show(progress, agent, self.episodes, self.seed, trusted=self.system)
             system = get_system(task.system).name

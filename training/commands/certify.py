@@ -13,7 +13,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
-from observers.storage import write
+from observers.storage import require_writable, write
 from training import markdown
 from training.commands.options import NoiseLevel, Observers, OwnPolicy, OwnSystem, read_observers, read_policy
 from training.evaluation.levels import beyond, level_for, show_level
@@ -81,6 +81,7 @@ class Certify:
             raise ValueError(f"each observer writes NAME.json, so names must differ; got {', '.join(names)}")
         found = []
         observers = read_observers(self.observers, self.system)
+        require_writable(self.out)
         for name, (_, artifact, system) in zip(names, observers, strict=True):
             level = level_for(artifact, system, self.measurement_noise)
             if reason := beyond(artifact, level):

@@ -14,6 +14,7 @@ from rich.table import Table
 import kkl_gym
 from kkl_gym.simulate import check_duration
 from observers import load
+from observers.storage import require_writable
 from training.commands.options import NoiseLevel, OneObserver, OneSystem, OwnPolicy, Seconds, Shown, read_policy, shown
 from training.commands.portraits import Motion, animate
 from training.evaluation.levels import Level, show_level
@@ -82,6 +83,7 @@ class Demo:
 
             show(environments[0], self.measurement_noise, seed=self.seed)
             return None
+        require_writable(self.out)
         with progress_bars(console) as progress:
             episodes = []
             for one in environments:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from kkl_gym.system import System
 from observers import Artifact
-from observers.storage import write
+from observers.storage import require_writable, write
 from training.commands.coverage import coverage_table, default_levels, draw, judged
 from training.commands.options import (
     NoiseLevels,
@@ -124,6 +124,8 @@ class Evaluate:
             raise ValueError("give at least one level of measurement noise; 0 is none")
         if self.csv is not None and (self.csv.is_dir() or not self.csv.name):
             raise ValueError(f"csv = {self.csv} is a folder: name a file")
+        if self.csv is not None:
+            require_writable(self.csv.parent)
         frames: list[pd.DataFrame] = []
         observers = [(*found, self._plant(found[-1])) for found in read_observers(self.observers, self.system)]
         with progress_bars(console) as progress:

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from kkl_gym import SYSTEMS
-from observers.storage import write
+from observers.storage import require_writable, write
 from training import markdown
 from training.commands.options import (
     NoiseLevel,
@@ -87,6 +87,7 @@ class Faults:
         if len(set(self.observers)) < len(self.observers):
             raise ValueError(f"name each observer once, got {', '.join(self.observers)}")
         frames = []
+        require_writable(self.out)
         with progress_bars(console) as progress:
             for name, artifact, system in read_observers(self.observers, self.system):
                 level = level_for(artifact, system, self.measurement_noise)

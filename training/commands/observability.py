@@ -9,6 +9,7 @@ from rich.console import Console
 
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
+from observers.storage import require_writable
 from training.commands.data import DataOptions
 from training.commands.options import NoiseLevels, Parameters
 from training.commands.record import Argument, names_in
@@ -94,6 +95,8 @@ class ObservabilityCommand:
         """
         from training.observable.report import save, table  # pandas takes half a second to import
 
+        if self.out:
+            require_writable(self.out)
         found = self._looked(console)
         data = self.records.data
         first = [str(path) if str(path).startswith("minari:") else path.name for path in data[:1]]

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from observers import Artifact
 from observers.names import resolve
+from observers.storage import require_writable
 from training.commands.data import DataOptions
 from training.commands.options import OwnPolicy, OwnSystem, read_observers, read_policy
 from training.progress import progress_bars
@@ -73,6 +74,7 @@ class Teaching:
         artifact = Artifact.read(source)
         if out.exists() and out.samefile(source):
             raise ValueError(f"out = {out} is the map that is taught, which would be lost: name another file")
+        require_writable(out.parent)
         with progress_bars(console) as progress:
             settings |= {"seed": self.seed, "console": progress}
             if artifact.signals is None:

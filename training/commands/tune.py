@@ -13,6 +13,7 @@ from rich.table import Table
 from kkl_gym.system import System
 from kkl_gym.systems import get_system
 from observers.checks import noise_levels
+from observers.storage import require_writable
 from training.commands.options import NoiseLevel, Parameters, Seconds, SystemName
 from training.commands.running import Workers, run_missing
 from training.config import Pipeline
@@ -103,6 +104,7 @@ class Tune:
         again += f" --pipeline {self.pipeline}" if self.pipeline != "input-aware" else ""
         again += f" --policy {self.policy}" if self.policy else ""
         again += f" --parameters{given}" if given else ""
+        require_writable(folder)
         if self.pipeline == "spinn":
             return self._intervals(system, runs, console, folder=folder, again=again)
         found = self._compare(system, runs, console)

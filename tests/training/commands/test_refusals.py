@@ -4,6 +4,7 @@ import pytest
 
 from training.cli import main
 from training.jobs import locked
+from training.progress import ProgressBars
 
 
 @pytest.mark.parametrize(
@@ -28,6 +29,31 @@ from training.jobs import locked
 def test_refused(arguments, message, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match=message):
+        main(arguments.split())
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "evaluate lorenz --csv file/errors.csv",
+        "certify lorenz-static --out file",
+        "faults lorenz --out file",
+        "demo --out file",
+        "tune lorenz --out file/tuned",
+        "agent evaluate van_der_pol --out file",
+        "errorbars lorenz-static --out file/bars.safetensors",
+        "tracking lorenz-static --out file/tracking.safetensors",
+        "observability lorenz --out file",
+    ],
+)
+def test_a_place_that_cannot_be_written_to_is_refused_before_long_work(arguments, tmp_path, monkeypatch):
+    def work(self, description, **options):
+        raise AssertionError(f"{description} has begun")
+
+    (tmp_path / "file").write_text("not a folder")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(ProgressBars, "add_task", work)
+    with pytest.raises(SystemExit, match="file.*: (File exists|Not a directory)"):
         main(arguments.split())
 
 
