@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import all_finite, bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.checks import bool_array, flag, noise_level, noise_levels, real_array, shown
 from observers.compiled import available
 from observers.decoder import Decoders, Parts
 from observers.errors import ArtifactError
 from observers.monitor import Monitor
 from observers.names import resolve
 from observers.replacement import check_replacement
+from observers.samples import check_output, checked_record, first_state, held_input
 from observers.spread import deviations
 from observers.thresholds import SOON
 from observers.tracker import Tracker
@@ -262,8 +263,8 @@ class KKLObserver:
             neither T nor a flow; the observer is then as it was.
         """
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
-        self._check_output(y0, y0.shape[:-1], first=True)
-        z0, age = self._start(y0, x0)
+        check_output(self.artifact, y0, y0.shape[:-1], first=True)
+        z0, age = first_state(self.artifact, y0, x0)
         if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
             self._compiled = True
             self._tell()
@@ -341,8 +342,8 @@ class KKLObserver:
         z = self.z
         rows = bool_array("rows", rows, z.shape[:-1])
         y0 = real_array("y", y0)
-        self._check_output(y0, (int(rows.sum()),), first=True)
-        z[rows], age = self._start(y0, x0)
+        check_output(self.artifact, y0, (int(rows.sum()),), first=True)
+        z[rows], age = first_state(self.artifact, y0, x0)
         if self._tracker is not None:
             self._tracker.restart(rows, z[rows], age, x0)
         self._z, self._y = z, self._y.copy()
@@ -406,13 +407,13 @@ class KKLObserver:
         batch = self._z.shape[:-1]
         if rows is not None:
             rows = bool_array("rows", rows, batch)
-        u = self._input(u, batch)
+        u = held_input(self.artifact, u, batch)
         gaps, missing = None, y is None
         if y is None:
             y, gaps = np.full(self._y.shape, np.nan), np.ones(self._y.shape, dtype=bool)
         else:
             y = real_array("y", y).copy()  # as in reset
-            gaps = self._check_output(y, batch)
+            gaps = check_output(self.artifact, y, batch)
         if not batch:
             if rows is not None and not rows:
                 return
@@ -687,19 +688,18 @@ class KKLObserver:
         x0: np.ndarray | None = None,
     ) -> np.ndarray:
         """What a function of the filter's states and their ages gives along a record."""
-        y, gaps = self._record(y, u)
-        u = None if u is None else real_array("u", u)
+        y, u, gaps = checked_record(self.artifact, y, u)
         steps, batch = len(y), y.shape[1:-1]
         linear = self.artifact.filter
         out: np.ndarray | None = None
         rows = max(1, _CHUNK // max(1, math.prod(batch)))
-        z, age0 = self._start(y[0], x0)
+        z, age0 = first_state(self.artifact, y[0], x0)
         for first in range(0, steps, rows):
             count = min(rows, steps - first)
             record = np.empty((count, *z.shape))
             for i, k in enumerate(range(first, first + count)):
                 if k > 0:
-                    held = self._input(None if u is None else u[k - 1], batch)
+                    held = held_input(self.artifact, None if u is None else u[k - 1], batch)
                     if gaps is not None and gaps[k].any():
                         y[k] = self._filled(y[k], gaps[k], held, z=z, before=y[k - 1], age=age0 + k - 1)
                     z = linear.advance(z, y[k - 1], held, y[k])
@@ -711,23 +711,6 @@ class KKLObserver:
         assert out is not None  # there is one sample at least
         return out
 
-    def _record(self, y: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-        """A record's outputs, and where entries are missing, None if none are; an error if it is none."""
-        y = real_array("y", y)
-        if y.ndim < 2 or not len(y):
-            raise ValueError(f"y must be a record of shape (steps, ..., {self.artifact.ny}), got {y.shape}")
-        gaps = self._check_output(y, y.shape[:-1])
-        if gaps is not None:
-            self._check_output(y[0], y.shape[1:-1], first=True)
-            y = y.copy()  # in which they are filled
-        if u is not None:
-            u = real_array("u", u)
-            if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
-                raise ValueError(
-                    f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}"
-                )
-        return y, gaps
-
     def _replayed(
         self,
         y: np.ndarray,
@@ -737,7 +720,7 @@ class KKLObserver:
         of: Callable[["KKLObserver"], np.ndarray],
     ) -> np.ndarray:
         """What is asked of another observer like this one at each sample of a record."""
-        y, gaps = self._record(y, u)
+        y, u, gaps = checked_record(self.artifact, y, u)
         other = self._twin()
         other.reset(y[0], x0)
         first = of(other)
@@ -748,60 +731,6 @@ class KKLObserver:
             other.advance(None if missing else y[k], None if u is None else u[k - 1])
             found[k] = of(other)
         return found
-
-    def _start(self, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
-        """The filter's first state, (..., size), and how many samples old it is."""
-        artifact = self.artifact
-        if x0 is None:
-            return artifact.filter.start(y0), 0
-        artifact.require_known_start()
-        x0, shape = real_array("x0", x0), (*y0.shape[:-1], artifact.nx)
-        if x0.shape != shape:
-            raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
-        if not all_finite(x0):
-            raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
-        if artifact.forward is None:  # where the tracker begins
-            return artifact.filter.start(y0), 0
-        z0 = np.zeros((*shape[:-1], artifact.filter.size))
-        z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)
-        return z0, math.inf  # which every map takes for its age_max
-
-    def _check_output(self, y: np.ndarray, batch: tuple[int, ...], first: bool = False) -> np.ndarray | None:
-        """Raise an error unless samples can be taken in; returns where entries are missing, None if none are."""
-        ny = self.artifact.ny
-        if y.shape != (*batch, ny):
-            raise ValueError(f"y must have shape {(*batch, ny)}, got {y.shape}")
-        if all_finite(y):
-            return None
-        if ny == 1 and not batch:
-            hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
-            raise ValueError(f"y holds NaN, infinity or values beyond 1e15; {hint}")
-        gaps = np.isnan(y)
-        if not all_finite(np.where(gaps, 0.0, y)):
-            raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")
-        if first:
-            raise ValueError("y holds NaN: outputs may be missing later, but the first sample must be whole")
-        return gaps
-
-    def _input(self, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
-        nu = self.artifact.nu
-        if u is None:
-            return np.zeros((*batch, nu))
-        u = real_array("u", u)
-        if nu == 0:
-            if u.shape[:-1] != batch:
-                raise ValueError(f"u must have a row of inputs for each of the batch, {batch}, got shape {u.shape}")
-            if u.any():
-                raise ValueError(
-                    f"this map for {self.artifact.system} knows no inputs, but u = {u}; take one that does, "
-                    "or pass u=None to ignore the input"
-                )
-            return np.zeros((*batch, 0))
-        if u.shape != (*batch, nu):
-            raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
-        if not all_finite(u):
-            raise ValueError("u holds NaN, infinity or values beyond 1e15")
-        return u
 
 
 def load(

@@ -1,0 +1,172 @@
+"""What an observer takes in, checked at its boundary: samples, inputs, records and starts that are known."""
+
+import math
+
+import numpy as np
+
+from observers.artifact import Artifact
+from observers.checks import all_finite, real_array
+
+
+def check_output(
+    artifact: Artifact, y: np.ndarray, batch: tuple[int, ...], *, first: bool = False
+) -> np.ndarray | None:
+    """Find what is missing of samples.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    y : ndarray of float
+        The samples.
+    batch : tuple of int
+        Shape of the batch.
+    first : bool
+        Whether they are the first ones, which must be whole.
+
+    Returns
+    -------
+    ndarray of bool, shape (..., ny), or None
+        Where entries are missing; None if none are.
+
+    Raises
+    ------
+    ValueError
+        If they have another shape than (..., ny), or there is anything but finite numbers, and NaN where it may be.
+    """
+    if y.shape != (*batch, artifact.ny):
+        raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
+    if all_finite(y):
+        return None
+    if artifact.ny == 1 and not batch:
+        hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
+        raise ValueError(f"y holds NaN, infinity or values beyond 1e15; {hint}")
+    gaps = np.isnan(y)
+    if not all_finite(np.where(gaps, 0.0, y)):
+        raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")
+    if first:
+        raise ValueError("y holds NaN: outputs may be missing later, but the first sample must be whole")
+    return gaps
+
+
+def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
+    """Return inputs as floats, zeros where there are none.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    u : array_like, shape (..., nu), or None
+        The inputs.
+    batch : tuple of int
+        Shape of the batch.
+
+    Returns
+    -------
+    ndarray, shape (..., nu)
+        The inputs.
+
+    Raises
+    ------
+    ValueError
+        If they have another shape, are no finite numbers, or are not zero where the observer knows of none.
+    """
+    nu = artifact.nu
+    if u is None:
+        return np.zeros((*batch, nu))
+    u = real_array("u", u)
+    if nu == 0:
+        if u.shape[:-1] != batch:
+            raise ValueError(f"u must have a row of inputs for each of the batch, {batch}, got shape {u.shape}")
+        if u.any():
+            raise ValueError(
+                f"this map for {artifact.system} knows no inputs, but u = {u}; take one that does, "
+                "or pass u=None to ignore the input"
+            )
+        return np.zeros((*batch, 0))
+    if u.shape != (*batch, nu):
+        raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
+    if not all_finite(u):
+        raise ValueError("u holds NaN, infinity or values beyond 1e15")
+    return u
+
+
+def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Return the filter's state at the first sample.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    y0 : ndarray, shape (..., ny)
+        The sample.
+    x0 : array_like, shape (..., nx), or None
+        The state, if it is known.
+
+    Returns
+    -------
+    z0 : ndarray, shape (..., size)
+        The filter's state.
+    age : float
+        How many samples old it is.
+
+    Raises
+    ------
+    ValueError
+        If x0 has another shape or is not finite, or the artifact holds neither T nor a flow.
+    """
+    if x0 is None:
+        return artifact.filter.start(y0), 0
+    artifact.require_known_start()
+    x0, shape = real_array("x0", x0), (*y0.shape[:-1], artifact.nx)
+    if x0.shape != shape:
+        raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
+    if not all_finite(x0):
+        raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
+    if artifact.forward is None:  # where the tracker begins
+        return artifact.filter.start(y0), 0
+    z0 = np.zeros((*shape[:-1], artifact.filter.size))
+    z0[..., : artifact.forward.mlp.outputs] = artifact.forward(x0)
+    return z0, math.inf  # which every map takes for its age_max
+
+
+def checked_record(
+    artifact: Artifact, y: np.ndarray, u: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Return a record as floats, and what is missing of it.
+
+    Parameters
+    ----------
+    artifact : Artifact
+        The observer.
+    y : array_like, shape (steps, ..., ny)
+        Outputs.
+    u : array_like, shape (steps - 1, ..., nu) or (steps, ..., nu), or None
+        Inputs.
+
+    Returns
+    -------
+    y : ndarray, shape (steps, ..., ny)
+        Outputs, a copy where some are missing.
+    u : ndarray or None
+        Inputs.
+    gaps : ndarray of bool, shape (steps, ..., ny), or None
+        Where outputs are missing; None if none are.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    """
+    y = real_array("y", y)
+    if y.ndim < 2 or not len(y):
+        raise ValueError(f"y must be a record of shape (steps, ..., {artifact.ny}), got {y.shape}")
+    gaps = check_output(artifact, y, y.shape[:-1])
+    if gaps is not None:
+        check_output(artifact, y[0], y.shape[1:-1], first=True)
+        y = y.copy()  # in which they are filled
+    if u is not None:
+        u = real_array("u", u)
+        if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
+            raise ValueError(f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}")
+    return y, u, gaps
