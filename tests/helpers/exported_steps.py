@@ -7,14 +7,11 @@ import pytest
 
 import kkl_gym
 from kkl_gym.simulate import simulate
-from observers import MLP, Artifact, KKLObserver, shipped
+from observers import MLP, Artifact, KKLObserver
 from observers.decoder import Decoder
 from observers.names import resolve
 from training.export import Exported
 
-UNTRACKED = sorted(
-    name for name in set(shipped().values()) if Artifact.read(resolve(name)).flow is None
-)  # a fixed function of z
 _ACTIVE = {"tanh": np.tanh, "silu": lambda h: h / (1 + np.exp(-h)), "relu": lambda h: h * (h > 0)}
 
 
@@ -114,16 +111,40 @@ def in_doubles(exported, y, u):
     return np.where(z[..., len(linear.A) :].any(-1)[..., None], x_hat, mapped(artifact.free_inverse))
 
 
-def apart(exported, x_hat, y, u):
-    """The largest difference from KKLObserver (float) or :func:`in_doubles` (double), in scales of the estimates."""
+def in_python(exported, y, u):
+    """Estimates along a record, (steps, ..., nx): KKLObserver's (float), or those of :func:`in_doubles` (double)."""
+    artifact = exported.artifact
     if exported.precision == "double":
-        expected = in_doubles(exported, y, u)
-    elif exported.artifact.flow is not None:
-        expected = np.array([observer.decode() for observer in stepped(exported, y, u)])
-    else:
-        artifact, levels = exported.artifact, (exported.measurement_noise,)
-        observer = KKLObserver(artifact, *levels, process_noise=exported.process_noise)
-        expected = observer.estimate(y, u)
-        if artifact.estimated_parameters:
-            expected = np.concatenate([expected, observer.estimate_parameters(y, u)], axis=-1)
-    return (abs(x_hat - expected) / exported.artifact.inverse.x_scale).max()
+        return in_doubles(exported, y, u)
+    if artifact.flow is not None:
+        return np.array([observer.decode() for observer in stepped(exported, y, u)])
+    observer = KKLObserver(artifact, exported.measurement_noise, process_noise=exported.process_noise)
+    x_hat = observer.estimate(y, u)
+    if not artifact.estimated_parameters:
+        return x_hat
+    return np.concatenate([x_hat, observer.estimate_parameters(y, u)], axis=-1)
+
+
+def apart(exported, x_hat, y, u):
+    """The largest difference from :func:`in_python`, in scales of the estimates."""
+    return (abs(x_hat - in_python(exported, y, u)) / exported.artifact.inverse.x_scale).max()
+
+
+def apart_at_all_levels(name, precision, step, steps=100_000):
+    """The largest difference that a shipped map's export makes in runs of 5,000 samples, laid end to end.
+
+    At no measurement noise, at what is usual, and at the most that the map knows of. ``step`` gives estimates for an
+    exported map, outputs and inputs.
+
+    Returns the largest as a part of each estimate's range in the runs, and as a part of its scale.
+    """
+    artifact = Artifact.read(resolve(name))
+    y, u = motion(artifact, steps, runs=-(-steps // 5000))
+    found = []
+    for level in (0.0, artifact.measurement_noise, artifact.inverse.measurement_noise_max):
+        exported = Exported.read(name, precision=precision, measurement_noise=level)
+        x_hat, expected = step(exported, y, u), in_python(exported, y, u)
+        assert x_hat.shape == (steps, artifact.nx)
+        units = np.ptp(expected, axis=0), artifact.inverse.x_scale
+        found.append([(abs(x_hat - expected) / unit).max() for unit in units])
+    return np.max(found, axis=0)

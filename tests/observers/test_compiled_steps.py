@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from error_bars import with_error_bars
+from exported_steps import apart_at_all_levels
 
 import observers
 from kkl_gym import get_system
@@ -174,6 +175,19 @@ def test_ten_thousand_samples(name):
     one, other = (observers.load(name, compiled=choice) for choice in (True, False))
     y, u = signals(one.artifact, 10_001)
     assert apart(along(one, y, u), along(other, y, u), one.artifact) < ACCURATE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
+def test_100_000_samples_of_every_shipped_map(name):
+    def compiled(exported, y, u):
+        levels = {"measurement_noise": exported.measurement_noise, "process_noise": exported.process_noise}
+        observer = observers.KKLObserver(exported.artifact, **levels, compiled=True)
+        return np.array([observer.reset(y[0]), *(observer.step(y[k], u[k - 1]) for k in range(1, len(y)))])
+
+    of_range, of_scale = apart_at_all_levels(name, "float", compiled)
+    print(f"{name}: {of_range:.1e} of the range, {of_scale:.1e} of the scale")
+    assert of_range < 1e-5
 
 
 @pytest.mark.parametrize("name", NAMES)

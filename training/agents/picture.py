@@ -10,7 +10,7 @@ from kkl_gym import get_system
 from kkl_gym.rendering import Canvas
 from training.agents.play import Episodes
 from training.evaluation.levels import show_level
-from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing, save_moving, style
+from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, drawing, save_moving, style
 from training.systems import ControlTask
 
 SHOWN = 5  # episodes in a figure
@@ -52,8 +52,9 @@ def draw_agents(task: ControlTask, played: Mapping[str, Episodes], path: Path) -
 def _draw(path: Path, task: ControlTask, columns: Sequence[tuple[str, Episodes]], *, width: float) -> None:
     """Draw the one episode of each column, below its title."""
     system = get_system(task.system)
-    with drawing(path, width * len(columns), 1.6 * (system.nx + system.nu)) as figure:
-        axes = figure.subplots(system.nx + system.nu, len(columns), sharex=True, sharey="row", squeeze=False)
+    names = [*system.state_names, *_numbered("y", system.ny), *_numbered("u", system.nu)]
+    with drawing(path, width * len(columns), 1.6 * len(names)) as figure:
+        axes = figure.subplots(len(names), len(columns), sharex=True, sharey="row", squeeze=False)
         for (title, episode), column in zip(columns, axes.T, strict=True):
             t = np.arange(len(episode.x)) * task.period
             for i, ax in enumerate(column[: system.nx]):
@@ -61,15 +62,25 @@ def _draw(path: Path, task: ControlTask, columns: Sequence[tuple[str, Episodes]]
                 if episode.x_hat is not None:
                     ax.plot(t, episode.x_hat[:, 0, i], color=ESTIMATE, lw=0.8, label="estimate")
                 ax.plot(t, episode.x[:, 0, i], color=TRUTH, lw=1.0, label="state")
-            for j, ax in enumerate(column[system.nx :]):
-                ax.step(t[:-1], episode.u[:, 0, j], where="post", color=RIVAL, lw=0.8)
+            for j, ax in enumerate(column[system.nx : -system.nu]):
+                ax.plot(t, episode.y[:, 0, j], ".", color=MEASURED, ms=2.0, label="measured output")
+            for j, ax in enumerate(column[-system.nu :]):
+                ax.step(t[:-1], episode.u[:, 0, j], where="post", color=RIVAL, lw=0.8, label="input")
                 ax.set_ylim(-1.1 * system.u_max[j], 1.1 * system.u_max[j])
             column[0].set_title(title)
             column[-1].set_xlabel("t in s")
-        for i, name in enumerate((*system.state_names, *(f"u{j + 1}" for j in range(system.nu)))):
+        for i, name in enumerate(names):
             axes[i, 0].set_ylabel(name)
-        figure.legend(*axes[0, -1].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        named = {
+            label: handle for ax in axes[:, -1] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=5)
         figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
+
+
+def _numbered(symbol: str, number: int) -> list[str]:
+    """Names of signals: y where there is one, and y1, y2 and so on."""
+    return [symbol] if number == 1 else [f"{symbol}{i + 1}" for i in range(number)]
 
 
 def animate(task: ControlTask, played: Mapping[str, Episodes], path: Path) -> None:

@@ -21,6 +21,8 @@ class Episodes:
         True states; after an escape the last one inside.
     x_hat : ndarray, shape (steps + 1, n, nx), or None
         Estimates, where an observer makes them.
+    y : ndarray, shape (steps + 1, n, ny)
+        Measured outputs.
     u : ndarray, shape (steps, n, nu)
         Inputs.
     escaped : ndarray of bool, shape (n,)
@@ -29,13 +31,14 @@ class Episodes:
 
     x: np.ndarray
     x_hat: np.ndarray | None
+    y: np.ndarray
     u: np.ndarray
     escaped: np.ndarray
 
     def row(self, i: int) -> "Episodes":
         """One of them, as a batch of one."""
         x_hat = None if self.x_hat is None else self.x_hat[:, [i]]
-        return Episodes(self.x[:, [i]], x_hat, self.u[:, [i]], self.escaped[[i]])
+        return Episodes(self.x[:, [i]], x_hat, self.y[:, [i]], self.u[:, [i]], self.escaped[[i]])
 
 
 def play(
@@ -71,13 +74,15 @@ def play(
             'play needs an environment made with autoreset_mode="Disabled", or episodes would run together'
         )
     obs, info = env.reset(seed=seed)
-    x, x_hat, u = [info["x"]], [info.get("x_hat")], []
+    x, x_hat, y, u = [info["x"]], [info.get("x_hat")], [info["y"]], []
     escaped = np.zeros(env.num_envs, dtype=bool)
     for done in range(1, steps + 1):
         obs, _, terminated, _, info = env.step(policy(obs))
         escaped |= terminated
         x.append(info["x"])
         x_hat.append(info.get("x_hat"))
+        y.append(info["y"])
         u.append(info["u"])
         report(done)
-    return Episodes(np.array(x), None if x_hat[0] is None else np.array(x_hat), np.array(u), escaped)
+    estimates = None if x_hat[0] is None else np.array(x_hat)
+    return Episodes(np.array(x), estimates, np.array(y), np.array(u), escaped)

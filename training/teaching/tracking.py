@@ -45,7 +45,7 @@ def learn_tracking(
     T_inv and its error bars stay as they are. A polynomial and a small network learn how states change over a sample,
     on simulated ones about the system's motions. They then learn what many samples in a row add up to. An unscented
     Kalman filter on that flow is what :class:`observers.KKLObserver` then runs beside z. Its covariances are calibrated
-    on further motions, so that regions of 90 % hold 90 % of the errors, or up to 92 % where a few are far off, and so
+    on further motions, so that regions of 90 % hold 90 % of the errors, or up to 91 % where a few are far off, and so
     are the limits of the monitor, if there are any.
 
     Parameters

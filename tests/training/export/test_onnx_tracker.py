@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import UNTRACKED, apart, doubles, exported_of, in_doubles, motion, stepped
+from exported_steps import apart, doubles, exported_of, in_doubles, stepped
 from random_tracking import KINDS, of_floats, signals, tracking
 
-from observers import Expression, KKLObserver, shipped
-from training.export import Exported
+from observers import Expression, KKLObserver
 
 pytest.importorskip("onnx", reason="needs the extra onnx")
 pytest.importorskip("onnxruntime", reason="needs the extra onnx")
@@ -28,26 +27,6 @@ def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     assert apart(exported, x_hat, y, u) < tolerance
     lost = [observer._tracker._mean_square[0] == 1.0 for observer in stepped(exported, y, u)]
     assert sum(lost[600:700]) > 1
-
-
-@pytest.mark.parametrize(
-    ("name", "precision", "tolerance"),
-    [
-        ("lorenz", "float", 2e-4),
-        *(
-            pytest.param(name, precision, tolerance, marks=pytest.mark.slow)
-            for name in sorted(set(shipped().values()) - set(UNTRACKED))
-            for precision, tolerance in (("float", 2e-4), ("double", 5e-9))
-        ),
-    ],
-)
-def test_what_ships(name, precision, tolerance, request):
-    steps = 100_000 if request.node.get_closest_marker("slow") else 1000
-    exported = Exported.read(name, precision=precision)
-    y, u = motion(exported.artifact, steps, runs=max(1, steps // 5000))
-    largest = apart(exported, Runner(exported).along(y[:, None], u[:, None])[:, 0], y, u)
-    print(f"{name} {precision}: {largest:.1e}")
-    assert largest < tolerance
 
 
 def test_rows_have_levels_of_their_own(tmp_path):
