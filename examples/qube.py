@@ -40,7 +40,7 @@ from scipy.signal import savgol_filter
 from kkl_gym.simulate import simulate
 from observers import Artifact
 from observers.storage import write
-from training.figures import ALARM, ESTIMATE, RIVAL, TARGET, TRUTH, drawing
+from training.figures import ESTIMATE, RIVAL, TARGET, TRUTH, drawing
 from training.identification.motions import Shooting
 from training.identification.shooting import shoot
 from training.identification.windows import windows
@@ -88,7 +88,8 @@ GUESSES = {
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
 GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
 # Of estimators in the figure.
-LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET), (":", ALARM)
+LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
+SHOWN, AVERAGED = 4.0, 125  # s of each run in the figure, and samples of which an error there is the root mean square
 WINDOW, FITTED = 125, 9.0  # samples of a motion that is fitted; s of each run, after which it rests
 # Of the equations' motions: how many, how long in s, and what they are released with at most: rad of the arm beside any
 # angle of the pendulum, and rad/s. The eight runs begin with the arm up to 0.85 rad from the middle. The number was
@@ -311,32 +312,26 @@ def errors(x_hat: Sequence[np.ndarray], records: Sequence[Record]) -> np.ndarray
 def draw(
     path: Path, estimators: Mapping[str, Sequence[np.ndarray]], records: Sequence[Record], titles: Sequence[str]
 ) -> None:
-    """Draw the first seconds of the runs, each in a column, recorded and as estimated."""
-    with drawing(path, 2.6 * len(records), 9) as figure:
-        axes = figure.subplots(len(SIGNALS.hidden), len(records), squeeze=False, sharex=True)
-        shown = slice(0, round(5.0 / DT))
+    """Draw the first seconds of the runs, each in a column: one recorded signal, and errors of two."""
+    names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
+    of = [SIGNALS.hidden.index(name) for name in names]
+    with drawing(path, 2.6 * len(records), 6.5) as figure:
+        axes = figure.subplots(1 + len(names), len(records), squeeze=False, sharex=True, sharey="row")
         for column, (record, title) in enumerate(zip(records, titles, strict=True)):
             t = record.t[shown] - record.t[0]
             axes[0, column].set_title(title)
             axes[-1, column].set_xlabel("t in s")
-            for i, name in enumerate(SIGNALS.hidden):
-                ax = axes[i, column]
-                ax.plot(t, record.x[shown, i], color=TRUTH, lw=1.8, label="recorded")
-                for (label, x_hat), look in zip(estimators.items(), LOOKS, strict=False):
-                    ax.plot(
-                        t,
-                        x_hat[column][shown, i],
-                        ls=look[0],
-                        color=look[1],
-                        lw=1.0,
-                        label=label,
-                        zorder=3 if "KKL" in label else 2,
-                    )
-                margin = 0.2 * np.ptp(record.x[:, i])
-                ax.set_ylim(record.x[:, i].min() - margin, record.x[:, i].max() + margin)
-                if column == 0:
-                    ax.set_ylabel(name)
-        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+            axes[0, column].plot(t, record.x[shown, of[0]], color=TRUTH, lw=1.2, label="recorded")
+            for i, ax in zip(of, axes[1:, column], strict=True):
+                for (label, x_hat), (style, color) in zip(estimators.items(), LOOKS, strict=False):
+                    squares = (x_hat[column][shown, i] - record.x[shown, i]) ** 2
+                    if np.isfinite(squares).all():  # finite differences say nothing of the pendulum
+                        rms = np.sqrt(np.convolve(squares, smooth, mode="valid"))
+                        ax.semilogy(t[AVERAGED // 2 :][: len(rms)], rms, ls=style, color=color, lw=1.2, label=label)
+        for ax, name in zip(axes[:, 0], (names[0], *(f"error of {name}" for name in names)), strict=True):
+            ax.set_ylabel(name)
+        lines = [line for ax in axes[:2, 0] for line in ax.lines]
+        figure.legend(handles=lines, loc="outside lower center", ncols=2)
 
 
 if __name__ == "__main__":
