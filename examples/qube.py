@@ -86,6 +86,7 @@ GUESSES = {
     "pendulum_friction": 4e-5,
 }
 ALONE, BOTH = "KKL, recorded states", "KKL, recorded states and the fitted model's motions"
+DIFFERENCES = "finite differences"
 GUIDED = "Kalman filter, fitted model with an arm that sticks, started by the second KKL"
 # Of estimators in the figure.
 LOOKS = (":", ESTIMATE), ("--", ESTIMATE), ("-", ESTIMATE), ("-", RIVAL), ("-", TARGET)
@@ -144,7 +145,7 @@ def main(
             GUIDED: guided(both, sticking, rest(training), records),
             "extended Kalman filter, published model": kalman(records, Qube()),
             "extended Kalman filter, fitted model": kalman(records, Qube(**model.parameters)),
-            "finite differences": [differences(record) for record in records],
+            DIFFERENCES: [differences(record) for record in records],
         }
     found = {name: errors(x_hat, records) for name, x_hat in estimators.items()}
     rows = [[name, *("-" if np.isnan(e) else f"{e:.3f}" for e in each)] for name, each in found.items()]
@@ -315,6 +316,7 @@ def draw(
     """Draw the first seconds of the runs, each in a column: one recorded signal, and errors of two."""
     names, shown, smooth = ("sin(alpha)", "alpha_dot"), slice(0, round(SHOWN / DT)), np.ones(AVERAGED) / AVERAGED
     of = [SIGNALS.hidden.index(name) for name in names]
+    drawn = {name: x_hat for name, x_hat in estimators.items() if name != DIFFERENCES}  # they say nothing of alpha
     with drawing(path, 2.6 * len(records), 6.5) as figure:
         axes = figure.subplots(1 + len(names), len(records), squeeze=False, sharex=True, sharey="row")
         for column, (record, title) in enumerate(zip(records, titles, strict=True)):
@@ -323,11 +325,10 @@ def draw(
             axes[-1, column].set_xlabel("t in s")
             axes[0, column].plot(t, record.x[shown, of[0]], color=TRUTH, lw=1.2, label="recorded")
             for i, ax in zip(of, axes[1:, column], strict=True):
-                for (label, x_hat), (style, color) in zip(estimators.items(), LOOKS, strict=False):
+                for (label, x_hat), (style, color) in zip(drawn.items(), LOOKS, strict=True):
                     squares = (x_hat[column][shown, i] - record.x[shown, i]) ** 2
-                    if np.isfinite(squares).all():  # finite differences say nothing of the pendulum
-                        rms = np.sqrt(np.convolve(squares, smooth, mode="valid"))
-                        ax.semilogy(t[AVERAGED // 2 :][: len(rms)], rms, ls=style, color=color, lw=1.2, label=label)
+                    rms = np.sqrt(np.convolve(squares, smooth, mode="valid"))
+                    ax.semilogy(t[AVERAGED // 2 :][: len(rms)], rms, ls=style, color=color, lw=1.2, label=label)
         for ax, name in zip(axes[:, 0], (names[0], *(f"error of {name}" for name in names)), strict=True):
             ax.set_ylabel(name)
         lines = [line for ax in axes[:2, 0] for line in ax.lines]

@@ -104,24 +104,25 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Make a folder, and find out before long work whether its results can be written there.
+    """Find out before long work whether its results can be written; nothing is left behind.
 
     Parameters
     ----------
     folder : str or PathLike
-        Where they are to lie.
+        Where they are to lie. It need not be there.
 
     Raises
     ------
     OSError
-        If the folder cannot be made, or no file in it; it names the folder.
+        If no file can be made there, or, as long as the folder is missing, in the one that it will be made in. It names
+        the folder.
     """
-    with naming(Path(folder)):
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        try:
-            tempfile.TemporaryFile(dir=folder, prefix=UNFINISHED).close()
-        except OSError as problem:  # which names a file that nobody has asked for
-            raise OSError(problem.errno, problem.strerror, str(folder)) from problem
+    path = Path(folder)
+    there = next((one for one in (path, *path.parents) if one.exists()), path)
+    try:
+        tempfile.TemporaryFile(dir=there, prefix=UNFINISHED).close()
+    except OSError as problem:  # which names a file that nobody has asked for
+        raise OSError(problem.errno, problem.strerror, str(folder)) from problem
 
 
 def write(path: str | os.PathLike[str], text: str) -> None:

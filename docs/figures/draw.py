@@ -90,7 +90,7 @@ def agents_moving() -> Draw:
 
 
 def agents_over_time() -> Draw:
-    """States and inputs of both agents."""
+    """States, outputs and inputs of both agents."""
     task, played = agents()
     return lambda path: picture.draw_agents(task, played, path)
 

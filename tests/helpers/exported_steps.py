@@ -130,8 +130,8 @@ def apart(exported, x_hat, y, u):
     return (abs(x_hat - in_python(exported, y, u)) / exported.artifact.inverse.x_scale).max()
 
 
-def apart_at_all_levels(name, precision, step, steps=100_000):
-    """The largest difference that a shipped map's export makes in runs of 5,000 samples, laid end to end.
+def apart_at_all_levels(name, precision, step, steps=100_000, length=5000):
+    """The largest difference that a shipped map's export makes in runs of so many samples, laid end to end.
 
     At no measurement noise, at what is usual, and at the most that the map knows of. ``step`` gives estimates for an
     exported map, outputs and inputs.
@@ -139,7 +139,7 @@ def apart_at_all_levels(name, precision, step, steps=100_000):
     Returns the largest as a part of each estimate's range in the runs, and as a part of its scale.
     """
     artifact = Artifact.read(resolve(name))
-    y, u = motion(artifact, steps, runs=-(-steps // 5000))
+    y, u = motion(artifact, steps, runs=-(-steps // length))
     found = []
     for level in (0.0, artifact.measurement_noise, artifact.inverse.measurement_noise_max):
         exported = Exported.read(name, precision=precision, measurement_noise=level)

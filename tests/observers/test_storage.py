@@ -445,7 +445,7 @@ def test_a_folder_that_one_may_not_write_to(path, monkeypatch):
 
 def test_a_folder_that_one_may_not_write_to_is_found_out_beforehand(tmp_path, monkeypatch):
     storage.require_writable(tmp_path / "new" / "folder")
-    assert not os.listdir(tmp_path / "new" / "folder")
+    assert not os.listdir(tmp_path)
 
     def refuse(**options):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), f"{options['dir']}/.part-1")

@@ -19,7 +19,7 @@ SECONDS = 10.0  # that it lasts
 
 
 def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
-    """Draw states, estimates, target and input over time.
+    """Draw states, estimates, target, outputs and inputs over time.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def _draw(path: Path, task: ControlTask, columns: Sequence[tuple[str, Episodes]]
         named = {
             label: handle for ax in axes[:, -1] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
         }
-        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=5)
+        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=min(5, 2 * len(columns)))
         figure.suptitle(f"{system.name.replace('_', ' ')}, measurement noise {show_level(task.measurement_noise)}")
 
 

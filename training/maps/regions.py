@@ -99,7 +99,7 @@ class Regions:
         return self._table(group, lambda i, cell: [self._factor(distances[i][cell], COVERAGE)])[..., 0]
 
     def factors_and_doubts(self, errors: list["Errors"], group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find how far covariances are to be doubted, by Gaussian likelihood, and factors.
+        """Find how far covariances are to be doubted, so that usual errors are likeliest, and factors.
 
         These are lenient: regions of 90 % may hold up to 91 %, as far as that brings the mean squared distance to nx.
         A tracker's errors have longer tails than a normal distribution's. So the mean is what a hundred motions usually
@@ -153,7 +153,8 @@ class Regions:
             mixed = P + doubt * (other - P)
             distances = squared_distance(error, mixed)
             mean = usual_mean(distances, motion)
-            factor = float(np.clip(mean / self.nx, *(self._factor(distances, share) for share in (COVERAGE, LENIENT))))
+            least, most = (self._factor(distances, share) for share in (COVERAGE, LENIENT))
+            factor = float(np.clip(mean / self.nx, least, most))
             surprise = mean / factor + np.linalg.slogdet(mixed)[1].mean() + self.nx * np.log(factor)
             tried.append((surprise, factor, doubt))
         return min(tried)[1:]

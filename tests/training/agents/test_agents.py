@@ -21,7 +21,8 @@ from stable_baselines3 import PPO, SAC
 from kkl_gym import get_system
 from observers import MLP
 from observers.names import resolve
-from training.agents import SB3VecEnv
+from training import figures
+from training.agents import SB3VecEnv, picture
 from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
 from training.agents.cost import WORST, Cost
 from training.agents.information import observer_of
@@ -391,6 +392,29 @@ def test_the_command_trains_and_evaluates(tmp_path, capsys, monkeypatch):
         main(["agent", "train", "pendulum"])
 
 
+@pytest.mark.parametrize("columns", [1, 2])
+def test_figures_show_states_outputs_and_inputs(columns, learned, tmp_path, monkeypatch):
+    """Each in a row; nothing of the legend is cut off."""
+    drawn = []
+    monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
+    agent, _ = learned
+    episodes = play(agent.make(columns), agent, steps=20, seed=0)
+    picture.draw(TASK, episodes, tmp_path / "a.png")
+    (figure,) = drawn
+    axes = np.reshape(figure.axes, (4, columns))
+    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["x1", "x2", "y", "u"]
+    for i in range(columns):
+        found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in axes[:, i]]
+        for j in range(2):
+            np.testing.assert_array_equal(found[j]["state"], episodes.x[:, i, j])
+            np.testing.assert_array_equal(found[j]["estimate"], episodes.x_hat[:, i, j])
+        np.testing.assert_array_equal(found[2]["measured output"], episodes.y[:, i, 0])
+        np.testing.assert_array_equal(found[3]["input"], episodes.u[:, i, 0])
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10
+
+
 def test_metadata_is_json(learned):
     _, folder = learned
     with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
@@ -408,6 +432,8 @@ def test_shipped_agents_act_on_estimates(name, least):
     system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6
     assert not episodes.escaped.any()
+    noise = episodes.y - system.output(episodes.x)
+    assert np.std(noise) == pytest.approx(agent.task.measurement_noise, rel=0.05)
 
 
 def test_the_one_that_sees_y_differs_from_the_shipped_one_in_that_alone():

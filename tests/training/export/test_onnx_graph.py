@@ -50,12 +50,13 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
 )
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-9)])
 def test_what_ships(name, precision, tolerance, request):
-    steps = 34_000 if request.node.get_closest_marker("slow") else 600  # at each of three levels
+    slow = request.node.get_closest_marker("slow")  # in which there are so many steps at each of three levels
+    size = {"steps": 34_000} if slow else {"steps": 1200, "length": 200}
 
     def along(exported, y, u):
         return Runner(exported).along(y[:, None], u[:, None])[:, 0]
 
-    of_range, of_scale = apart_at_all_levels(name, precision, along, steps)
+    of_range, of_scale = apart_at_all_levels(name, precision, along, **size)
     print(f"{name} {precision}: {of_range:.1e} of the range, {of_scale:.1e} of the scale")
     assert of_range < tolerance
 
