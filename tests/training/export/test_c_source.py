@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from compiled_c import compiled, estimates, fed, needs_cc
-from exported_steps import apart, apart_at_all_levels, exported_of, in_doubles, noise
+from compiled_c import compiled, estimates, fed, microseconds, needs_cc
+from exported_steps import apart, apart_at_all_levels, exported_of, in_doubles, in_python, motion, noise
 from rollout_observers import observer_of
 
 from observers import shipped
@@ -66,6 +66,19 @@ def test_100_000_steps_of_what_ships(name, precision, tolerance, tmp_path):
     (path,) = {*tmp_path.glob("*.c")} - {*tmp_path.glob("*_main.c")}
     print(f"{name} {precision}: {of_range:.1e} of the range, {of_scale:.1e} of the scale, {footprint(path)}")
     assert of_range < tolerance
+
+
+@needs_cc
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(shipped().values())))
+def test_how_long_a_step_takes(name, tmp_path):
+    """Printed for docs/guides/speed.md."""
+    exported = Exported.read(name)
+    y, u = motion(exported.artifact, 5000)
+    taken, total = microseconds(exported, tmp_path, y, u)
+    print(f"{name}: {taken:.3g} µs a step")
+    assert taken > 0
+    assert total == pytest.approx(in_python(exported, y, u)[1:, 0].sum(), rel=1e-4, abs=1e-2)
 
 
 @needs_cc
