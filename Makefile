@@ -108,7 +108,7 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 	$(MAKE) figures
 
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
-agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: hours on two cores; resumable
+agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: an hour and a half on two cores; resumable
 	$(BIN)/kkl-gym agent compare
 	$(BIN)/kkl-gym agent compare --systems reverse_duffing van_der_pol --information x_hat_std --no-more-noise
 	mkdir -p docs/results/agents training/agents/shipped
