@@ -12,11 +12,11 @@ WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler, cc")
 
 
-def compiled(exported, folder, *options):
-    """The program around an exported observer."""
+def compiled(exported, folder, *options, main=None):
+    """The program around an exported observer, its own or another."""
     for name, text in c_files(exported).items():
         (folder / name).write_text(text, encoding="utf-8")
-    program, sources = folder / "program", [folder / f"{exported.name}{end}.c" for end in ("", "_main")]
+    program, sources = folder / "program", [folder / f"{exported.name}.c", main or folder / f"{exported.name}_main.c"]
     done = subprocess.run(["cc", *WARNINGS, *options, *sources, "-lm", "-o", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return program
@@ -56,18 +56,15 @@ int main(void)
 
 def microseconds(exported, folder, y, u, turns=20):
     """The processor time of a step in C, along a record and many times over, and the sum of the first estimates."""
-    for name, text in c_files(exported).items():
-        (folder / name).write_text(text, encoding="utf-8")
     nu = u.shape[-1]
     sizes = {"STEPS": len(y), "TURNS": turns, "NY": y.shape[-1], "NU": nu, "WIDTH": len(exported.estimates)}
     text = TIMED.replace("NAME", exported.name).replace("GIVEN", "u[k]," if nu else "")
     (folder / "timed.c").write_text(text, encoding="utf-8")
     told = [f"-D{name}={size}" for name, size in sizes.items()]
-    sources = [folder / "timed.c", folder / f"{exported.name}.c"]
-    subprocess.run(["cc", "-std=c99", "-O2", *told, *sources, "-lm", "-o", folder / "timed"], check=True)
+    program = compiled(exported, folder, *told, main=folder / "timed.c")
     held = np.concatenate([np.zeros((1, nu)), u[: len(y) - 1]])
     rows = np.concatenate([held, y], axis=-1).tolist()
-    done = fed(folder / "timed", "\n".join(" ".join(map(repr, row)) for row in rows))
+    done = fed(program, "\n".join(" ".join(map(repr, row)) for row in rows))
     return [float(number) for number in done.stdout.split()]
 
 
