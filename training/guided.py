@@ -24,6 +24,7 @@ SETTLED = 5.0  # s at the pace of the shipped systems, after which errors count 
 AGES = 30  # at which they are looked at
 WINDOW = 0.5  # s at that pace, over which innovations are averaged
 CHANCE = 1e-9  # that their mean square is as large as its limit where model and levels of noise hold
+NOISE_FLOOR = 0.001  # half of what filters assume at least that nobody watches: more of those would lose their way
 
 
 class GuidedKalmanFilter:
@@ -95,7 +96,9 @@ class GuidedKalmanFilter:
         self._batch: tuple[int, ...] | None = None
         artifact = dataclasses.replace(artifact, flow=None)  # which would be a second filter of the kind
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
-        self._filter = UnscentedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level))
+        self._filter = UnscentedKalmanFilter(
+            system, dt, Q=Q, R=measurement_covariance(system, level, floor=NOISE_FLOOR)
+        )
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)
         self._log_volumes = np.linalg.slogdet(self._covariances)[1]
         self._window, self._share = round(WINDOW * system.pace / dt), -np.expm1(-dt / (WINDOW * system.pace))

@@ -12,10 +12,10 @@ from observers.unscented import Gaussian
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
 UNSEEN = 1e12  # variance of an output that is missing, in multiples of the largest of those measured
-NOISE_FLOOR = 0.02  # the least measurement noise that a filter assumes, in multiples of the system's default
+NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
-LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
+LEAST_PROCESS_NOISE = 0.002  # that a filter assumes, at the system's pace: 4 % of the environments' default
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
@@ -30,7 +30,9 @@ def unknown_start(system: System) -> Gaussian:
     return x.mean(0), np.cov(x.T).reshape(system.nx, -1) + np.diag(LEAST_VARIANCE * (high - low) ** 2)
 
 
-def measurement_covariance(system: System, measurement_noise: float | Sequence[float]) -> np.ndarray:
+def measurement_covariance(
+    system: System, measurement_noise: float | Sequence[float], *, floor: float = NOISE_FLOOR
+) -> np.ndarray:
     """Covariance of the measurement noise that a filter assumes: no less than a part of the system's default.
 
     Parameters
@@ -39,13 +41,15 @@ def measurement_covariance(system: System, measurement_noise: float | Sequence[f
         What is measured.
     measurement_noise : float or sequence of float, length ny
         Standard deviation of the noise on each sample, of all outputs or each.
+    floor : float
+        The least that is assumed, in multiples of the system's default.
 
     Returns
     -------
     ndarray, shape (ny, ny)
         R.
     """
-    least = NOISE_FLOOR * np.asarray(system.measurement_noise, dtype=float)
+    least = floor * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 

@@ -1,5 +1,6 @@
 """The system's motion over one sample, as a polynomial and a network: its data, and what its training minimises."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,12 +32,15 @@ BATCH, LEARNING_RATE = 1024, 3e-3
 # deviation. The network then has little to say. Elsewhere it would have to make up for powers that grow without end:
 # then it is a wide one, beside a linear fit.
 LITTLE = 1e-4
+MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
+# Where those leave more, higher degrees are tried. Most of their terms do not matter, and are left out.
+MOST_OF_HIGHER, HIGHEST = 120, 7
 NARROW, WIDE = (8, 2), (24, 2)  # neurons in each hidden layer, and how many there are
 SMALL_NARROW, SMALL_WIDE = (4, 1), (12, 2)  # of small flows
-# The polynomials of small flows lack terms that move a state by less than that part of what they leave, or than that
-# many standard deviations. The others are then fitted again (S. L. Brunton et al., Proc. Natl. Acad. Sci. 113, 2016).
+# The polynomials of small flows, and those of higher degrees, lack terms that move a state by less than that part of
+# what they leave, or than that many standard deviations. The others are then fitted again (S. L. Brunton et al., Proc.
+# Natl. Acad. Sci. 113, 2016).
 NEGLIGIBLE, INVISIBLE = 0.3, 1e-6
-MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 OF_MEDIAN = 1.4826  # a normal distribution's standard deviation, over the median of its absolute values
 FARTHEST = 0.1  # share of the increments, of the longest, from which it is found how errors grow with them
 LEAST_BEND = 0.1  # of that: less would hardly change a covariance, unless a state crosses its range in a sample
@@ -138,10 +142,11 @@ class FlowProblem(nn.Module):
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
-    degree : int
-        Of the polynomial, if it leaves little; else it is 1.
+    degrees : sequence of int
+        Of the polynomials that are tried, of which the first is taken that leaves little; else its degree is 1. Of all
+        but the first, terms that hardly matter are left out.
     small : bool
-        Whether terms of the polynomial that hardly matter are left out, and the network is smaller.
+        Whether terms of the polynomial that hardly matter are always left out, and the network is smaller.
     device : torch.device
         Where the network is trained.
 
@@ -154,16 +159,25 @@ class FlowProblem(nn.Module):
     """
 
     def __init__(
-        self, increments: Increments, u_scale: np.ndarray, *, degree: int, small: bool, device: torch.device
+        self,
+        increments: Increments,
+        u_scale: np.ndarray,
+        *,
+        degrees: Sequence[int],
+        small: bool,
+        device: torch.device,
     ) -> None:
         super().__init__()
         inputs = scaled_inputs(increments, u_scale)
         change = increments.change / increments.x_scale
-        self.polynomial, left = _fitted(inputs, change, degree)
-        little = np.median(np.abs(left), axis=0).max() < LITTLE
-        if not little and degree > 1:
+        for degree in degrees:
+            self.polynomial, left = _fitted(inputs, change, degree)
+            little = np.median(np.abs(left), axis=0).max() < LITTLE
+            if little:
+                break
+        if not little:
             self.polynomial, left = _fitted(inputs, change, 1)
-        elif small and degree > 1:
+        elif degree != degrees[0] or (small and degree > 1):
             self.polynomial, left = _thinned(inputs, change, self.polynomial, degree)
         shapes = (SMALL_NARROW, SMALL_WIDE) if small else (NARROW, WIDE)
         width, depth = shapes[0 if little else 1]
@@ -218,8 +232,8 @@ def _thinned(
     return polynomial, change - terms @ polynomial.T
 
 
-def largest_degree(variables: int) -> int:
-    """Find the degree of polynomials that are tried.
+def possible_degrees(variables: int) -> list[int]:
+    """Find the degrees of polynomials that are tried, one after the other.
 
     Parameters
     ----------
@@ -228,10 +242,12 @@ def largest_degree(variables: int) -> int:
 
     Returns
     -------
-    int
-        The highest up to 5 of which there are at most 60 terms; 1 where there is none.
+    list of int
+        The highest up to 5 of which there are at most 60 terms, or 1 where there is none; then all higher ones up to 7
+        of at most 120 terms.
     """
-    return max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
+    usual = max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
+    return [usual, *(k for k in range(usual + 1, HIGHEST + 1) if count(variables, k) <= MOST_OF_HIGHER)]
 
 
 def scaled_inputs(increments: Increments, u_scale: np.ndarray) -> np.ndarray:
@@ -244,7 +260,7 @@ def fit_flow(
     increments: Increments,
     u_scale: np.ndarray,
     *,
-    degree: int,
+    degrees: Sequence[int],
     steps: int,
     seed: int,
     progress: ProgressBars,
@@ -260,8 +276,8 @@ def fit_flow(
         What it is fitted to.
     u_scale : ndarray, shape (nu,)
         Of the inputs.
-    degree : int
-        Of the polynomial, if it leaves little; else it is 1.
+    degrees : sequence of int
+        As :class:`FlowProblem` has them.
     steps : int
         Batches.
     seed : int
@@ -281,7 +297,7 @@ def fit_flow(
         One that has no error, and no factors yet.
     """
     device = device or torch.device("cpu")
-    problem = FlowProblem(increments, u_scale, degree=degree, small=small, device=device)
+    problem = FlowProblem(increments, u_scale, degrees=degrees, small=small, device=device)
     optimise_at_once(
         "flow", problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed
     )

@@ -19,8 +19,8 @@ from training.methods.base import Arrays, CausalObserver, Configuration, Method,
 # Levels of the process noise that a filter assumes, in multiples of each state's scale per square root of the pace:
 # white noise, unlike the bounded process noise of the environments. It stands for the filters' own errors of
 # linearisation, for there is none in the trajectories.
-DIFFUSION = (1e-3, 1e-2, 1e-1)
-GUIDED_DIFFUSION = (3e-4, 1e-2, 1e-1)  # where an observer takes the filter back, it may trust an exact model more
+DIFFUSION = (1e-4, 1e-3, 1e-2)
+WRONG_DIFFUSION = (1e-3, 1e-2, 1e-1)  # which has to make up for a wrong model as well
 
 
 def diffusion_intensity(trained: Arrays, system: System) -> np.ndarray:
@@ -37,10 +37,11 @@ class EKF(Method[Arrays]):
     name: ClassVar[str] = "ekf"
     label: ClassVar[str] = "EKF"
     filter: ClassVar[type[KalmanFilter]] = ExtendedKalmanFilter
+    diffusion: ClassVar[tuple[float, ...]] = DIFFUSION
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
         """Three levels of diffusion, in multiples of the scale per square root of a second of its pace."""
-        return tuple({"diffusion": level} for level in DIFFUSION)
+        return tuple({"diffusion": level} for level in self.diffusion)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
@@ -67,10 +68,6 @@ class Guided(EKF):
     name: ClassVar[str] = "guided"
     label: ClassVar[str] = "UKF, guided by the shipped map"
 
-    def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """Three levels of diffusion, as for the others; the least is smaller."""
-        return tuple({"diffusion": level} for level in GUIDED_DIFFUSION)
-
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
         """The filter and the map, told the noise level."""
         Q = diffusion_intensity(trained, system)
@@ -82,6 +79,7 @@ class WrongEKF(WrongParameters, EKF):
 
     name: ClassVar[str] = "ekf-wrong"
     label: ClassVar[str] = "EKF, model 10 % off"
+    diffusion: ClassVar[tuple[float, ...]] = WRONG_DIFFUSION
 
 
 class UntunedEKF(EKF):

@@ -102,7 +102,7 @@ def learn_recorded_tracking(
         flow = fit_flow(
             learned,
             np.where(u_scale > 0, u_scale, 1.0),
-            degree=DEGREE,
+            degrees=(DEGREE,),
             steps=steps,
             small=small,
             seed=seed,

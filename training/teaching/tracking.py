@@ -11,9 +11,9 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
-from training.kalman import LEAST_PROCESS_NOISE, NOISE_FLOOR
+from training.kalman import LEAST_PROCESS_NOISE
 from training.maps.ahead import draw_courses, learn_ahead
-from training.maps.flow import Increments, draw_increments, fit_flow, largest_degree, usual_bend, usual_error
+from training.maps.flow import Increments, draw_increments, fit_flow, possible_degrees, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
 from training.progress import ProgressBars, progress_bars
 from training.seeds import Stream, generator
@@ -22,6 +22,7 @@ from training.trajectories.controllers import Controller
 from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
+LEAST_NOISE = 0.02  # the least measurement noise that is assumed, in multiples of what is usual for the map
 OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
 AHEAD = 0.125  # of the batches that learn single samples, so many learn many samples in a row
 UNSURE = 1.5  # times what was added to covariances at each sample before: a flow that asks for more is not taken
@@ -179,11 +180,11 @@ def _learned(
     low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
     usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
     outputs = np.nanstd(system.output(increments.x), axis=0)
-    least = np.maximum(NOISE_FLOOR * usual, OF_OUTPUT * outputs)
+    least = np.maximum(LEAST_NOISE * usual, OF_OUTPUT * outputs)
     flow = fit_flow(
         increments,
         u_scale,
-        degree=largest_degree(artifact.nx + nu),
+        degrees=possible_degrees(artifact.nx + nu),
         steps=steps,
         small=small,
         seed=seed,

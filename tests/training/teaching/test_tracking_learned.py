@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from linear_system import Oscillator
 from rich.console import Console
 from tracking import DT, exact_motion, plain_observer, tracking_observer
@@ -172,7 +173,7 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent, thin):
         found = flow.fit_flow(
             increments,
             np.array([4.0]),
-            degree=3,
+            degrees=(3,),
             steps=1,
             seed=0,
             small=thin,
@@ -208,8 +209,21 @@ def test_terms_that_small_flows_lack_are_below_what_the_others_leave():
     assert (left.std(0) < 1.02 * before.std(0)).all()
 
 
-def test_degrees_are_as_high_as_sixty_terms_allow():
-    assert [flow.largest_degree(n) for n in (1, 2, 3, 4, 5, 6, 9, 10, 40)] == [5, 5, 5, 3, 3, 2, 2, 1, 1]
+def test_degrees_are_as_high_as_sixty_terms_allow_and_then_as_high_as_twice_as_many_do():
+    found = [flow.possible_degrees(n) for n in (1, 2, 3, 4, 5, 6, 9, 10, 40)]
+    assert [usual for usual, *_ in found] == [5, 5, 5, 3, 3, 2, 2, 1, 1]
+    assert [higher for _, *higher in found] == [[6, 7], [6, 7], [6, 7], [4], [], [3], [], [2], []]
+
+
+def test_where_a_degree_leaves_much_the_next_one_is_tried_and_its_terms_that_do_not_matter_are_left_out():
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(5000, 2)), rng.uniform(-1, 1, (5000, 1))
+    x -= x.mean(0)
+    change = np.column_stack([0.1 * x[:, 1], 0.02 * u[:, 0] - 0.01 * x[:, 0] ** 6])
+    increments = flow.Increments(x, u, change, x.mean(0), x.std(0))
+    problem = flow.FlowProblem(increments, np.ones(1), degrees=(5, 6, 7), small=False, device=torch.device("cpu"))
+    assert problem.polynomial.shape == (2, 84)  # of degree 6
+    assert (problem.polynomial != 0).sum(1).tolist() == [1, 2]  # x2; u and the power of x1
 
 
 def test_inputs_are_learned():
