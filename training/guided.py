@@ -13,7 +13,14 @@ from kkl_gym.systems import get_system
 from observers import Artifact, KKLObserver
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array, shown
 from observers.names import resolve
-from training.kalman import LEAST_VARIANCE, UnscentedKalmanFilter, measurement_covariance, process_intensity
+from training.kalman import (
+    FLOOR_WHERE_WATCHED,
+    LEAST_VARIANCE,
+    LEAST_WHERE_WATCHED,
+    UnscentedKalmanFilter,
+    measurement_covariance,
+    process_intensity,
+)
 from training.seeds import Stream, generator
 from training.trajectories.noise import draw_process_noise, noisy_output
 from training.trajectories.signals import random_inputs
@@ -24,7 +31,6 @@ SETTLED = 5.0  # s at the pace of the shipped systems, after which errors count 
 AGES = 30  # at which they are looked at
 WINDOW = 0.5  # s at that pace, over which innovations are averaged
 CHANCE = 1e-9  # that their mean square is as large as its limit where model and levels of noise hold
-NOISE_FLOOR = 0.001  # half of what filters assume at least that nobody watches: more of those would lose their way
 
 
 class GuidedKalmanFilter:
@@ -91,13 +97,13 @@ class GuidedKalmanFilter:
         level = artifact.measurement_noise if measurement_noise is None else measurement_noise
         level = noise_levels("measurement_noise", level, system.ny)
         disturbed = system.process_noise if process_noise is None else noise_level("process_noise", process_noise)
-        Q = process_intensity(system, disturbed, dt) if Q is None else _checked(Q, system.nx)
+        Q = process_intensity(system, disturbed, dt, least=LEAST_WHERE_WATCHED) if Q is None else _checked(Q, system.nx)
         self.system = system
         self._batch: tuple[int, ...] | None = None
         artifact = dataclasses.replace(artifact, flow=None)  # which would be a second filter of the kind
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
         self._filter = UnscentedKalmanFilter(
-            system, dt, Q=Q, R=measurement_covariance(system, level, floor=NOISE_FLOOR)
+            system, dt, Q=Q, R=measurement_covariance(system, level, floor=FLOOR_WHERE_WATCHED)
         )
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)
         self._log_volumes = np.linalg.slogdet(self._covariances)[1]

@@ -15,7 +15,9 @@ UNSEEN = 1e12  # variance of an output that is missing, in multiples of the larg
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
-LEAST_PROCESS_NOISE = 0.002  # that a filter assumes, at the system's pace: 4 % of the environments' default
+LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
+# The same of filters that are taken back where they are lost, and so may trust their samples and their model more.
+FLOOR_WHERE_WATCHED, LEAST_WHERE_WATCHED = 0.001, 0.002
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
@@ -54,7 +56,9 @@ def measurement_covariance(
     return np.diag(np.broadcast_to(levels, (system.ny,)) ** 2)
 
 
-def process_intensity(system: System, process_noise: float, dt: float) -> np.ndarray:
+def process_intensity(
+    system: System, process_noise: float, dt: float, *, least: float = LEAST_PROCESS_NOISE
+) -> np.ndarray:
     """Intensity of the white noise that a filter assumes in place of the environments' process noise, never quite 0.
 
     Parameters
@@ -65,13 +69,15 @@ def process_intensity(system: System, process_noise: float, dt: float) -> np.nda
         Level of a noise that is uniform and held over each sample, in multiples of the system's scale per second.
     dt : float
         Sampling interval in seconds.
+    least : float
+        The least level that is assumed, at the pace of the shipped systems.
 
     Returns
     -------
     ndarray, shape (nx, nx)
         Q, per second.
     """
-    assumed = max(process_noise, LEAST_PROCESS_NOISE / system.pace)
+    assumed = max(process_noise, least / system.pace)
     return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
 
 

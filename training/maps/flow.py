@@ -36,7 +36,7 @@ MOST_TERMS, HIGHEST_DEGREE = 60, 5  # of polynomials
 # Where those leave more, higher degrees are tried. Most of their terms do not matter, and are left out.
 MOST_OF_HIGHER, HIGHEST = 120, 7
 NARROW, WIDE = (8, 2), (24, 2)  # neurons in each hidden layer, and how many there are
-SMALL_NARROW, SMALL_WIDE = (4, 1), (12, 2)  # of small flows
+SMALL_NARROW, SMALL_WIDE = (4, 1), (12, 2)  # of small flows; those of higher degrees have the usual one
 # The polynomials of small flows, and those of higher degrees, lack terms that move a state by less than that part of
 # what they leave, or than that many standard deviations. The others are then fitted again (S. L. Brunton et al., Proc.
 # Natl. Acad. Sci. 113, 2016).
@@ -172,15 +172,18 @@ class FlowProblem(nn.Module):
         change = increments.change / increments.x_scale
         for degree in degrees:
             self.polynomial, left = _fitted(inputs, change, degree)
-            little = np.median(np.abs(left), axis=0).max() < LITTLE
+            little = _is_little(left)
             if little:
                 break
+        higher = little and degree != degrees[0]
         if not little:
             self.polynomial, left = _fitted(inputs, change, 1)
-        elif degree != degrees[0] or (small and degree > 1):
-            self.polynomial, left = _thinned(inputs, change, self.polynomial, degree)
-        shapes = (SMALL_NARROW, SMALL_WIDE) if small else (NARROW, WIDE)
-        width, depth = shapes[0 if little else 1]
+        elif higher or (small and degree > 1):
+            thinned = _thinned(inputs, change, self.polynomial, degree)
+            if _is_little(thinned[1]):
+                self.polynomial, left = thinned
+        narrow, wide = (SMALL_NARROW, SMALL_WIDE) if small and not higher else (NARROW, WIDE)
+        width, depth = narrow if little else wide
         self.gain = left.std(0)
         left = left / np.where(self.gain > 0, self.gain, 1.0)
         self.network = Network(inputs.shape[1], change.shape[1], width=width, depth=depth, activation="tanh").to(device)
@@ -204,6 +207,11 @@ class FlowProblem(nn.Module):
         square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
         loss = (self._weight[rows] * square).mean()
         return {"loss": loss, "error": loss.detach().sqrt()}
+
+
+def _is_little(left: np.ndarray) -> bool:
+    """Whether what a polynomial leaves is usually little."""
+    return bool(np.median(np.abs(left), axis=0).max() < LITTLE)
 
 
 def _fitted(inputs: np.ndarray, change: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:

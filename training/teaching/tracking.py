@@ -11,7 +11,7 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
-from training.kalman import LEAST_PROCESS_NOISE
+from training.kalman import LEAST_WHERE_WATCHED
 from training.maps.ahead import draw_courses, learn_ahead
 from training.maps.flow import Increments, draw_increments, fit_flow, possible_degrees, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
@@ -26,6 +26,7 @@ LEAST_NOISE = 0.02  # the least measurement noise that is assumed, in multiples 
 OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
 AHEAD = 0.125  # of the batches that learn single samples, so many learn many samples in a row
 UNSURE = 1.5  # times what was added to covariances at each sample before: a flow that asks for more is not taken
+REACH = 2.0  # of X, within which estimates may lie at least
 JUDGED = 0.05  # share of the increments of which the flow's error is taken, and which it does not learn from
 
 
@@ -178,13 +179,14 @@ def _learned(
     judged, increments = drawn.part(slice(held_out)), drawn.part(slice(held_out, None))
     u_scale = np.array(system.u_max[:nu], dtype=float)
     low, high = (np.array(bound, dtype=float) for bound in zip(*system.bounds, strict=True))
+    degrees = possible_degrees(artifact.nx + nu)
     usual = np.broadcast_to(np.asarray(artifact.measurement_noise, dtype=float), (system.ny,))
     outputs = np.nanstd(system.output(increments.x), axis=0)
     least = np.maximum(LEAST_NOISE * usual, OF_OUTPUT * outputs)
     flow = fit_flow(
         increments,
         u_scale,
-        degrees=possible_degrees(artifact.nx + nu),
+        degrees=degrees,
         steps=steps,
         small=small,
         seed=seed,
@@ -193,10 +195,14 @@ def _learned(
         low=low,
         high=high,
         process_noise=np.array(system.scale) / increments.x_scale * dt / np.sqrt(3),
-        least_process_noise=LEAST_PROCESS_NOISE / system.pace,
+        least_process_noise=LEAST_WHERE_WATCHED / system.pace,
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
+    if flow.degree > degrees[0]:  # it grows steeply beyond what it was fitted to, and a covariance with it
+        lowest, highest = system.box(REACH)
+        lowest, highest = np.minimum(lowest, drawn.x.min(0)), np.maximum(highest, drawn.x.max(0))
+        flow = dataclasses.replace(flow, low=np.maximum(low, lowest), high=np.minimum(high, highest))
     flow = _judged(flow, judged)
     ahead = round(AHEAD * steps)
     if not ahead:

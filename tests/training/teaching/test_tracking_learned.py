@@ -81,7 +81,7 @@ def test_process_noise_is_that_of_simulations_at_the_systems_pace():
     found = learn_tracking(plain_observer(), Slow(), steps=2, trajectories=50).flow
     w = draw_process_noise(Slow(), 1.0, n=100, steps=200, rng=np.random.default_rng(0))
     np.testing.assert_allclose(found.process_noise * found.x_scale, DT * w.std((0, 1)), rtol=0.03)
-    assert found.least_process_noise == pytest.approx(0.005 / 4.0)
+    assert found.least_process_noise == pytest.approx(0.002 / 4.0)
 
 
 def test_the_monitors_limits_are_those_of_the_observer_that_tracks(monkeypatch):
@@ -232,6 +232,11 @@ def test_inputs_are_learned():
     short = dataclasses.replace(artifact, limits=None, training={**artifact.training, "duration": 4.0})
     found = learn_tracking(short, system, steps=600, trajectories=50)
     assert found.flow.nu == 1
+    assert found.flow.degree == 7  # and not asked far beyond what it was fitted to
+    assert (found.flow.high >= system.box(2.0)[1]).all()
+    assert (found.flow.high < [12, 30]).all()
+    assert (found.flow.low <= system.box(2.0)[0]).all()
+    assert (found.flow.low > [-12, -30]).all()
     x = np.array([[1.5, 0.3]])
     still, pushed = (found.flow(x, np.array([[u]]))[0, 1] for u in (0.0, 5.0))
     assert pushed - still == pytest.approx(5.0 * 0.01, rel=0.2)
