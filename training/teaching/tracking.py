@@ -199,20 +199,26 @@ def _learned(
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
-    if flow.degree > degrees[0]:  # it grows steeply beyond what it was fitted to, and a covariance with it
-        lowest, highest = system.box(REACH)
-        lowest, highest = np.minimum(lowest, drawn.x.min(0)), np.maximum(highest, drawn.x.max(0))
-        flow = dataclasses.replace(flow, low=np.maximum(low, lowest), high=np.minimum(high, highest))
     flow = _judged(flow, judged)
-    ahead = round(AHEAD * steps)
-    if not ahead:
-        return flow
-    with progress.phase("simulating courses"):
-        courses = draw_courses(system, increments.x, increments.u, dt, samples=round(duration / dt))
-    other = learn_ahead(flow, courses, steps=ahead, seed=seed, progress=progress, device=device)
-    other = _judged(other, judged)
-    less_sure = other.variances(0.0, 0.0)[0] > UNSURE**2 * flow.variances(0.0, 0.0)[0]
-    return flow if less_sure.any() else other
+    if ahead := round(AHEAD * steps):
+        with progress.phase("simulating courses"):
+            courses = draw_courses(system, increments.x, increments.u, dt, samples=round(duration / dt))
+        other = learn_ahead(flow, courses, steps=ahead, seed=seed, progress=progress, device=device)
+        other = _judged(other, judged)
+        less_sure = other.variances(0.0, 0.0)[0] > UNSURE**2 * flow.variances(0.0, 0.0)[0]
+        flow = flow if less_sure.any() else other
+    return _bounded(flow, drawn.x, system) if flow.degree > degrees[0] else flow
+
+
+def _bounded(flow: Flow, x: np.ndarray, system: System) -> Flow:
+    """A flow that is asked no further than 2X and the states (n, nx) that it was fitted to.
+
+    Beyond them a polynomial of a high degree grows steeply, and a covariance with it: after a few false samples an
+    estimate would stay lost.
+    """
+    low, high = system.box(REACH)
+    low, high = np.minimum(low, x.min(0)), np.maximum(high, x.max(0))
+    return dataclasses.replace(flow, low=np.maximum(flow.low, low), high=np.minimum(flow.high, high))
 
 
 def _judged(flow: Flow, increments: Increments) -> Flow:
