@@ -176,7 +176,7 @@ class FlowProblem(nn.Module):
             if little:
                 break
         higher = little and degree != degrees[0]
-        if not little:
+        if not little and degree > 1:
             self.polynomial, left = _fitted(inputs, change, 1)
         elif higher or (small and degree > 1):
             thinned = _thinned(inputs, change, self.polynomial, degree)
