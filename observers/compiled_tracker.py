@@ -13,6 +13,7 @@ import numpy as np
 from observers.filter import LinearFilter
 from observers.flow import Flow
 from observers.sparse import without_zeros
+from observers.supervision import Supervision
 from observers.tracker_kernels import kernels
 from observers.unscented import Gaussian
 
@@ -22,9 +23,9 @@ _NONE = np.empty((0, 0))
 class CompiledTracker:
     """A step of an unscented Kalman filter on a learned flow, whose states are scaled.
 
-    Where a method takes a state, that is an array (n, nx + nx^2 + 1) in memory without gaps, which is written over. A
-    row holds the estimate, its covariance, and the running mean square of the innovations. A single sample has a state
-    of one row.
+    Where a method takes a state, that is an array (n, width) in memory without gaps, which is written over. A row holds
+    the estimate (nx), its covariance (nx^2), the running mean square of the innovations, that of their trend, and the
+    trend itself (ny). A single sample has a state of one row.
 
     Parameters
     ----------
@@ -34,10 +35,10 @@ class CompiledTracker:
         What makes z of the outputs.
     C : ndarray, shape (ny, nx)
         Of the outputs y = C x.
+    watch : Supervision
+        How innovations are watched.
     variances : (ndarray, ndarray)
         Of what is added to scaled states at each sample, (nx,), and of the noise on each output, (ny,).
-    share : float
-        Of the newest innovation in the mean square.
 
     Raises
     ------
@@ -50,16 +51,17 @@ class CompiledTracker:
         flow: Flow,
         linear: LinearFilter,
         C: np.ndarray,
+        watch: Supervision,
         *,
         variances: tuple[np.ndarray, np.ndarray],
-        share: float,
     ) -> None:
         network, (q, r) = flow.mlp.compiled, variances
         if network is None:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
         bend = np.zeros(flow.nx) if flow.bend is None else flow.bend
         states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale, bend)
-        outputs = _packed(C @ flow.x_offset, r, np.full(len(r), share), C * flow.x_scale)
+        watched = np.tile([watch.share, watch.trend_share, watch.trend_gain, watch.trend_limit], (len(r), 1))
+        outputs = _packed(C @ flow.x_offset, r, watched, C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._nx, self._ny = flow.nx, len(C)
         used = tuple(map(tuple, (flow.polynomial != 0).tolist()))
@@ -81,7 +83,7 @@ class CompiledTracker:
 
         Parameters
         ----------
-        state : ndarray, shape (n, nx + nx^2 + 1)
+        state : ndarray, shape (n, width)
             The state.
         u : ndarray, shape (n, nu)
             Inputs.
@@ -108,7 +110,7 @@ class CompiledTracker:
 
         Parameters
         ----------
-        state : ndarray, shape (1, nx + nx^2 + 1)
+        state : ndarray, shape (1, width)
             The state.
         z : ndarray, shape (size,)
             That of the filter.
@@ -145,7 +147,7 @@ class CompiledTracker:
             Where the tracker is lost.
         where : ndarray of int, shape (k,)
             The rows that these are.
-        state : ndarray, shape (n, nx + nx^2 + 1)
+        state : ndarray, shape (n, width)
             The state.
         x : ndarray, shape (n, nx), optional
             The estimates in units of the states, which are written over as the state is.

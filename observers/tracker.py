@@ -2,7 +2,6 @@
 
 import copy
 import functools
-import math
 from typing import Any
 
 import numpy as np
@@ -11,13 +10,10 @@ from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
 from observers.factors import Factors
-from observers.flow import Flow
+from observers.supervision import DOUBT, Supervision
 from observers.thresholds import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
-# A filter is lost where innovations are as large as that by chance: the normal distribution's quantile for 1e-5. Their
-# running mean is more skewed than what that is taken of, so that it is up to 5e-5, most where windows are short.
-_BEYOND_CHANCE = 4.265
 KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scaled states
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample
 
@@ -59,6 +55,10 @@ class Tracker:
     told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
     surer than so soon after a reset as the window is long.
 
+    An estimate that is off by less than the noise is not lost, and may be off by many times what the filter believes.
+    Its innovations then agree with one another. Where the mean square of their running mean is beyond chance, the
+    filter's covariance is multiplied by ten, so that it believes the samples again.
+
     What it says of its own errors is not the filter's covariance P alone, which is now and then far too small. P is
     doubted, at each level of noise and age as far as that made errors likelier in calibration: (1 - doubt) P + doubt M.
     Within the window M is what T_inv says of these errors. That is its own covariance, and the square of what the two
@@ -97,12 +97,15 @@ class Tracker:
         self._nz = len(artifact.filter.A)
         self._C = None if artifact.C is None else artifact.C * flow.x_scale
         self._units = flow.x_scale[:, None] * flow.x_scale
-        self._window, self._share, self._limit = supervision(flow, self._dt)
+        self._supervision = Supervision.of(flow, self._dt)
+        self._window = self._supervision.window
+        self._end = flow.nx + flow.nx**2  # of what a row of the state says of the estimate
         shares = artifact.inverse.shares(measurement_noise, process_noise)
         self._calibrated, self._free_calibrated = (
             _Calibrated(each, shares, self._dt, self._units)
             for each in (flow.factors, flow.free_factors or flow.factors)
         )
+        self._unwatched = np.array([1.0, 1.0, *np.zeros(len(r))])  # the end of a row that begins
         self._batch: tuple[int, ...]
         self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
@@ -119,12 +122,22 @@ class Tracker:
     def _P(self) -> np.ndarray:
         """Their covariances, (n, nx, nx)."""
         nx = self._flow.nx
-        return self._state[:, nx:-1].reshape(len(self._state), nx, nx)
+        return self._state[:, nx : self._end].reshape(len(self._state), nx, nx)
 
     @property
     def _mean_square(self) -> np.ndarray:
         """Of the innovations, over the window, (n,)."""
-        return self._state[:, -1]
+        return self._state[:, self._end]
+
+    @property
+    def _trend_square(self) -> np.ndarray:
+        """The mean square of the trend over the window, (n,), 1 where innovations are independent."""
+        return self._state[:, self._end + 1]
+
+    @property
+    def _trend(self) -> np.ndarray:
+        """The running mean of the innovations, in units of their standard deviations, (n, ny)."""
+        return self._state[:, self._end + 2 :]
 
     @property
     def estimate(self) -> np.ndarray:
@@ -156,7 +169,7 @@ class Tracker:
         heard = heard if heard is not None and heard[0] is z else None
         z = z.reshape(n, z.shape[-1])
         ages, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
-        P = (self._state[:, nx:-1] * self._scales(ages, acted)).reshape(n, nx, nx)
+        P = (self._state[:, nx : self._end] * self._scales(ages, acted)).reshape(n, nx, nx)
         soon = (ages < self._window) & ~self._known
         if soon.any():
             ages = np.broadcast_to(ages, n)[soon]
@@ -237,7 +250,7 @@ class Tracker:
         """Go on where another stands, which may be told other levels of noise or have another flow."""
         self._batch = other._batch
         self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units)
-        self._mean_square[:] = other._mean_square
+        self._state[:, self._end :] = other._state[:, other._end :]
         self._known = other._known
 
     def warm_up(self, z: np.ndarray) -> None:
@@ -269,17 +282,34 @@ class Tracker:
             else:
                 expected, across = self._output(x), P @ self._C.T
                 S = self._C @ across
-            x, P, nis = conditioned(x, P, y - expected, S + self._R, across)
-            share = self._share * (1 - np.isnan(y).mean(-1))  # less of those that are known in part, which scatter more
-            mean_square = self._mean_square + share * (nis - self._mean_square)
-            state = self._packed(self._within(x), P, mean_square)
-            sound = np.isfinite(state[:, :-1].sum(-1))
+            x, P, white = conditioned(x, P, y - expected, S + self._R, across)
+            P, watched = self._watched(P, white, ~np.isnan(y))
+            state = self._packed(self._within(x), P, watched)
+            sound = np.isfinite(state[:, : self._end].sum(-1))
         taken = sound if rows is None else sound & rows
         if not taken.all():
             state = np.where(taken[:, None], state, self._state)
-            state[~sound if rows is None else ~sound & rows, -1] = np.inf
+            state[~sound if rows is None else ~sound & rows, self._end] = np.inf
         self._state = state
         return expected.reshape(*self._batch, ny)
+
+    def _watched(self, P: np.ndarray, white: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances, and the rows' ends (n, 2 + ny), after innovations (n, ny) in units of standard deviations.
+
+        A covariance is doubted where they agree with one another.
+        """
+        watch, ny = self._supervision, seen.shape[1]
+        counted = watch.share / ny * seen.sum(-1)  # less of those that are known in part, which scatter more
+        seen_mean = 1 / np.maximum(seen.sum(-1), 1)
+        mean_square = self._mean_square + counted * (seen_mean * (white**2).sum(-1) - self._mean_square)
+        trend = self._trend + watch.trend_share * np.where(seen, white - self._trend, 0.0)
+        square = watch.trend_gain * seen_mean * (np.where(seen, trend, 0.0) ** 2).sum(-1)
+        trend_square = self._trend_square + counted * (square - self._trend_square)
+        doubted = trend_square > watch.trend_limit
+        if doubted.any():
+            P = np.where(doubted[:, None, None], DOUBT * P, P)
+            trend_square, trend = np.where(doubted, 1.0, trend_square), np.where(doubted[:, None], 0.0, trend)
+        return P, np.column_stack([mean_square, trend_square, trend])
 
     def step_single(
         self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
@@ -313,13 +343,14 @@ class Tracker:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         self._heard = None
         if not self._batch:  # a single sample: every call of numpy would be felt
-            age, one = float(age), not self._state.item(-1) <= self._limit  # lost where it is NaN too
+            age = float(age)
+            one = not self._state.item(self._end) <= self._supervision.limit  # lost where it is NaN too
             if (one or age < self._window) and (rows is None or rows):
                 said = self._said_of_one(z, age, one)
                 self._take(said, _FLAGS[one], _FIRST)
                 self._heard = z, _FLAGS[True], said
             return
-        lost = ~(self._mean_square <= self._limit)
+        lost = ~(self._mean_square <= self._supervision.limit)
         asked = np.ravel(age) < self._window  # of all rows, or the one age that they share
         if not asked.any() and not lost.any():  # most often
             return
@@ -350,7 +381,7 @@ class Tracker:
         if taken.any():
             self._state = self._state.copy()  # others may look at what there was
             self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
-            self._mean_square[where[lost]] = 1.0
+            self._state[where[lost], self._end :] = self._unwatched
 
     def _said(self, z: np.ndarray, age: np.ndarray, lost: np.ndarray | None = None) -> Gaussian:
         """What T_inv says of z, (k, size), at ages in samples: estimates, and covariances, in units of the states."""
@@ -371,10 +402,10 @@ class Tracker:
     def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
         """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
         self._shown, self._heard = None, None
-        self._state = self._packed(*self._scaled(x, P), np.ones(len(x)))
+        self._state = self._packed(*self._scaled(x, P), np.tile(self._unwatched, (len(x), 1)))
 
-    def _packed(self, x: np.ndarray, P: np.ndarray, mean_square: np.ndarray) -> np.ndarray:
-        return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), mean_square[:, None]], axis=1)
+    def _packed(self, x: np.ndarray, P: np.ndarray, watched: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), watched], axis=1)
 
     def _output(self, s: np.ndarray) -> np.ndarray:
         return self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
@@ -402,7 +433,7 @@ class Tracker:
         if C is None:
             return None
         try:
-            return CompiledTracker(self._flow, self._artifact.filter, C, variances=self._variances, share=self._share)
+            return CompiledTracker(self._flow, self._artifact.filter, C, self._supervision, variances=self._variances)
         except ImportError:
             return None
 
@@ -423,34 +454,4 @@ def _mean_square(P: np.ndarray) -> np.ndarray:
     return np.asarray(np.trace(P, axis1=-2, axis2=-1))
 
 
-def supervision(flow: Flow, dt: float) -> tuple[int, float, float]:
-    """How innovations are watched.
-
-    Parameters
-    ----------
-    flow : Flow
-        The motion over a sample.
-    dt : float
-        Seconds from sample to sample.
-
-    Returns
-    -------
-    window : int
-        Samples over which they are averaged, and within which T_inv may say again where to begin.
-    share : float
-        Of the newest innovation in the mean square.
-    limit : float
-        Of the mean square, beyond which the tracker is lost.
-    """
-    window = max(1, round(flow.window / dt))
-    share = -math.expm1(-1 / window)
-    return window, share, _largest_mean_square(len(flow.least_measurement_noise) * (2 - share) / share)
-
-
-def _largest_mean_square(freedom: float) -> float:
-    """Of as many standard normal numbers, beyond chance: by Wilson and Hilferty's cube root of chi-square."""
-    spread = 2 / (9 * freedom)
-    return float((1 - spread + _BEYOND_CHANCE * math.sqrt(spread)) ** 3)
-
-
-__all__ = ["Tracker", "supervision"]
+__all__ = ["Tracker"]

@@ -5,8 +5,8 @@ short as theirs are else mostly overhead. A step takes some rows at a time, and 
 or their sigma points, which are vectors to the processor. A single sample is the same with one row.
 
 Kernels take a table of states, a row for each: its bounds, the gain of the flow's network, the variance that is added,
-offset, scale and bend. That of outputs has their mean, the variance of the noise, the share of the newest innovation in
-the mean square, and C.
+offset, scale and bend. That of outputs has their mean, the variance of the noise, what innovations are watched by, as
+:class:`observers.supervision.Supervision` has it, and C.
 """
 
 import functools
@@ -19,6 +19,7 @@ import numpy as np
 from observers.compiled import UNROLLED, active_kernel, network_kernels
 from observers.polynomial import count, table
 from observers.sparse import single_kernel
+from observers.supervision import DOUBT
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -26,7 +27,7 @@ _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the 
 _WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
 _WIDE = 16  # neurons of a layer: beyond, a single row's loops are over them, and not over its few points
 _LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
-_MEAN, _VARIANCE, _SHARE, _C = range(4)  # columns of the table of outputs
+_MEAN, _VARIANCE, _SHARE, _TREND_SHARE, _TREND_GAIN, _TREND_LIMIT, _C = range(7)  # columns of the table of outputs
 
 
 def _compiled(function: _F) -> _F:
@@ -129,7 +130,8 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
                     for j in range(nx):
                         row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
-                    row[nx + nx * nx] = 1.0
+                    row[nx + nx * nx] = row[nx + nx * nx + 1] = 1.0
+                    row[nx + nx * nx + 2 :] = 0.0
 
     return one, step_lanes, take
 
@@ -322,6 +324,8 @@ def _step(
         squared: np.ndarray,
         seen: np.ndarray,
         there: np.ndarray,
+        trend: np.ndarray,
+        raised: np.ndarray,
     ) -> None:
         """Take in an output, where it is a number."""
         for r in range(lanes):
@@ -339,7 +343,10 @@ def _step(
                 apart[r] -= there[r] * output[_C + i] * mean[i, r]
                 pivot[r] += output[_C + i] * across[i, r]
         for r in range(lanes):
-            squared[r] += apart[r] * apart[r] / pivot[r]
+            white = apart[r] / math.sqrt(pivot[r])
+            trend[r] += there[r] * output[_TREND_SHARE] * (white - trend[r])
+            raised[r] += there[r] * trend[r] * trend[r]
+            squared[r] += white * white
             seen[r] += there[r]
             there[r] /= pivot[r]
         for i in range(nx):
@@ -365,11 +372,11 @@ def _step(
         expected: np.ndarray,
     ) -> None:
         n, cut = len(state), nx * nx
-        of_rows = np.empty((cut + 3 * nx + 7, lanes))
+        of_rows = np.empty((cut + 3 * nx + 8 + ny, lanes))
         P, x, mean = of_rows[:cut].reshape(nx, nx, lanes), of_rows[cut : cut + nx], of_rows[cut + nx : cut + 2 * nx]
         across, more = of_rows[cut + 2 * nx : cut + 3 * nx], of_rows[cut + 3 * nx :]
         distance, sample, apart, pivot = more[0], more[1], more[2], more[3]
-        squared, seen, there = more[4], more[5], more[6]
+        squared, seen, there, raised, trends = more[4], more[5], more[6], more[7], more[8:]
         flat = np.empty((signals + nx) * points)
         of_points = flat.reshape(signals + nx, points)
         at, moved = of_points[:signals], of_points[signals:]
@@ -399,11 +406,12 @@ def _step(
                     for i in range(nx):
                         expected[first + r, k] += outputs[k, _C + i] * mean[i, r]
             for r in range(lanes):
-                squared[r] = seen[r] = 0.0
+                squared[r] = seen[r] = raised[r] = 0.0
             for k in range(ny):
                 for r in range(lanes):
-                    sample[r] = y[min(first + r, n - 1), k]
-                correct(outputs[k], sample, mean, P, across, apart, pivot, squared, seen, there)
+                    now = min(first + r, n - 1)
+                    sample[r], trends[k, r] = y[now, k], state[now, nx + cut + 2 + k]
+                correct(outputs[k], sample, mean, P, across, apart, pivot, squared, seen, there, trends[k], raised)
             for r in range(size):
                 row, total = state[first + r], 0.0
                 for i in range(nx):
@@ -418,7 +426,16 @@ def _step(
                         for j in range(i + 1):
                             row[nx + nx * i + j] = row[nx + nx * j + i] = P[i, j, r]
                     if seen[r] > 0:
-                        row[nx + cut] += outputs[0, _SHARE] * seen[r] / ny * (squared[r] / seen[r] - row[nx + cut])
+                        share, trend = outputs[0, _SHARE] * seen[r] / ny, outputs[0, _TREND_GAIN] * raised[r] / seen[r]
+                        row[nx + cut] += share * (squared[r] / seen[r] - row[nx + cut])
+                        row[nx + cut + 1] += share * (trend - row[nx + cut + 1])
+                        for k in range(ny):
+                            row[nx + cut + 2 + k] = trends[k, r]
+                        if row[nx + cut + 1] > outputs[0, _TREND_LIMIT]:
+                            for i in range(nx, nx + cut):
+                                row[i] *= DOUBT
+                            row[nx + cut + 1] = 1.0
+                            row[nx + cut + 2 :] = 0.0
                 elif rows[first + r]:
                     row[nx + cut] = np.inf
                 for i in range(nx):

@@ -126,7 +126,8 @@ def corrected(
         Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
     """
     expected, S, across = transformed(x, P, function=output, points=points)
-    return conditioned(x, P, y - expected, S + R, across)
+    x, P, white = conditioned(x, P, y - expected, S + R, across)
+    return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
 
 
 def transformed(
@@ -169,20 +170,21 @@ def conditioned(
 
     Returns
     -------
-    x, P, nis
+    x, P : ndarray
         As :func:`corrected` has them.
+    white : ndarray, shape (n, ny)
+        Innovations less what those of the outputs before say of them, in units of their standard deviation: where all
+        is as assumed, they are independent and of variance 1. 0 where samples are missing.
     """
-    missing, measured = np.isnan(innovation), innovation.shape[1]
+    missing = np.isnan(innovation)
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
         across = np.where(missing[:, None, :], 0.0, across)
-        S = np.where(missing[:, None, :] | missing[..., None], np.eye(measured), S)  # apart from those measured
-        measured = np.maximum(measured - missing.sum(-1), 1)
+        S = np.where(missing[:, None, :] | missing[..., None], np.eye(S.shape[-1]), S)  # apart from those measured
     told = np.concatenate([across.mT, innovation[..., None]], axis=-1)
-    solved = told / S if S.shape[-1] == 1 else np.linalg.solve(S, told)
-    nis = (innovation * solved[..., -1]).sum(-1) / measured
-    change = solved[..., :-1].mT @ told  # K S K^T, and K times the innovation
-    return x + change[..., -1], P - change[..., :-1], nis
+    white = told / np.sqrt(S) if S.shape[-1] == 1 else np.linalg.solve(factor(S), told)
+    change = white[..., :-1].mT @ white  # K S K^T, and K times the innovation
+    return x + change[..., -1], P - change[..., :-1], white[..., -1]
 
 
 def factor(P: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from observers import MLP, Factors, Flow
 from observers.polynomial import count
 
 JUMPS = (600, 605)  # samples that no motion explains
+OFF = (1200, 1400)  # samples that swing, so that innovations agree with one another
 # Options of :func:`tracking` that exports have to get right.
 KINDS = (
     {},
@@ -64,7 +65,7 @@ def tracking(outputs=1, inputs=True, surer=0.0, bend=None, **options):
 
 
 def signals(artifact, steps, batch=()):
-    """Outputs along the flow with noise, which jump for a while, and inputs."""
+    """Outputs along the flow with noise, which jump once and swing later, and inputs."""
     rng, flow = np.random.default_rng(1), artifact.flow
     u = np.sin(np.cumsum(0.3 * rng.normal(size=(steps, *batch, artifact.nu)), axis=0))
     u[: steps // 10] = 0.0
@@ -74,6 +75,8 @@ def signals(artifact, steps, batch=()):
         y.append(x @ artifact.C.T + 0.1 * rng.normal(size=(*batch, artifact.ny)))
     y = np.array(y)
     y[slice(*JUMPS)] += 6.0
+    off = y[slice(*OFF)]
+    off += 0.8 * np.sin(np.arange(len(off)) / 3).reshape(-1, *(1 for _ in off.shape[1:]))
     return y, u
 
 

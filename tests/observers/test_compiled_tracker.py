@@ -12,8 +12,9 @@ from random_tracking import JUMPS, a_flow, signals, tracking
 import observers
 from observers import Expression, KKLObserver, LinearFilter, tracker_kernels
 from observers.compiled_tracker import CompiledTracker
+from observers.supervision import DOUBT, Supervision
 from observers.thresholds import MANY_ROWS, SOON
-from observers.unscented import corrected, predicted
+from observers.unscented import conditioned, predicted
 
 pytest.importorskip("numba")
 
@@ -22,7 +23,7 @@ MISSING, RESTART, LEVELS = 7, 60, 1150  # now and then, and once
 
 
 def along(observer, y, u):
-    """Estimates, covariances and mean squares of innovations, with all that may happen on the way."""
+    """Estimates, covariances and how innovations are watched, with all that may happen on the way."""
     found = [], [], []
     batch, (steps, *_) = y.shape[1:-1], y.shape
     rng = np.random.default_rng(2)
@@ -44,18 +45,18 @@ def along(observer, y, u):
             observer.advance(sample, u[k - 1])
         found[0].append(observer.decode())
         found[1].append(observer.covariance)
-        found[2].append(observer._tracker._mean_square.copy())
+        found[2].append(observer._tracker._state[:, observer._tracker._end :].copy())
     return [np.array(each) for each in found]
 
 
 def assert_alike(found, expected, flow, within=1e-4):
     """Estimates in units of their standard deviations, and covariances in units of themselves."""
-    (x, P, mean_square), (x_expected, P_expected, mean_square_expected) = found, expected
+    (x, P, watched), (x_expected, P_expected, watched_expected) = found, expected
     size = np.sqrt(P_expected.diagonal(0, -2, -1))
     assert np.isfinite(x_expected).all()
     assert np.abs((x - x_expected) / size).max() < within
     assert np.abs((P - P_expected) / (size[..., :, None] * size[..., None, :])).max() < within
-    np.testing.assert_allclose(mean_square, mean_square_expected, rtol=within, atol=within)
+    np.testing.assert_allclose(watched, watched_expected, rtol=within, atol=within)
 
 
 def numpy_alone(monkeypatch):
@@ -179,10 +180,15 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
     low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
     q, r = flow.variances(0.3, 0.1)
     linear = LinearFilter(np.array([[-1.0, 2.0], [-2.0, -1.0]]), rng.normal(size=(2, ny)), dt=0.1, nu=nu)
-    machine = CompiledTracker(flow, linear, C, variances=(q, r), share=0.1)
+    watch = Supervision(window=10, share=0.1, limit=2.0, trend_share=0.4, trend_limit=1.2)
+    machine = CompiledTracker(flow, linear, C, watch, variances=(q, r))
     for n in (1, 129):
         x, root, u = rng.normal(size=(n, nx)), rng.normal(size=(n, nx, nx)), rng.normal(size=(n, nu))
-        P, y, before = root @ root.mT / 9 + 1e-6 * np.eye(nx), rng.normal(size=(n, ny)), rng.uniform(0.5, 2.0, n)
+        P, y, before = (
+            root @ root.mT / 9 + 1e-6 * np.eye(nx),
+            rng.normal(size=(n, ny)),
+            rng.uniform(0.5, 2.0, (n, 2 + ny)),
+        )
         y[::3, 0], y[::4] = np.nan, np.nan
         none = np.arange(n) % 10 == 5  # is a covariance there
         P[none] *= -1.0
@@ -192,9 +198,10 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
             return flow.scaled(np.clip(s, low, high).reshape(-1, nx), v).reshape(s.shape)  # noqa: B023
 
         ahead = predicted(x, P, move=move, Q=np.diag(q))
-        expected = corrected(*ahead, y, output=lambda s: (flow.x_offset + flow.x_scale * s) @ C.T, R=np.diag(r))
+        scaled = C * flow.x_scale
+        across, seen = ahead[1] @ scaled.T, ahead[0] @ scaled.T + C @ flow.x_offset
+        x_next, P_next, white = conditioned(*ahead, y - seen, scaled @ across + np.diag(r), across)
         state = np.column_stack([x, P.reshape(n, -1), before])
-        seen = ahead[0] @ (C * flow.x_scale).T + C @ flow.x_offset
         if n == 1:
             z, last = rng.normal(size=linear.size), rng.normal(size=ny)
             x_hat, filled, z_next = machine.single(state, z, last, u[0], y[0])
@@ -203,11 +210,26 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
             np.testing.assert_allclose(z_next, linear.advance(z, last, u[0], filled), rtol=1e-12)
         else:
             np.testing.assert_allclose(machine.advance(state, u, y, None)[1], seen, rtol=1e-5, atol=1e-5)
-        share = 0.1 * (1 - np.isnan(y).mean(-1))
-        wanted = np.clip(expected[0], low, high), expected[1], before + share * (expected[2] - before)
-        parts = state[:, :nx], state[:, nx:-1].reshape(P.shape), state[:, -1]
-        for one, other, start in zip(parts, wanted, (x, P, np.inf), strict=True):
-            other[none] = start[none] if np.ndim(start) else start
+        there = ~np.isnan(y)
+        share = 0.1 * there.mean(-1)
+        trend = np.where(there, before[:, 2:] + 0.4 * (white - before[:, 2:]), before[:, 2:])
+        raised = 4.0 * (trend**2 * there).sum(-1) / np.maximum(there.sum(-1), 1)
+        trend_square = before[:, 1] + share * (raised - before[:, 1])
+        doubted = (trend_square > 1.2) & there.any(-1)
+        assert n == 1 or 10 < doubted.sum() < n - 10
+        wanted = [
+            np.clip(x_next, low, high),
+            P_next * np.where(doubted, DOUBT, 1.0)[:, None, None],
+            before[:, 0] + share * ((white**2).sum(-1) / np.maximum(there.sum(-1), 1) - before[:, 0]),
+            np.where(doubted, 1.0, trend_square),
+            np.where(doubted[:, None], 0.0, trend),
+        ]
+        end = nx + nx**2
+        parts = state[:, :nx], state[:, nx:end].reshape(P.shape), state[:, end], state[:, end + 1], state[:, end + 2 :]
+        for one, other, start in zip(
+            parts, wanted, (x, P, np.full(n, np.inf), *before.T[1:2], before[:, 2:]), strict=True
+        ):
+            other[none] = start[none]
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 
 

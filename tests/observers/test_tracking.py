@@ -105,7 +105,7 @@ def test_a_lost_estimate_is_found_again():
         moved, away = x[k] + away, Phi @ away
         found = observer.step(y[k] + (moved - x[k])[:, :1])
         widest = max(widest, observer.std.max())
-    np.testing.assert_allclose(widest, STD, rtol=0.02)  # T_inv said it
+    assert widest >= 0.98 * STD  # T_inv said it; the jump has misled z, so that more of it is doubted than not
     assert np.abs(found - moved).max() < 0.3
 
 
@@ -468,7 +468,8 @@ def test_what_is_missing_corrects_nothing():
     x, P, H, R = rng.normal(size=(4, 3)), np.tile(np.eye(3), (4, 1, 1)), rng.normal(size=(2, 3)), 1e-14 * np.eye(2)
 
     def found(y, H, R):
-        return unscented.conditioned(x, P, y - x @ H.T, H @ P @ H.T + R, P @ H.T)
+        mean, covariance, white = unscented.conditioned(x, P, y - x @ H.T, H @ P @ H.T + R, P @ H.T)
+        return mean, covariance, (white**2).sum(-1)
 
     y = rng.normal(size=(4, 2))
     y[:, 0] = np.nan

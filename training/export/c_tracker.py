@@ -14,7 +14,7 @@ from observers.flow import Flow
 from observers.network import MLP
 from observers.polynomial import table
 from observers.spread import LARGEST_LOG, Spread
-from observers.tracker import supervision
+from observers.supervision import DOUBT, Supervision
 from training.export import c_templates, c_tracker_templates
 from training.export.c_map import SQUARE, map_functions, measurement_levels, process_level
 from training.export.c_text import array, block, network_arrays, network_words, number
@@ -73,7 +73,7 @@ def tracker_constants(exported: Exported, flow: Flow) -> list[str]:
 
 def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> str:
     """``NAME_estimate``, and all functions that come before it."""
-    window, share, limit = supervision(flow, exported.artifact.filter.dt)
+    watch = Supervision.of(flow, exported.artifact.filter.dt)
     nx, free = flow.nx, "free" in exported.maps
     parts = [map_functions(exported, label, inverse) for label, inverse in exported.maps.items()]
     parts.append(c_tracker_templates.INTERPOLATED)
@@ -92,9 +92,12 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
             far=number(math.sqrt(nx)),
             bent=c_tracker_templates.BENT.format(**words) if flow.bend is not None else "",
             scaled_inputs=c_tracker_templates.SCALED_INPUTS.format(**words) if flow.nu else "",
-            share=number(share),
-            limit=number(limit),
-            window=window,
+            window=watch.window,
+            doubt=number(DOUBT),
+            **{
+                name: number(getattr(watch, name))
+                for name in ("share", "limit", "trend_share", "trend_gain", "trend_limit")
+            },
         )
     )
     parts.append(c_tracker_templates.ESTIMATE_TRACKED.format(**words, head=c_templates.ESTIMATE.format(**words)))

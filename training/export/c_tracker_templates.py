@@ -3,6 +3,7 @@
 FIELDS = """\
     double x[{nx}], P[{nx}][{nx}]; /* the estimate and its covariance, in scaled states */
     double mean_square; /* of the innovations; beyond its limit the estimate is lost */
+    double trend[{ny}], trend_square; /* their running mean, and its mean square; beyond that's limit P is doubted */
 """
 
 INTERPOLATED = """
@@ -127,10 +128,18 @@ static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P
     }}
 {bent}}}
 
+/* Innovations agree with nothing as yet. */
+static void unwatched({NAME}_observer *observer)
+{{
+    observer->trend_square = 1.0;
+    for (size_t k = 0; k < {ny}; k++)
+        observer->trend[k] = 0.0;
+}}
+
 /* Predict, and take in a sample, one output after another. What is missing is replaced by what was predicted. */
 static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{ny}])
 {{
-    double x[{nx}], P[{nx}][{nx}], across[{nx}], squared = 0.0, total = 0.0;
+    double x[{nx}], P[{nx}][{nx}], trend[{ny}], across[{nx}], squared = 0.0, raised = 0.0, total = 0.0;
     size_t seen = 0;
     predict(observer{pass_u}, x, P);
     for (size_t k = 0; k < {ny}; k++) {{
@@ -144,6 +153,7 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
     }}
     for (size_t k = 0; k < {ny}; k++) {{
         double apart = y[k] - output_mean[k], pivot = R[k];
+        trend[k] = observer->trend[k];
         if (isnan(y[k]))
             continue;
         for (size_t i = 0; i < {nx}; i++) {{
@@ -154,6 +164,8 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
         }}
         for (size_t i = 0; i < {nx}; i++)
             pivot += C[k][i] * across[i];
+        trend[k] += {trend_share} * (apart / sqrt(pivot) - trend[k]);
+        raised += SQUARE(trend[k]);
         squared += apart * apart / pivot;
         seen++;
         for (size_t i = 0; i < {nx}; i++) {{
@@ -176,8 +188,19 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
         for (size_t j = 0; j < {nx}; j++)
             observer->P[i][j] = P[i][j];
     }}
-    if (seen)
-        observer->mean_square += {share} * (double)seen / {ny} * (squared / seen - observer->mean_square);
+    if (seen) {{
+        double share = {share} * (double)seen / {ny};
+        observer->mean_square += share * (squared / seen - observer->mean_square);
+        observer->trend_square += share * ({trend_gain} * raised / seen - observer->trend_square);
+        for (size_t k = 0; k < {ny}; k++)
+            observer->trend[k] = trend[k];
+    }}
+    if (observer->trend_square > {trend_limit}) {{ /* innovations agree with one another */
+        for (size_t i = 0; i < {nx}; i++)
+            for (size_t j = 0; j < {nx}; j++)
+                observer->P[i][j] *= {doubt};
+        unwatched(observer);
+    }}
 }}
 
 /* Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost. */
@@ -202,8 +225,10 @@ static void supervise({NAME}_observer *observer)
         for (size_t j = 0; j < {nx}; j++)
             observer->P[i][j] = P[i][j];
     }}
-    if (lost)
+    if (lost) {{
         observer->mean_square = 1.0;
+        unwatched(observer);
+    }}
 }}
 """
 

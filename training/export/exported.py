@@ -15,7 +15,7 @@ from observers.errors import ArtifactError
 from observers.inverse import InverseMap
 from observers.names import resolve
 from observers.storage import checksum
-from observers.tracker import supervision
+from observers.supervision import Supervision
 
 # Of the network, of samples and of estimates. The filter is of doubles in both: its modes are all but dependent, and
 # what distinguishes them would be lost in the last digits of floats.
@@ -161,7 +161,8 @@ class Exported:
         """Samples since the first after which the age no longer matters; 0 if it never does."""
         ends = [inverse.age_max for inverse in self.maps.values() if "age" in inverse.features]
         if self.artifact.flow is not None:
-            ends.append(supervision(self.artifact.flow, self.artifact.filter.dt)[0] * self.artifact.filter.dt)
+            dt = self.artifact.filter.dt
+            ends.append(Supervision.of(self.artifact.flow, dt).window * dt)
         return min(math.ceil(max(ends, default=0.0) / self.artifact.filter.dt), _MOST_SAMPLES)
 
     @property

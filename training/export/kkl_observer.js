@@ -196,6 +196,7 @@ class Tracker {
   /** Begin with what a map says of z, at an age in samples. */
   begin(map, z, age) {
     this.meanSquare = Infinity; // lost as yet
+    this.trend = new Array(this.ny).fill(0);
     this.supervise(map, z, age);
   }
 
@@ -253,13 +254,16 @@ class Tracker {
     let [x, P] = this.#predicted(u);
     const expected = this.C.map((row, k) => row.reduce((sum, value, i) => sum + value * x[i], this.mean[k]));
     const whole = y.map((value, k) => (!Number.isNaN(value) ? value : Number.isFinite(expected[k]) ? expected[k] : before[k]));
-    let squared = 0, seen = 0;
+    let squared = 0, raised = 0, seen = 0;
+    const trend = [...this.trend];
     for (let k = 0; k < this.ny; k++) {
       if (Number.isNaN(y[k])) continue;
       const row = this.C[k];
       const across = P.map((entries) => entries.reduce((sum, value, j) => sum + value * row[j], 0));
       const apart = y[k] - row.reduce((sum, value, i) => sum + value * x[i], this.mean[k]);
       const pivot = row.reduce((sum, value, i) => sum + value * across[i], this.R[k]);
+      trend[k] += this.trend_share * (apart / Math.sqrt(pivot) - trend[k]);
+      raised += trend[k] ** 2;
       squared += apart ** 2 / pivot;
       seen++;
       x = x.map((value, i) => value + (across[i] / pivot) * apart);
@@ -270,7 +274,15 @@ class Tracker {
       return whole;
     }
     [this.x, this.P] = [this.#within(x), P];
-    if (seen) this.meanSquare += ((this.share * seen) / this.ny) * (squared / seen - this.meanSquare);
+    if (!seen) return whole;
+    const share = (this.share * seen) / this.ny;
+    this.trend = trend;
+    this.meanSquare += share * (squared / seen - this.meanSquare);
+    this.trendSquare += share * ((this.trend_gain * raised) / seen - this.trendSquare);
+    if (this.trendSquare > this.trend_limit) { // innovations agree with one another
+      this.P = P.map((entries) => entries.map((value) => this.doubt * value));
+      [this.trendSquare, this.trend] = [1, trend.map(() => 0)];
+    }
     return whole;
   }
 
@@ -284,7 +296,7 @@ class Tracker {
     if (!lost && !(trace(P) < trace(this.P))) return;
     this.x = this.#within(map.mean(z, age * this.dt).map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]));
     this.P = P;
-    if (lost) this.meanSquare = 1;
+    if (lost) [this.meanSquare, this.trendSquare, this.trend] = [1, 1, this.trend.map(() => 0)];
   }
 
   /** The covariance of the estimate's error; the map is that of free motion until an input acts. */

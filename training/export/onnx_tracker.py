@@ -1,7 +1,8 @@
 """A tracking observer's own part as nodes of an ONNX graph: :mod:`observers.tracker` for outputs C x.
 
-A row of the tracker's state holds the estimate and its covariance, both of scaled states, the mean square of the
-innovations, and the last sample, in which what was missing is replaced by what was predicted. All are doubles.
+A row of the tracker's state holds the estimate and its covariance, both of scaled states, the mean squares of the
+innovations and of their trend, that trend, and the last sample, in which what was missing is replaced by what was
+predicted. All are doubles.
 """
 
 import itertools
@@ -12,16 +13,16 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.polynomial import count, table
-from observers.tracker import supervision
+from observers.supervision import DOUBT, Supervision
 from training.export.onnx_map import Maps
 from training.export.onnx_nodes import Graph
 
-Parts = tuple[str, str, str]  # estimate (n, nx), covariance (n, nx, nx), mean square (n, 1)
+Parts = tuple[str, str, str, str, str]  # estimate, covariance (n, nx, nx), mean squares (n, 1), and trend (n, ny)
 
 
 def state_width(artifact: Artifact) -> int:
     """Numbers in a row of the state."""
-    return artifact.nx + artifact.nx**2 + 1 + artifact.ny
+    return artifact.nx + artifact.nx**2 + 2 + 2 * artifact.ny
 
 
 class TrackerNodes:
@@ -45,14 +46,14 @@ class TrackerNodes:
         self._flow, self._C = artifact.require_flow(), artifact.C
         flow = self._flow
         self._low, self._high = flow.scaled_bounds
-        self._window, self._share, self._limit = supervision(flow, artifact.filter.dt)
+        self._watch = Supervision.of(flow, artifact.filter.dt)
         nx, ny = artifact.nx, artifact.ny
-        ends = np.cumsum([0, nx, nx * nx, 1, ny])
-        x, P, mean_square, y = (
+        ends = np.cumsum([0, nx, nx * nx, 1, 1, ny, ny])
+        x, P, mean_square, trend_square, trend, y = (
             graph("Gather", given["tracker"], graph.constant(np.arange(a, b), np.int64), axis=1)
             for a, b in itertools.pairwise(ends)
         )
-        self._before: Parts = (x, self._matrix(P), mean_square)
+        self._before: Parts = (x, self._matrix(P), mean_square, trend_square, trend)
         self.y = y  # the last sample, (n, ny)
 
     def taken(self) -> tuple[Parts, str]:
@@ -67,7 +68,7 @@ class TrackerNodes:
             expected = graph("Add", graph("MatMul", x, graph.constant(C[k][:, None])), graph.constant([means[k]]))
             stand_in = graph("Where", self._finite(expected), expected, before[k])
             whole.append(graph("Where", missing[k], stand_in, y[k]))
-        zero, squared, seen = graph.constant([0.0]), [], []
+        zero, white, seen = graph.constant([0.0]), [], []
         for k, variance in enumerate(self._measurement_variances()):
             row = graph.constant(C[k][:, None])
             across = graph("MatMul", P, row)  # (n, nx, 1)
@@ -79,17 +80,17 @@ class TrackerNodes:
             x = graph("Add", x, graph("Mul", gain, apart))
             less = graph("MatMul", across, graph("Unsqueeze", gain, graph.constant([1], np.int64)))
             P = graph("Sub", P, less)
-            squared.append(graph("Mul", graph("Mul", apart, apart), of_sample))
+            white.append(graph("Mul", apart, graph("Sqrt", of_sample)))
             seen.append(graph.cast(graph("Not", missing[k]), np.float64))
-        return self._sound(x, P, root, self._sum(squared), self._sum(seen)), graph.joined(*whole)
+        return self._sound(x, P, root, graph.joined(*white), graph.joined(*seen)), graph.joined(*whole)
 
     def supervised(self, tracked: Parts, maps: Maps, begins: str) -> Parts:
         """Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost."""
         graph, flow, age = self._graph, self._flow, self._given["age"]
-        x, P, mean_square = tracked
+        x, P, mean_square, trend_square, trend = tracked
         mean_square = graph("Where", begins, graph.constant([math.inf]), mean_square)
-        lost = graph("Not", graph("LessOrEqual", mean_square, graph.constant([self._limit])))
-        window = graph.constant([float(self._window)])
+        lost = graph("Not", graph("LessOrEqual", mean_square, graph.constant([self._watch.limit])))
+        window = graph.constant([float(self._watch.window)])
         theirs = graph.joined(*maps.covariance(graph("Min", age, window), flow.x_scale))
         ours, nx = self._flat(P, flow.nx**2), flow.nx
         diagonal = graph.constant(np.eye(nx).reshape(-1, 1))
@@ -101,12 +102,14 @@ class TrackerNodes:
             graph("Where", takes, said, x),
             self._matrix(graph("Where", takes, theirs, ours)),
             graph("Where", lost, graph.constant([1.0]), mean_square),
+            graph("Where", lost, graph.constant([1.0]), trend_square),
+            graph("Where", lost, graph.constant([0.0]), trend),
         )
 
     def packed(self, tracked: Parts, y: str) -> str:
         """The state as the graph gives it back."""
-        x, P, mean_square = tracked
-        return self._graph.joined(x, self._flat(P, self._flow.nx**2), mean_square, y)
+        x, P, *watched = tracked
+        return self._graph.joined(x, self._flat(P, self._flow.nx**2), *watched, y)
 
     def estimate(self, tracked: Parts) -> str:
         """The estimate in units of the states, (n, nx)."""
@@ -116,7 +119,7 @@ class TrackerNodes:
     def _predicted(self) -> tuple[str, str, list[str]]:
         """Estimate and covariance a sample later, and the entries of the factor of what it was."""
         graph, flow, nx = self._graph, self._flow, self._flow.nx
-        x, P, _ = self._before
+        x, P = self._before[:2]
         entries, states = graph.columns(self._flat(P, nx * nx), nx * nx), graph.columns(x, nx)
         L: list[list[str]] = []
         for i in range(nx):
@@ -182,27 +185,44 @@ class TrackerNodes:
         least = graph("Max", noise, graph.constant(self._flow.least_measurement_noise))  # (n, ny), whatever it was
         return graph.columns(graph("Mul", least, least), ny)
 
-    def _sound(self, x: str, P: str, root: list[str], squared: str, seen: str) -> Parts:
-        """What follows, unless it is not finite: the estimate then stays, and is lost."""
-        graph, nx = self._graph, self._flow.nx
-        x_before, P_before, mean_square = self._before
+    def _sound(self, x: str, P: str, root: list[str], white: str, seen: str) -> Parts:
+        """What follows, unless it is not finite: the estimate then stays, and is lost.
+
+        Innovations (n, ny) are in units of their standard deviations, 0 where samples are missing; where they are seen
+        is 1. They are watched as :mod:`observers.supervision` has it.
+        """
+        graph, nx, watch, one = self._graph, self._flow.nx, self._watch, self._graph.constant([1.0])
+        x_before, P_before, mean_square, trend_square, trend = self._before
         numbers = graph.joined(x, self._flat(P, nx * nx), *root)
         total = graph("ReduceSum", numbers, graph.constant([1], np.int64), keepdims=1)
         sound = self._finite(total)
-        step = graph("Sub", squared, graph("Mul", seen, mean_square))
-        step = graph("Mul", step, graph.constant([self._share / self._artifact.ny]))
-        flat = graph("Where", sound, self._flat(P, nx * nx), self._flat(P_before, nx * nx))
+        step = graph("Mul", seen, graph("Sub", white, trend))
+        trend_next = graph("Add", trend, graph("Mul", step, graph.constant([watch.trend_share])))
+        raised = graph(
+            "Mul", graph("Mul", graph("Mul", trend_next, trend_next), seen), graph.constant([watch.trend_gain])
+        )
+        mean_square = self._averaged(mean_square, graph("Mul", white, white), seen)
+        trend_square_next = self._averaged(trend_square, raised, seen)
+        agree = graph("Greater", trend_square_next, graph.constant([watch.trend_limit]))
+        doubted = graph("Mul", self._flat(P, nx * nx), graph("Where", agree, graph.constant([DOUBT]), one))
         return (
             graph("Where", sound, graph.within(x, self._low, self._high), x_before),
-            self._matrix(flat),
-            graph("Where", sound, graph("Add", mean_square, step), graph.constant([math.inf])),
+            self._matrix(graph("Where", sound, doubted, self._flat(P_before, nx * nx))),
+            graph("Where", sound, mean_square, graph.constant([math.inf])),
+            graph("Where", sound, graph("Where", agree, one, trend_square_next), trend_square),
+            graph("Where", sound, graph("Where", agree, graph.constant([0.0]), trend_next), trend),
         )
+
+    def _averaged(self, mean: str, values: str, seen: str) -> str:
+        """A running mean (n, 1) of values (n, ny) after those of a sample that are seen; the others are 0."""
+        graph = self._graph
+        ones = graph.constant(np.ones((self._artifact.ny, 1)))
+        total, count = (graph("MatMul", each, ones) for each in (values, seen))
+        step = graph("Sub", total, graph("Mul", count, mean))
+        return graph("Add", mean, graph("Mul", step, graph.constant([self._watch.share / self._artifact.ny])))
 
     def _finite(self, value: str) -> str:
         return self._graph("Less", self._graph("Abs", value), self._graph.constant([math.inf]))
-
-    def _sum(self, values: list[str]) -> str:
-        return values[0] if len(values) == 1 else self._graph("Sum", *values)
 
     def _matrix(self, flat: str) -> str:
         return self._graph("Reshape", flat, self._shape(-1, self._flow.nx, self._flow.nx))

@@ -1,5 +1,6 @@
 """The step as a file of constants, which ``kkl_observer.js`` runs in browsers and in Node."""
 
+import dataclasses
 import os
 from importlib.resources import files
 from typing import Any
@@ -10,7 +11,7 @@ from observers import storage
 from observers.flow import Flow
 from observers.inverse import InverseMap
 from observers.polynomial import table
-from observers.tracker import supervision
+from observers.supervision import DOUBT, Supervision
 from training.export.exported import Exported
 
 KEY = "kkl_step"  # of the metadata
@@ -99,11 +100,11 @@ def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> di
             of_kind = {"levels": factors.levels, "ages": factors.ages, "factors": factors.factors, "doubt": doubt}
             arrays |= {f"{kind}.{name}": values for name, values in of_kind.items()}
     tensors |= {f"flow.{name}": np.asarray(values, dtype=float) for name, values in arrays.items() if values.size}
-    window, share, limit = supervision(flow, dt)
+    watch = Supervision.of(flow, dt)
     return {
         "activation": flow.mlp.activation,
         "least_process_noise": flow.least_process_noise,
-        "window": window,
-        "share": share,
-        "limit": limit,
+        **dataclasses.asdict(watch),
+        "trend_gain": watch.trend_gain,
+        "doubt": DOUBT,
     }

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import WARNINGS, compiled, estimates, needs_cc
-from exported_steps import apart, doubles, exported_of, in_doubles, stepped
+from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_doubted
 from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver
@@ -40,8 +40,9 @@ def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     y, u = of_floats(exported.artifact, 2000)
     y[700:720] = y[300::7, 0] = np.nan
     assert apart(exported, estimates(compiled(exported, tmp_path), y, u), y, u) < tolerance
-    lost = [observer._tracker._mean_square[0] == 1.0 for observer in stepped(exported, y, u)]
+    lost, doubted = lost_and_doubted(exported, y, u)
     assert sum(lost[600:700]) > 1
+    assert doubted.any()
 
 
 @needs_cc

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from error_bars import with_error_bars
-from exported_steps import apart, exported_of, motion, noise, stepped
+from exported_steps import apart, exported_of, lost_and_doubted, motion, noise, stepped
 from random_tracking import KINDS, signals, tracking
 
 from observers import Expression, KKLObserver, Limits, load
@@ -126,12 +126,13 @@ def test_error_bars(process, options, make_artifact, tmp_path):
 @pytest.mark.parametrize("options", KINDS)
 def test_maps_that_track(options, tmp_path):
     exported = exported_of(tracking(**options), tmp_path, precision="double")  # compared with a step in doubles
-    y, u = signals(exported.artifact, 1000)
+    y, u = signals(exported.artifact, 1500)
     y[700:720] = y[300::7, 0] = np.nan
     found = replayed(exported, tmp_path, y, u)
     assert apart(exported, np.array(found["x_hat"]), y, u) < 1e-9
-    lost = [observer._tracker._mean_square[0] == 1.0 for observer in stepped(exported, y, u)]
+    lost, doubted = lost_and_doubted(exported, y, u)
     assert any(lost[600:700])
+    assert doubted.any()
 
 
 def test_error_bars_of_maps_that_track(tmp_path):

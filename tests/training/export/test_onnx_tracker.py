@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import apart, doubles, exported_of, in_doubles, stepped
+from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_doubted
 from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver
@@ -15,6 +15,7 @@ pytest.importorskip("onnxruntime", reason="needs the extra onnx")
 from onnx_steps import Runner
 
 from training.export.onnx_graph import onnx_model
+from training.export.onnx_tracker import state_width
 
 
 @pytest.mark.parametrize(("precision", "tolerance"), [("float", 1e-5), ("double", 1e-9)])
@@ -25,8 +26,9 @@ def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     y[700:720] = y[300::7, 0] = np.nan
     x_hat = Runner(exported).along(y[:, None], u[:, None])[:, 0]
     assert apart(exported, x_hat, y, u) < tolerance
-    lost = [observer._tracker._mean_square[0] == 1.0 for observer in stepped(exported, y, u)]
+    lost, doubted = lost_and_doubted(exported, y, u)
     assert sum(lost[600:700]) > 1
+    assert doubted.any()
 
 
 def test_rows_have_levels_of_their_own(tmp_path):
@@ -37,7 +39,7 @@ def test_rows_have_levels_of_their_own(tmp_path):
     runner = Runner(exported)
     step = runner.session.run
     told = {"measurement_noise": np.array([a for a, _ in levels]), "process_noise": np.array([[b] for _, b in levels])}
-    states, x_hat = {"z": np.zeros((2, artifact.filter.size)), "tracker": np.zeros((2, 2 + 4 + 1 + 2))}, []
+    states, x_hat = {"z": np.zeros((2, artifact.filter.size)), "tracker": np.zeros((2, state_width(artifact)))}, []
     for k in range(200):
         given = {"u": u[k - 1], "y_next": y[k], "age": np.full((2, 1), float(k)), **told, **states}
         states["z"], states["tracker"], found = step(["z_next", "tracker_next", "x_hat"], given)
@@ -52,7 +54,7 @@ def test_a_row_begins_anew_and_one_whose_covariance_breaks_down_is_lost(tmp_path
     artifact = tracking()
     exported = exported_of(artifact, tmp_path, precision="double")
     runner, (y, u) = Runner(exported), signals(artifact, 80, (3,))
-    states, x_hat = {"z": np.zeros((3, artifact.filter.size)), "tracker": np.zeros((3, 8))}, []
+    states, x_hat = {"z": np.zeros((3, artifact.filter.size)), "tracker": np.zeros((3, state_width(artifact)))}, []
     for k in range(80):
         if k == 50:
             states["tracker"][1, 2] = -1.0  # a variance

@@ -1,0 +1,73 @@
+"""How a tracker notices by its innovations that it is off: limits of what chance makes of them.
+
+Innovations, in units of the standard deviation that a Kalman filter expects of them, are independent and have a mean
+square of 1 where the filter is right. Where it is lost they are large. Where it is off by less than the noise, but by
+more than it believes, they are hardly larger, but agree with those before.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+from observers.flow import Flow
+
+# Limits are the normal distribution's quantile for 1e-5. Running means are more skewed than what their limits are taken
+# of, so that chance exceeds these up to five times as often, most where windows are short.
+_BEYOND_CHANCE = 4.265
+_TRENDS = 8  # running means that a window is long enough for
+DOUBT = 10.0  # what a covariance is multiplied with where innovations agree with one another
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """Of a tracker, for all levels of noise.
+
+    Parameters
+    ----------
+    window : int
+        Samples over which squares are averaged, and within which T_inv may say again where to begin.
+    share : float
+        Of the newest square in such a running mean.
+    limit : float
+        Of the mean square of innovations, beyond which the tracker is lost.
+    trend_share : float
+        Of the newest innovation in their running mean, the trend.
+    trend_limit : float
+        Of the mean square of the trend, in multiples of what it is where innovations are independent. Beyond it the
+        covariance is doubted.
+    """
+
+    window: int
+    share: float
+    limit: float
+    trend_share: float
+    trend_limit: float
+
+    @classmethod
+    def of(cls, flow: Flow, dt: float) -> Self:
+        """That of a flow on samples every ``dt`` seconds."""
+        window, ny = max(1, round(flow.window / dt)), len(flow.least_measurement_noise)
+        share, trend_share = -math.expm1(-1 / window), -math.expm1(-_TRENDS / window)
+        freedom = ny * (2 - share) / share
+        memory = (1 - trend_share) ** 2 * (1 - share)  # what is left of a trend's square a sample later
+        return cls(
+            window,
+            share,
+            _largest_mean_square(freedom),
+            trend_share,
+            _largest_mean_square(freedom * (1 - memory) / (1 + memory)),
+        )
+
+    @property
+    def trend_gain(self) -> float:
+        """What the square of a trend is multiplied with to be 1 on average where innovations are independent."""
+        return (2 - self.trend_share) / self.trend_share
+
+
+def _largest_mean_square(freedom: float) -> float:
+    """Of as many standard normal numbers, beyond chance: by Wilson and Hilferty's cube root of chi-square."""
+    spread = 2 / (9 * freedom)
+    return float((1 - spread + _BEYOND_CHANCE * math.sqrt(spread)) ** 3)
+
+
+__all__ = ["DOUBT", "Supervision"]

@@ -1,0 +1,80 @@
+"""What chance makes of innovations, and what an estimate that is off by less than the noise makes of them."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from linear_system import C
+from tracking import DT, STD, exact_motion, tracking_observer
+
+from observers import KKLObserver
+from observers.supervision import DOUBT, Supervision
+
+LEVEL = 0.2
+
+
+def supervision(window, ny=1):
+    """Of a flow of which nothing else matters here."""
+    return Supervision.of(SimpleNamespace(window=window * DT, least_measurement_noise=np.zeros(ny)), DT)
+
+
+@pytest.mark.parametrize("ny", [1, 2])
+@pytest.mark.parametrize("window", [50, 200])
+def test_limits_are_beyond_chance(window, ny):
+    """Running means along independent innovations: 1 on average, and hardly ever beyond their limits."""
+    watch, rows, steps = supervision(window, ny), 1500, 10 * window
+    rng = np.random.default_rng(0)
+    trend, mean_square, trend_square = np.zeros((rows, ny)), np.ones(rows), np.ones(rows)
+    found = []
+    for k in range(steps):
+        white = rng.standard_normal((rows, ny))
+        trend += watch.trend_share * (white - trend)
+        mean_square += watch.share * ((white**2).mean(-1) - mean_square)
+        trend_square += watch.share * (watch.trend_gain * (trend**2).mean(-1) - trend_square)
+        if k >= 5 * window:
+            found.append((mean_square.copy(), trend_square.copy()))
+    for values, limit in zip(np.moveaxis(found, 1, 0), (watch.limit, watch.trend_limit), strict=True):
+        assert values.mean() == pytest.approx(1.0, abs=0.01)
+        assert (values > limit).mean() < 5e-4
+        assert (values > 1 + 0.5 * (limit - 1)).mean() > 1e-3  # and not so far beyond that nothing would be noticed
+
+
+def test_a_window_may_be_a_single_sample():
+    watch = supervision(0.1)
+    assert watch.window == 1
+    assert np.isfinite([watch.limit, watch.trend_limit, watch.trend_gain]).all()
+    assert 1 < watch.trend_limit < 100
+
+
+def followed(off, steps):
+    """Errors and standard deviations, (steps, 2), of an estimate that is off and holds that for impossible."""
+    (Phi, _), rng = exact_motion(), np.random.default_rng(3)
+    artifact = tracking_observer()
+    flow = replace(artifact.flow, window=10.0, process_noise=1e-3 * artifact.flow.process_noise)
+    observer = KKLObserver(replace(artifact, flow=flow), LEVEL, process_noise=0.0)
+    x, found = np.array([0.4, -0.3]), []
+    observer.reset(C @ x, x0=x + off)
+    for _ in range(steps):
+        x = Phi @ x
+        error = observer.step(C @ x + LEVEL * rng.standard_normal(1)) - x
+        found.append((error, observer.std))
+        assert observer._tracker._mean_square[0] < observer._tracker._supervision.limit  # it is not lost
+    return map(np.array, zip(*found, strict=True))
+
+
+def test_an_estimate_that_is_off_by_less_than_the_noise_is_doubted():
+    error, std = followed(0.5 * LEVEL * np.ones(2), 3000)
+    risen = std[1:] / std[:-1]
+    assert risen.max() == pytest.approx(np.sqrt(DOUBT), rel=0.1)
+    assert 1 <= (risen[:, 0] > 2).sum() <= 4
+    assert std.max() < 0.5 * STD  # which T_inv would have said
+    assert np.abs(error[:20]).max() > 0.09
+    assert np.abs(error[-200:]).max() < 0.03
+    assert (np.abs(error) / std)[-200:].max() < 4
+
+
+def test_an_estimate_that_is_right_is_not_doubted():
+    error, std = followed(np.zeros(2), 5000)
+    assert (std[1:] < 1.1 * std[:-1]).all()
+    assert np.abs(error).max() < 0.01
