@@ -60,8 +60,8 @@ class CompiledTracker:
             raise ImportError("machine code needs Numba: pip install kkl-gym[fast]")
         bend = np.zeros(flow.nx) if flow.bend is None else flow.bend
         states = _packed(*flow.scaled_bounds, flow.gain, q, flow.x_offset, flow.x_scale, bend)
-        watched = np.tile([watch.share, watch.trend_share, watch.trend_gain, watch.trend_limit], (len(r), 1))
-        outputs = _packed(C @ flow.x_offset, r, watched, C * flow.x_scale)
+        watched = [watch.share, watch.trend_share, watch.trend_square_share, watch.trend_gain, watch.trend_limit]
+        outputs = _packed(C @ flow.x_offset, r, np.tile(watched, (len(r), 1)), C * flow.x_scale)
         scale = 1.0 / np.array(flow.u_scale, dtype=float)
         self._nx, self._ny = flow.nx, len(C)
         used = tuple(map(tuple, (flow.polynomial != 0).tolist()))

@@ -12,9 +12,11 @@ from typing import Self
 from observers.flow import Flow
 
 # Limits are the normal distribution's quantile for 1e-5. Running means are more skewed than what their limits are taken
-# of, so that chance exceeds these up to five times as often, most where windows are short.
+# of, so that chance exceeds these more often, most where windows are short: of the mean square of innovations up to five
+# times as often, and of that of their trend up to fifty times. A doubt that is wrong costs little.
 _BEYOND_CHANCE = 4.265
-_TRENDS = 8  # running means that a window is long enough for
+_TREND = 0.25  # windows over which innovations are averaged to see whether they agree
+_LONG = 4.0  # windows over which the square of that is averaged
 DOUBT = 10.0  # what a covariance is multiplied with where innovations agree with one another
 
 
@@ -25,13 +27,15 @@ class Supervision:
     Parameters
     ----------
     window : int
-        Samples over which squares are averaged, and within which T_inv may say again where to begin.
+        Samples over which squares of innovations are averaged, and within which T_inv may say again where to begin.
     share : float
-        Of the newest square in such a running mean.
+        Of the newest square in that running mean.
     limit : float
         Of the mean square of innovations, beyond which the tracker is lost.
     trend_share : float
         Of the newest innovation in their running mean, the trend.
+    trend_square_share : float
+        Of the trend's newest square in the running mean of these, which goes farther back than a window.
     trend_limit : float
         Of the mean square of the trend, in multiples of what it is where innovations are independent. Beyond it the
         covariance is doubted.
@@ -41,21 +45,22 @@ class Supervision:
     share: float
     limit: float
     trend_share: float
+    trend_square_share: float
     trend_limit: float
 
     @classmethod
     def of(cls, flow: Flow, dt: float) -> Self:
         """That of a flow on samples every ``dt`` seconds."""
         window, ny = max(1, round(flow.window / dt)), len(flow.least_measurement_noise)
-        share, trend_share = -math.expm1(-1 / window), -math.expm1(-_TRENDS / window)
-        freedom = ny * (2 - share) / share
-        memory = (1 - trend_share) ** 2 * (1 - share)  # what is left of a trend's square a sample later
+        share, trend_share, long_share = (-math.expm1(-1 / (each * window)) for each in (1.0, _TREND, _LONG))
+        memory = (1 - trend_share) ** 2 * (1 - long_share)  # of a trend's square, a sample later
         return cls(
             window,
             share,
-            _largest_mean_square(freedom),
+            _largest_mean_square(ny * (2 - share) / share),
             trend_share,
-            _largest_mean_square(freedom * (1 - memory) / (1 + memory)),
+            long_share,
+            _largest_mean_square(ny * (2 - long_share) / long_share * (1 - memory) / (1 + memory)),
         )
 
     @property

@@ -299,12 +299,12 @@ class Tracker:
         A covariance is doubted where they agree with one another.
         """
         watch, ny = self._supervision, seen.shape[1]
-        counted = watch.share / ny * seen.sum(-1)  # less of those that are known in part, which scatter more
+        counted = seen.sum(-1) / ny  # less of those that are known in part, which scatter more
         seen_mean = 1 / np.maximum(seen.sum(-1), 1)
-        mean_square = self._mean_square + counted * (seen_mean * (white**2).sum(-1) - self._mean_square)
+        mean_square = self._mean_square + watch.share * counted * (seen_mean * (white**2).sum(-1) - self._mean_square)
         trend = self._trend + watch.trend_share * np.where(seen, white - self._trend, 0.0)
         square = watch.trend_gain * seen_mean * (np.where(seen, trend, 0.0) ** 2).sum(-1)
-        trend_square = self._trend_square + counted * (square - self._trend_square)
+        trend_square = self._trend_square + watch.trend_square_share * counted * (square - self._trend_square)
         doubted = trend_square > watch.trend_limit
         if doubted.any():
             P = np.where(doubted[:, None, None], DOUBT * P, P)

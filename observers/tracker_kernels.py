@@ -27,7 +27,7 @@ _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the 
 _WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
 _WIDE = 16  # neurons of a layer: beyond, a single row's loops are over them, and not over its few points
 _LANES = 32  # rows of a batch that go through together: what there is of them stays in the first cache
-_MEAN, _VARIANCE, _SHARE, _TREND_SHARE, _TREND_GAIN, _TREND_LIMIT, _C = range(7)  # columns of the table of outputs
+_MEAN, _VARIANCE, _SHARE, _TREND_SHARE, _TREND_SQUARE_SHARE, _TREND_GAIN, _TREND_LIMIT, _C = range(8)  # of outputs
 
 
 def _compiled(function: _F) -> _F:
@@ -426,9 +426,9 @@ def _step(
                         for j in range(i + 1):
                             row[nx + nx * i + j] = row[nx + nx * j + i] = P[i, j, r]
                     if seen[r] > 0:
-                        share, trend = outputs[0, _SHARE] * seen[r] / ny, outputs[0, _TREND_GAIN] * raised[r] / seen[r]
-                        row[nx + cut] += share * (squared[r] / seen[r] - row[nx + cut])
-                        row[nx + cut + 1] += share * (trend - row[nx + cut + 1])
+                        counted, trend = seen[r] / ny, outputs[0, _TREND_GAIN] * raised[r] / seen[r]
+                        row[nx + cut] += outputs[0, _SHARE] * counted * (squared[r] / seen[r] - row[nx + cut])
+                        row[nx + cut + 1] += outputs[0, _TREND_SQUARE_SHARE] * counted * (trend - row[nx + cut + 1])
                         for k in range(ny):
                             row[nx + cut + 2 + k] = trends[k, r]
                         if row[nx + cut + 1] > outputs[0, _TREND_LIMIT]:

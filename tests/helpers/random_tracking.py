@@ -76,7 +76,7 @@ def signals(artifact, steps, batch=()):
     y = np.array(y)
     y[slice(*JUMPS)] += 6.0
     off = y[slice(*OFF)]
-    off += 0.8 * np.sin(np.arange(len(off)) / 3).reshape(-1, *(1 for _ in off.shape[1:]))
+    off += np.sin(np.arange(len(off)) / 6).reshape(-1, *(1 for _ in off.shape[1:]))
     return y, u
 
 

@@ -180,7 +180,7 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
     low, high = ((bound - flow.x_offset) / flow.x_scale for bound in (flow.low, flow.high))
     q, r = flow.variances(0.3, 0.1)
     linear = LinearFilter(np.array([[-1.0, 2.0], [-2.0, -1.0]]), rng.normal(size=(2, ny)), dt=0.1, nu=nu)
-    watch = Supervision(window=10, share=0.1, limit=2.0, trend_share=0.4, trend_limit=1.2)
+    watch = Supervision(10, share=0.1, limit=2.0, trend_share=0.4, trend_square_share=0.2, trend_limit=1.4)
     machine = CompiledTracker(flow, linear, C, watch, variances=(q, r))
     for n in (1, 129):
         x, root, u = rng.normal(size=(n, nx)), rng.normal(size=(n, nx, nx)), rng.normal(size=(n, nu))
@@ -211,16 +211,16 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
         else:
             np.testing.assert_allclose(machine.advance(state, u, y, None)[1], seen, rtol=1e-5, atol=1e-5)
         there = ~np.isnan(y)
-        share = 0.1 * there.mean(-1)
+        counted = there.mean(-1)
         trend = np.where(there, before[:, 2:] + 0.4 * (white - before[:, 2:]), before[:, 2:])
         raised = 4.0 * (trend**2 * there).sum(-1) / np.maximum(there.sum(-1), 1)
-        trend_square = before[:, 1] + share * (raised - before[:, 1])
-        doubted = (trend_square > 1.2) & there.any(-1)
+        trend_square = before[:, 1] + 0.2 * counted * (raised - before[:, 1])
+        doubted = (trend_square > 1.4) & there.any(-1)
         assert n == 1 or 10 < doubted.sum() < n - 10
         wanted = [
             np.clip(x_next, low, high),
             P_next * np.where(doubted, DOUBT, 1.0)[:, None, None],
-            before[:, 0] + share * ((white**2).sum(-1) / np.maximum(there.sum(-1), 1) - before[:, 0]),
+            before[:, 0] + 0.1 * counted * ((white**2).sum(-1) / np.maximum(there.sum(-1), 1) - before[:, 0]),
             np.where(doubted, 1.0, trend_square),
             np.where(doubted[:, None], 0.0, trend),
         ]

@@ -96,7 +96,7 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
             doubt=number(DOUBT),
             **{
                 name: number(getattr(watch, name))
-                for name in ("share", "limit", "trend_share", "trend_gain", "trend_limit")
+                for name in ("share", "limit", "trend_share", "trend_square_share", "trend_gain", "trend_limit")
             },
         )
     )

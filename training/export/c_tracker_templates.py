@@ -189,9 +189,10 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
             observer->P[i][j] = P[i][j];
     }}
     if (seen) {{
-        double share = {share} * (double)seen / {ny};
-        observer->mean_square += share * (squared / seen - observer->mean_square);
-        observer->trend_square += share * ({trend_gain} * raised / seen - observer->trend_square);
+        double counted = (double)seen / {ny};
+        observer->mean_square += {share} * counted * (squared / seen - observer->mean_square);
+        raised *= {trend_gain} / seen;
+        observer->trend_square += {trend_square_share} * counted * (raised - observer->trend_square);
         for (size_t k = 0; k < {ny}; k++)
             observer->trend[k] = trend[k];
     }}

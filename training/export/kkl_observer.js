@@ -275,10 +275,10 @@ class Tracker {
     }
     [this.x, this.P] = [this.#within(x), P];
     if (!seen) return whole;
-    const share = (this.share * seen) / this.ny;
+    const counted = seen / this.ny;
     this.trend = trend;
-    this.meanSquare += share * (squared / seen - this.meanSquare);
-    this.trendSquare += share * ((this.trend_gain * raised) / seen - this.trendSquare);
+    this.meanSquare += this.share * counted * (squared / seen - this.meanSquare);
+    this.trendSquare += this.trend_square_share * counted * ((this.trend_gain * raised) / seen - this.trendSquare);
     if (this.trendSquare > this.trend_limit) { // innovations agree with one another
       this.P = P.map((entries) => entries.map((value) => this.doubt * value));
       [this.trendSquare, this.trend] = [1, trend.map(() => 0)];

@@ -201,8 +201,8 @@ class TrackerNodes:
         raised = graph(
             "Mul", graph("Mul", graph("Mul", trend_next, trend_next), seen), graph.constant([watch.trend_gain])
         )
-        mean_square = self._averaged(mean_square, graph("Mul", white, white), seen)
-        trend_square_next = self._averaged(trend_square, raised, seen)
+        mean_square = self._averaged(mean_square, graph("Mul", white, white), seen, watch.share)
+        trend_square_next = self._averaged(trend_square, raised, seen, watch.trend_square_share)
         agree = graph("Greater", trend_square_next, graph.constant([watch.trend_limit]))
         doubted = graph("Mul", self._flat(P, nx * nx), graph("Where", agree, graph.constant([DOUBT]), one))
         return (
@@ -213,13 +213,13 @@ class TrackerNodes:
             graph("Where", sound, graph("Where", agree, graph.constant([0.0]), trend_next), trend),
         )
 
-    def _averaged(self, mean: str, values: str, seen: str) -> str:
+    def _averaged(self, mean: str, values: str, seen: str, share: float) -> str:
         """A running mean (n, 1) of values (n, ny) after those of a sample that are seen; the others are 0."""
         graph = self._graph
         ones = graph.constant(np.ones((self._artifact.ny, 1)))
         total, count = (graph("MatMul", each, ones) for each in (values, seen))
         step = graph("Sub", total, graph("Mul", count, mean))
-        return graph("Add", mean, graph("Mul", step, graph.constant([self._watch.share / self._artifact.ny])))
+        return graph("Add", mean, graph("Mul", step, graph.constant([share / self._artifact.ny])))
 
     def _finite(self, value: str) -> str:
         return self._graph("Less", self._graph("Abs", value), self._graph.constant([math.inf]))
