@@ -71,7 +71,7 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	$(BIN)/kkl-gym evaluate $(SYSTEMS) --plant-error 0.1 --csv docs/results/tracking/plant-error.csv
 	for map in $(SYSTEMS) $(SMALL); do $(BIN)/kkl-gym evaluate $$map --calibration \
 		--csv runs/error_bars/$$map.csv || exit 1; done
-	for map in reverse_duffing van_der_pol; do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 \
+	for map in $(SYSTEMS); do $(BIN)/kkl-gym evaluate $$map --calibration --trajectories 400 \
 		--csv runs/error_bars/$$map-400.csv || exit 1; done
 	cp $(SYSTEMS:%=runs/error_bars/%.csv) $(SMALL:%=runs/error_bars/%.csv) runs/error_bars/*-400.csv docs/results/tracking
 	$(BIN)/kkl-gym evaluate $(STATIC) --process-noise 0.05 --csv docs/results/accuracy-process-noise.csv

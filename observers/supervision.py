@@ -1,8 +1,9 @@
-"""How a tracker notices by its innovations that it is off: limits of what chance makes of them.
+"""How a tracker notices by its innovations that it is off: limits of what chance makes of them, a test of whiteness.
 
 Innovations, in units of the standard deviation that a Kalman filter expects of them, are independent and have a mean
 square of 1 where the filter is right. Where it is lost they are large. Where it is off by less than the noise, but by
-more than it believes, they are hardly larger, but agree with those before.
+more than it believes, they are hardly larger, but agree with those before. So they do where the noise itself is not
+white.
 """
 
 import math
@@ -12,12 +13,12 @@ from typing import Self
 from observers.flow import Flow
 
 # Limits are the normal distribution's quantile for 1e-5. Running means are more skewed than what their limits are taken
-# of, so that chance exceeds these more often, most where windows are short: of the mean square of innovations up to five
-# times as often, and of that of their trend up to fifty times. A doubt that is wrong costs little.
+# of, so that chance exceeds these more often: of the mean square of innovations up to five times as often, most where
+# windows are short, and of that of their trend up to some twenty times. To inflate a covariance in vain costs little.
 _BEYOND_CHANCE = 4.265
 _TREND = 0.25  # windows over which innovations are averaged to see whether they agree
 _LONG = 4.0  # windows over which the square of that is averaged
-DOUBT = 10.0  # what a covariance is multiplied with where innovations agree with one another
+INFLATION = 10.0  # what a covariance is multiplied with where innovations agree with one another
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Supervision:
         Of the trend's newest square in the running mean of these, which goes farther back than a window.
     trend_limit : float
         Of the mean square of the trend, in multiples of what it is where innovations are independent. Beyond it the
-        covariance is doubted.
+        covariance is inflated.
     """
 
     window: int
@@ -75,4 +76,4 @@ def _largest_mean_square(freedom: float) -> float:
     return float((1 - spread + _BEYOND_CHANCE * math.sqrt(spread)) ** 3)
 
 
-__all__ = ["DOUBT", "Supervision"]
+__all__ = ["INFLATION", "Supervision"]

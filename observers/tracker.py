@@ -10,7 +10,7 @@ from observers.artifact import Artifact
 from observers.compiled_tracker import CompiledTracker
 from observers.decoder import Decoders
 from observers.factors import Factors
-from observers.supervision import DOUBT, Supervision
+from observers.supervision import INFLATION, Supervision
 from observers.thresholds import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
@@ -57,7 +57,7 @@ class Tracker:
 
     An estimate that is off by less than the noise is not lost, and may be off by many times what the filter believes.
     Its innovations then agree with one another. Where the mean square of their running mean is beyond chance, the
-    filter's covariance is multiplied by ten, so that it believes the samples again.
+    filter's covariance is inflated tenfold, so that it believes the samples again.
 
     What it says of its own errors is not the filter's covariance P alone, which is now and then far too small. P is
     doubted, at each level of noise and age as far as that made errors likelier in calibration: (1 - doubt) P + doubt M.
@@ -107,7 +107,7 @@ class Tracker:
         )
         self._unwatched = np.array([1.0, 1.0, *np.zeros(len(r))])  # the end of a row that begins
         self._batch: tuple[int, ...]
-        self._state: np.ndarray  # a row for each of the flattened batch: what the three properties below say
+        self._state: np.ndarray  # a row for each of the flattened batch: what the five properties below say
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
         self._shown: np.ndarray | None = None  # the estimates, (n, nx) or (nx,), where machine code has made them
         self._heard: tuple[np.ndarray, np.ndarray, Gaussian] | None = None  # z, rows (n,), what T_inv said of these
@@ -131,7 +131,7 @@ class Tracker:
 
     @property
     def _trend_square(self) -> np.ndarray:
-        """The mean square of the trend over the window, (n,), 1 where innovations are independent."""
+        """The mean square of the trend over four windows, (n,), 1 where innovations are independent."""
         return self._state[:, self._end + 1]
 
     @property
@@ -296,7 +296,7 @@ class Tracker:
     def _watched(self, P: np.ndarray, white: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Covariances, and the rows' ends (n, 2 + ny), after innovations (n, ny) in units of standard deviations.
 
-        A covariance is doubted where they agree with one another.
+        A covariance is inflated where they agree with one another.
         """
         watch, ny = self._supervision, seen.shape[1]
         counted = seen.sum(-1) / ny  # less of those that are known in part, which scatter more
@@ -305,10 +305,10 @@ class Tracker:
         trend = self._trend + watch.trend_share * np.where(seen, white - self._trend, 0.0)
         square = watch.trend_gain * seen_mean * (np.where(seen, trend, 0.0) ** 2).sum(-1)
         trend_square = self._trend_square + watch.trend_square_share * counted * (square - self._trend_square)
-        doubted = trend_square > watch.trend_limit
-        if doubted.any():
-            P = np.where(doubted[:, None, None], DOUBT * P, P)
-            trend_square, trend = np.where(doubted, 1.0, trend_square), np.where(doubted[:, None], 0.0, trend)
+        agree = (trend_square > watch.trend_limit) & seen.any(-1)
+        if agree.any():
+            P = np.where(agree[:, None, None], INFLATION * P, P)
+            trend_square, trend = np.where(agree, 1.0, trend_square), np.where(agree[:, None], 0.0, trend)
         return P, np.column_stack([mean_square, trend_square, trend])
 
     def step_single(

@@ -19,7 +19,7 @@ import numpy as np
 from observers.compiled import UNROLLED, active_kernel, network_kernels
 from observers.polynomial import count, table
 from observers.sparse import single_kernel
-from observers.supervision import DOUBT
+from observers.supervision import INFLATION
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -433,7 +433,7 @@ def _step(
                             row[nx + cut + 2 + k] = trends[k, r]
                         if row[nx + cut + 1] > outputs[0, _TREND_LIMIT]:
                             for i in range(nx, nx + cut):
-                                row[i] *= DOUBT
+                                row[i] *= INFLATION
                             row[nx + cut + 1] = 1.0
                             row[nx + cut + 2 :] = 0.0
                 elif rows[first + r]:

@@ -99,6 +99,39 @@ def test_the_page_on_error_bars(title, observer, starts, driven, span):
     assert f"| {title} | {' | '.join(cells)} |" in (RESULTS / "error_bars.md").read_text()
 
 
+def calibration(system, starts, driven, span, suffix=""):
+    """Rows of the default map's calibration by level of noise."""
+    found = pd.read_csv(RESULTS / "tracking" / f"{system}{suffix}.csv").set_index(["starts", "driven", "span"])
+    return found.loc[[(starts, driven, span)]]
+
+
+@pytest.mark.parametrize("span", ["first 2 s", "after 5 s"])
+@pytest.mark.parametrize(("starts", "driven"), [("X", False), ("X", True), ("2X \\ X", False)])
+def test_the_page_on_tracking_has_the_coverage(starts, driven, span):
+    page = (RESULTS / "tracking.md").read_text()
+    cells = [calibration(system, starts, driven, span)["90"] for system in SYSTEMS]
+    shown = " | ".join(f"{each.min():.1f} to {each.max():.1f}" for each in cells)
+    title = f"starts in {starts}{', driven' if driven else ''}, {span}"
+    assert f"| {title} | {shown} |" in page
+    if starts == "X":  # with noise, of four times as many runs
+        rows = [calibration(system, starts, driven, span, "-400") for system in SYSTEMS]
+        cells = [each[each.measurement_noise > 0]["90"] for each in rows]
+        shown = " | ".join(f"{each.min():.1f} to {each.max():.1f}" for each in cells)
+        assert f"| {title}, 400 runs with noise | {shown} |" in page
+
+
+@pytest.mark.parametrize(
+    ("title", "suffix"), [("NEES within its limits after 5 s, with noise", ""), ("the same of 400 runs", "-400")]
+)
+def test_the_page_on_tracking_has_the_nees(title, suffix):
+    cells = []
+    for system in SYSTEMS:
+        rows = pd.concat([calibration(system, "X", driven, "after 5 s", suffix) for driven in (False, True)])
+        rows = rows[rows.measurement_noise > 0]
+        cells.append(f"{rows.nees.between(rows.nees_low, rows.nees_high).sum()} of {len(rows)}")
+    assert f"| {title} | {' | '.join(cells)} |" in (RESULTS / "tracking.md").read_text()
+
+
 def test_the_page_on_accuracy_says_what_noise_does():
     found = pd.read_csv(RESULTS / "tracking" / "accuracy.csv")
     found = found[(found.starts == "X") & ~found.driven & found.observer.isin(SYSTEMS)]

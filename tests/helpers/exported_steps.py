@@ -84,11 +84,11 @@ def stepped(exported, y, u):
         yield observer
 
 
-def lost_and_doubted(exported, y, u):
-    """Whether a tracker is lost, and whether its covariance is doubted and no more, at each sample, (steps,) each."""
+def lost_and_inflated(exported, y, u):
+    """Whether a tracker is lost, and whether its covariance is inflated and no more, at each sample, (steps,) each."""
     begun = [observer._tracker._state[0, observer._tracker._end :][:2] == 1.0 for observer in stepped(exported, y, u)]
-    lost, doubted = np.array(begun).T
-    return lost, doubted & ~lost
+    lost, inflated = np.array(begun).T
+    return lost, inflated & ~lost
 
 
 def in_doubles(exported, y, u):

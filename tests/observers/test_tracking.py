@@ -100,12 +100,13 @@ def test_a_lost_estimate_is_found_again():
     for k in range(20):
         observer.step(y[k])
         np.testing.assert_allclose(observer.std.max(), sound, rtol=0.01)  # chance does not make it lost
-    (Phi, _), away, widest = exact_motion(), jump, 0.0
+    (Phi, _), away, widest, lost = exact_motion(), jump, 0.0, 0
     for k in range(20, 20 + 8 * window):
         moved, away = x[k] + away, Phi @ away
         found = observer.step(y[k] + (moved - x[k])[:, :1])
-        widest = max(widest, observer.std.max())
-    assert widest >= 0.98 * STD  # T_inv said it; the jump has misled z, so that more of it is doubted than not
+        widest, lost = max(widest, observer.std.max()), lost + (observer._tracker._mean_square == 1.0).sum()
+    assert lost >= 3  # each of the rows at least once
+    assert widest >= 0.98 * STD  # T_inv said it, and the jump has misled z, so that what it said was inflated
     assert np.abs(found - moved).max() < 0.3
 
 

@@ -14,7 +14,7 @@ from observers.flow import Flow
 from observers.network import MLP
 from observers.polynomial import table
 from observers.spread import LARGEST_LOG, Spread
-from observers.supervision import DOUBT, Supervision
+from observers.supervision import INFLATION, Supervision
 from training.export import c_templates, c_tracker_templates
 from training.export.c_map import SQUARE, map_functions, measurement_levels, process_level
 from training.export.c_text import array, block, network_arrays, network_words, number
@@ -93,7 +93,7 @@ def tracker_functions(exported: Exported, flow: Flow, words: dict[str, Any]) -> 
             bent=c_tracker_templates.BENT.format(**words) if flow.bend is not None else "",
             scaled_inputs=c_tracker_templates.SCALED_INPUTS.format(**words) if flow.nu else "",
             window=watch.window,
-            doubt=number(DOUBT),
+            inflation=number(INFLATION),
             **{
                 name: number(getattr(watch, name))
                 for name in ("share", "limit", "trend_share", "trend_square_share", "trend_gain", "trend_limit")

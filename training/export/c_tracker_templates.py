@@ -3,7 +3,7 @@
 FIELDS = """\
     double x[{nx}], P[{nx}][{nx}]; /* the estimate and its covariance, in scaled states */
     double mean_square; /* of the innovations; beyond its limit the estimate is lost */
-    double trend[{ny}], trend_square; /* their running mean, and its mean square; beyond that's limit P is doubted */
+    double trend[{ny}], trend_square; /* their running mean, and its mean square; beyond its limit P is inflated */
 """
 
 INTERPOLATED = """
@@ -129,7 +129,7 @@ static void predict(const {NAME}_observer *observer{u}, double x[{nx}], double P
 {bent}}}
 
 /* Innovations agree with nothing as yet. */
-static void unwatched({NAME}_observer *observer)
+static void without_trend({NAME}_observer *observer)
 {{
     observer->trend_square = 1.0;
     for (size_t k = 0; k < {ny}; k++)
@@ -196,11 +196,11 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
         for (size_t k = 0; k < {ny}; k++)
             observer->trend[k] = trend[k];
     }}
-    if (observer->trend_square > {trend_limit}) {{ /* innovations agree with one another */
+    if (seen && observer->trend_square > {trend_limit}) {{ /* innovations agree with one another */
         for (size_t i = 0; i < {nx}; i++)
             for (size_t j = 0; j < {nx}; j++)
-                observer->P[i][j] *= {doubt};
-        unwatched(observer);
+                observer->P[i][j] *= {inflation};
+        without_trend(observer);
     }}
 }}
 
@@ -228,7 +228,7 @@ static void supervise({NAME}_observer *observer)
     }}
     if (lost) {{
         observer->mean_square = 1.0;
-        unwatched(observer);
+        without_trend(observer);
     }}
 }}
 """

@@ -280,7 +280,7 @@ class Tracker {
     this.meanSquare += this.share * counted * (squared / seen - this.meanSquare);
     this.trendSquare += this.trend_square_share * counted * ((this.trend_gain * raised) / seen - this.trendSquare);
     if (this.trendSquare > this.trend_limit) { // innovations agree with one another
-      this.P = P.map((entries) => entries.map((value) => this.doubt * value));
+      this.P = P.map((entries) => entries.map((value) => this.inflation * value));
       [this.trendSquare, this.trend] = [1, trend.map(() => 0)];
     }
     return whole;

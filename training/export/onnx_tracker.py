@@ -13,7 +13,7 @@ import numpy as np
 
 from observers.artifact import Artifact
 from observers.polynomial import count, table
-from observers.supervision import DOUBT, Supervision
+from observers.supervision import INFLATION, Supervision
 from training.export.onnx_map import Maps
 from training.export.onnx_nodes import Graph
 
@@ -203,11 +203,13 @@ class TrackerNodes:
         )
         mean_square = self._averaged(mean_square, graph("Mul", white, white), seen, watch.share)
         trend_square_next = self._averaged(trend_square, raised, seen, watch.trend_square_share)
-        agree = graph("Greater", trend_square_next, graph.constant([watch.trend_limit]))
-        doubted = graph("Mul", self._flat(P, nx * nx), graph("Where", agree, graph.constant([DOUBT]), one))
+        beyond = graph("Greater", trend_square_next, graph.constant([watch.trend_limit]))
+        any_seen = graph("Greater", graph("ReduceMax", seen, axes=[1], keepdims=1), graph.constant([0.0]))
+        agree = graph("And", beyond, any_seen)
+        inflated = graph("Mul", self._flat(P, nx * nx), graph("Where", agree, graph.constant([INFLATION]), one))
         return (
             graph("Where", sound, graph.within(x, self._low, self._high), x_before),
-            self._matrix(graph("Where", sound, doubted, self._flat(P_before, nx * nx))),
+            self._matrix(graph("Where", sound, inflated, self._flat(P_before, nx * nx))),
             graph("Where", sound, mean_square, graph.constant([math.inf])),
             graph("Where", sound, graph("Where", agree, one, trend_square_next), trend_square),
             graph("Where", sound, graph("Where", agree, graph.constant([0.0]), trend_next), trend),

@@ -11,7 +11,7 @@ from observers import storage
 from observers.flow import Flow
 from observers.inverse import InverseMap
 from observers.polynomial import table
-from observers.supervision import DOUBT, Supervision
+from observers.supervision import INFLATION, Supervision
 from training.export.exported import Exported
 
 KEY = "kkl_step"  # of the metadata
@@ -106,5 +106,5 @@ def _described_flow(tensors: dict[str, np.ndarray], flow: Flow, dt: float) -> di
         "least_process_noise": flow.least_process_noise,
         **dataclasses.asdict(watch),
         "trend_gain": watch.trend_gain,
-        "doubt": DOUBT,
+        "inflation": INFLATION,
     }

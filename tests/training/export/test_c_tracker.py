@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from compiled_c import WARNINGS, compiled, estimates, needs_cc
-from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_doubted
+from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_inflated
 from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver
@@ -40,9 +40,9 @@ def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     y, u = of_floats(exported.artifact, 2000)
     y[700:720] = y[300::7, 0] = np.nan
     assert apart(exported, estimates(compiled(exported, tmp_path), y, u), y, u) < tolerance
-    lost, doubted = lost_and_doubted(exported, y, u)
+    lost, inflated = lost_and_inflated(exported, y, u)
     assert sum(lost[600:700]) > 1
-    assert doubted.any()
+    assert inflated.any()
 
 
 @needs_cc

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from error_bars import with_error_bars
-from exported_steps import apart, exported_of, lost_and_doubted, motion, noise, stepped
+from exported_steps import apart, exported_of, lost_and_inflated, motion, noise, stepped
 from random_tracking import KINDS, signals, tracking
 
 from observers import Expression, KKLObserver, Limits, load
@@ -130,9 +130,9 @@ def test_maps_that_track(options, tmp_path):
     y[700:720] = y[300::7, 0] = np.nan
     found = replayed(exported, tmp_path, y, u)
     assert apart(exported, np.array(found["x_hat"]), y, u) < 1e-9
-    lost, doubted = lost_and_doubted(exported, y, u)
+    lost, inflated = lost_and_inflated(exported, y, u)
     assert any(lost[600:700])
-    assert doubted.any()
+    assert inflated.any()
 
 
 def test_error_bars_of_maps_that_track(tmp_path):

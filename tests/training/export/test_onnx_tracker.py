@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_doubted
+from exported_steps import apart, doubles, exported_of, in_doubles, lost_and_inflated
 from random_tracking import KINDS, of_floats, signals, tracking
 
 from observers import Expression, KKLObserver
@@ -26,9 +26,9 @@ def test_two_thousand_samples(options, precision, tolerance, tmp_path):
     y[700:720] = y[300::7, 0] = np.nan
     x_hat = Runner(exported).along(y[:, None], u[:, None])[:, 0]
     assert apart(exported, x_hat, y, u) < tolerance
-    lost, doubted = lost_and_doubted(exported, y, u)
+    lost, inflated = lost_and_inflated(exported, y, u)
     assert sum(lost[600:700]) > 1
-    assert doubted.any()
+    assert inflated.any()
 
 
 def test_rows_have_levels_of_their_own(tmp_path):
