@@ -38,11 +38,16 @@ class _Calibrated:
 
     def scale(self, age: float) -> np.ndarray:
         """The same of a single sample, (nx, nx)."""
-        scale = self._scales.get(age if age < self.last else self.last)
+        age = min(age, self.last)
+        scale = self._scales.get(age)
         if scale is None:
-            age = min(age, self.last)
             scale = self._scales[age] = self.scales(*self.at(np.array([age])))[0]
         return scale
+
+    @functools.cached_property
+    def last_scale(self) -> np.ndarray:
+        """The same from the last age on."""
+        return self.scale(self.last)
 
 
 class Tracker:
@@ -158,9 +163,11 @@ class Tracker:
             acted = len(z) > nz and (z.item(nz) != 0.0 or any(z[nz:].tolist()))
             calibrated = self._calibrated if acted else self._free_calibrated
             if age >= self._window or self._known.item(0):
-                if self._looked_at[0] is not self._state:
-                    self._looked_at = self._state, self._P[0]
-                single: np.ndarray = self._looked_at[1] * calibrated.scale(float(age))
+                state, P = self._looked_at
+                if state is not self._state:
+                    state, P = self._looked_at = self._state, self._P[0]
+                scale = calibrated.last_scale if age >= calibrated.last else calibrated.scale(float(age))
+                single: np.ndarray = P * scale
                 return single
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
