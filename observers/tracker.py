@@ -25,7 +25,7 @@ class _Calibrated:
         self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
         self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
         self.last = float(self._ages[-1])  # after which nothing changes
-        self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
+        self.cached = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
     def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors and doubts, (n,)."""
@@ -39,9 +39,9 @@ class _Calibrated:
     def scale(self, age: float) -> np.ndarray:
         """The same of a single sample, (nx, nx)."""
         age = min(age, self.last)
-        scale = self._scales.get(age)
+        scale = self.cached.get(age)
         if scale is None:
-            scale = self._scales[age] = self.scales(*self.at(np.array([age])))[0]
+            scale = self.cached[age] = self.scales(*self.at(np.array([age])))[0]
         return scale
 
     @functools.cached_property
@@ -166,8 +166,8 @@ class Tracker:
                 state, P = self._looked_at
                 if state is not self._state:
                     state, P = self._looked_at = self._state, self._P[0]
-                scale = calibrated.last_scale if age >= calibrated.last else calibrated.scale(float(age))
-                single: np.ndarray = P * scale
+                scale = calibrated.last_scale if age >= calibrated.last else calibrated.cached.get(float(age))
+                single: np.ndarray = P * (calibrated.scale(float(age)) if scale is None else scale)
                 return single
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
