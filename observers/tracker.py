@@ -25,7 +25,7 @@ class _Calibrated:
         self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
         self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
         self.last = float(self._ages[-1])  # after which nothing changes
-        self.cached = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
+        self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
     def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors and doubts, (n,)."""
@@ -39,9 +39,9 @@ class _Calibrated:
     def scale(self, age: float) -> np.ndarray:
         """The same of a single sample, (nx, nx)."""
         age = min(age, self.last)
-        scale = self.cached.get(age)
+        scale = self._scales.get(age)
         if scale is None:
-            scale = self.cached[age] = self.scales(*self.at(np.array([age])))[0]
+            scale = self._scales[age] = self.scales(*self.at(np.array([age])))[0]
         return scale
 
     @functools.cached_property
@@ -166,8 +166,8 @@ class Tracker:
                 state, P = self._looked_at
                 if state is not self._state:
                     state, P = self._looked_at = self._state, self._P[0]
-                scale = calibrated.last_scale if age >= calibrated.last else calibrated.cached.get(float(age))
-                single: np.ndarray = P * (calibrated.scale(float(age)) if scale is None else scale)
+                scale = calibrated.last_scale if age >= calibrated.last else calibrated.scale(float(age))
+                single: np.ndarray = P * scale
                 return single
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
@@ -305,14 +305,14 @@ class Tracker:
 
         A covariance is inflated where they agree with one another.
         """
-        watch, ny = self._supervision, seen.shape[1]
-        counted = seen.sum(-1) / ny  # less of those that are known in part, which scatter more
-        seen_mean = 1 / np.maximum(seen.sum(-1), 1)
+        watch, count = self._supervision, seen.sum(-1)
+        counted = count / seen.shape[1]  # less of those that are known in part, which scatter more
+        seen_mean = 1 / np.maximum(count, 1)
         mean_square = self._mean_square + watch.share * counted * (seen_mean * (white**2).sum(-1) - self._mean_square)
         trend = self._trend + watch.trend_share * np.where(seen, white - self._trend, 0.0)
         square = watch.trend_gain * seen_mean * (np.where(seen, trend, 0.0) ** 2).sum(-1)
         trend_square = self._trend_square + watch.trend_square_share * counted * (square - self._trend_square)
-        agree = (trend_square > watch.trend_limit) & seen.any(-1)
+        agree = (trend_square > watch.trend_limit) & (count > 0)
         if agree.any():
             P = np.where(agree[:, None, None], INFLATION * P, P)
             trend_square, trend = np.where(agree, 1.0, trend_square), np.where(agree[:, None], 0.0, trend)
