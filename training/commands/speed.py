@@ -141,14 +141,14 @@ class Speed:
 
     def _observers(self, environments: Sequence[Shown], progress: ProgressBars) -> None:
         """Observers without environments, beside Kalman filters."""
-        n, steps, vector_steps = self.num_envs, -(-self.steps // 10), -(-self.vector_steps // 10)
+        n, vector_steps = self.num_envs, -(-self.vector_steps // 10)
         title = Column("observers alone", no_wrap=True)
         table = Table(title, "µs per step", f"µs per step, {n} rows", "GFLOP/s", "GFLOP/s of its products", "share")
         observed = [one for one in environments if one.observed]
         for one in observed:
             for name in (one.observer or one.system.name, *_others(one).values()):
                 artifact = Artifact.read(resolve(name))
-                tasks = observer_tasks(artifact, one.system, rows=None, steps=steps)
+                tasks = observer_tasks(artifact, one.system, rows=None, steps=self.steps)
                 batch = observer_tasks(artifact, one.system, rows=n, steps=vector_steps)
                 many = KKLObserver(dataclasses.replace(artifact, flow=None))  # for its network, T_inv
                 many.reset(np.zeros((n, artifact.ny)))
