@@ -16,7 +16,7 @@ from pages import PAGES, ROOT, Page, name
 from training.cli import COMMANDS, EXTRAS, read
 
 # Commands of others, which are taken on trust.
-OF_OTHERS = {"cc", "cd", "cp", "dask", "printf", "ray", "srun", "tensorboard", "./van_der_pol"}
+OF_OTHERS = {"cc", "cd", "cp", "dask", "printf", "ray", "sleep", "srun", "tensorboard", "./van_der_pol"}
 
 
 def with_blocks(language):

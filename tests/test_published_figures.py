@@ -22,8 +22,9 @@ def test_the_readmes_table_is_the_benchmarks():
         "the default maps": "shipped",
         "the same without [tracking](docs/guides/tracking.md)": "shipped-static",
         "extended Kalman filter, tuned": "ekf",
+        "unscented Kalman filter, tuned": "ukf",
         "parameters 10 % wrong: without tracking": "default-wrong",
-        "parameters 10 % wrong: Kalman filter": "ekf-wrong",
+        "parameters 10 % wrong: extended Kalman filter": "ekf-wrong",
     }
     readme = (ROOT / "README.md").read_text()
     for label, method in rows.items():
@@ -97,6 +98,9 @@ def test_the_page_on_error_bars(title, observer, starts, driven, span):
         assert len(shares) == 6
         cells.append(f"{shares.min():.1f} to {shares.max():.1f}")
     assert f"| {title} | {' | '.join(cells)} |" in (RESULTS / "error_bars.md").read_text()
+    if (observer, starts, driven, span) == ("KKL", "X", False, "after 5 s"):
+        guide = (ROOT / "docs" / "guides" / "error_bars.md").read_text()
+        assert f"| starts in X, all levels of noise, T_inv alone | {' | '.join(cells)} |" in guide
 
 
 def calibration(system, starts, driven, span, suffix=""):
