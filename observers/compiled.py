@@ -133,8 +133,10 @@ class CompiledNetwork:
         """Lend memory for the layers of a piece, the same to one after another."""
         spare = self._spare
         memory = spare.pop() if spare else np.empty((2, self._rows * self._most), np.float32)
-        yield memory
-        spare.append(memory)
+        try:
+            yield memory
+        finally:
+            spare.append(memory)
 
     @property
     def _rows(self) -> int:

@@ -55,7 +55,7 @@ class LinearFilter:
     """
 
     def __init__(self, A: np.ndarray, B: np.ndarray, dt: float, nu: int = 0) -> None:
-        A, B = real_array("A", A), real_array("B", B)
+        A, B = real_array("A", A).copy(), real_array("B", B).copy()  # the caller may reuse them
         if A.ndim != 2 or A.shape[0] != A.shape[1] or B.ndim != 2 or len(B) != len(A):
             raise ValueError(f"A must be (nz, nz) and B (nz, ny), got {A.shape} and {B.shape}")
         if not (np.isfinite(A).all() and np.isfinite(B).all()):
@@ -84,6 +84,7 @@ class LinearFilter:
         def acts_on_z_y(matrix: np.ndarray) -> np.ndarray:
             return np.vstack([matrix, np.zeros((nu * nz, ny))])
 
+        A.flags.writeable = B.flags.writeable = False  # what follows from them would not change
         self.A, self.B, self.dt, self.nu = A, B, dt, nu
         with np.errstate(all="ignore"):
             s = poles * dt

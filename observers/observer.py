@@ -55,10 +55,10 @@ class KKLObserver:
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
         Whether single samples go through machine code, which takes some seconds to make, and then a third of the time,
-        or a twelfth where the observer tracks. True makes it here, such as before a loop in real time; it needs Numba,
-        the extra ``fast``. False leaves them to NumPy. None is NumPy until a :meth:`reset` after 1,000 samples, and
-        then Numba if it is installed: no run is held up in its midst. The two agree to rounding. Batches of 128 rows or
-        more take Numba wherever it is.
+        or a twentieth where the observer tracks. True makes it here, such as before a loop in real time, and where the
+        observer is unpickled; it needs Numba, the extra ``fast``. False leaves them to NumPy. None is NumPy until a
+        :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is held up in its midst. The two
+        agree to rounding. Batches of 128 rows or more take Numba wherever it is.
 
     Raises
     ------
@@ -176,6 +176,11 @@ class KKLObserver:
             compiled=self._compiled,
         )
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        if self._compiled and available() and (self._z is None or self._z.ndim == 1):
+            self._warm_up()  # in another process there is no machine code yet
+
     def _warm_up(self) -> None:
         """Make the machine code for single samples now, by a sample that is forgotten."""
         linear = self.artifact.filter
@@ -264,14 +269,15 @@ class KKLObserver:
         """
         y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
+        x0 = None if x0 is None else real_array("x0", x0)
         z0, age = first_state(self.artifact, y0, x0)
         if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
             self._compiled = True
             self._tell()
             self._warm_up()
-        self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
         if self._tracker is not None:
             self._tracker.reset(z0, age, x0)
+        self._z, self._y, self._age, self._x_hat, self._parts = z0, y0, age, None, None
         if self._monitor is not None:
             self._monitor.reset(y0.shape[:-1])
         return self.decode()
@@ -341,7 +347,7 @@ class KKLObserver:
         """
         z = self.z
         rows = bool_array("rows", rows, z.shape[:-1])
-        y0 = real_array("y", y0)
+        y0, x0 = real_array("y", y0), None if x0 is None else real_array("x0", x0)
         check_output(self.artifact, y0, (int(rows.sum()),), first=True)
         z[rows], age = first_state(self.artifact, y0, x0)
         if self._tracker is not None:
@@ -357,9 +363,9 @@ class KKLObserver:
         """Take in the next sample.
 
         Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes
-        z' = A z + B h(T_inv(z)) a model of the system. With several outputs, some may be missing where others are not,
-        such as those of slower sensors: it then coasts on these alone. Where the artifact holds no h, the last value of
-        what is missing is taken as still valid.
+        z' = A z + B h(T_inv(z)) a model of the system. One that tracks coasts on its learned motion. With several
+        outputs, some may be missing where others are not, such as those of slower sensors: it then coasts on these
+        alone. Where the artifact holds no h, the last value of what is missing is taken as still valid.
 
         Parameters
         ----------
@@ -450,7 +456,7 @@ class KKLObserver:
             self._monitor.update(self.artifact.residual(self._y, self._x_hat), seen)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimate T_inv(z) as things stand: the network's half of :meth:`step`.
+        """Return the estimate as things stand: T_inv(z), the network's half of :meth:`step`, or what a tracker has.
 
         Parameters
         ----------

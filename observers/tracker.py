@@ -27,6 +27,9 @@ class _Calibrated:
         self.last = float(self._ages[-1])  # after which nothing changes
         self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_scales": {}}
+
     def at(self, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Factors and doubts, (n,)."""
         return np.exp(2 * np.interp(age, self._ages, self._logs)), np.interp(age, self._ages, self._doubts)
@@ -59,6 +62,9 @@ class Tracker:
     tracker is lost: where the mean square of its innovations, over the window, is beyond chance for the levels of noise
     told, or its covariance is none any more. What came before may then have misled z too, so that T_inv is taken for no
     surer than so soon after a reset as the window is long.
+
+    Windows are of samples that were there. While they are missing z forgets its start as it does else, which the
+    estimate of T_inv has to be told, but learns nothing, so that T_inv is no surer than after those that were there.
 
     An estimate that is off by less than the noise is not lost, and may be off by many times what the filter believes.
     Its innovations then agree with one another. Where the mean square of their running mean is beyond chance, the
@@ -110,9 +116,8 @@ class Tracker:
             _Calibrated(each, shares, self._dt, self._units)
             for each in (flow.factors, flow.free_factors or flow.factors)
         )
-        self._unwatched = np.array([1.0, 1.0, *np.zeros(len(r))])  # the end of a row that begins
         self._batch: tuple[int, ...]
-        self._state: np.ndarray  # a row for each of the flattened batch: what the five properties below say
+        self._state: np.ndarray  # a row for each of the flattened batch: what the six properties below say
         self._known: np.ndarray  # whether it began at a known state, (n,): T_inv then has nothing to say of errors
         self._shown: np.ndarray | None = None  # the estimates, (n, nx) or (nx,), where machine code has made them
         self._heard: tuple[np.ndarray, np.ndarray, Gaussian] | None = None  # z, rows (n,), what T_inv said of these
@@ -140,9 +145,14 @@ class Tracker:
         return self._state[:, self._end + 1]
 
     @property
+    def _seen(self) -> np.ndarray:
+        """Samples since the beginning of which anything was there, (n,)."""
+        return self._state[:, self._end + 2]
+
+    @property
     def _trend(self) -> np.ndarray:
         """The running mean of the innovations, in units of their standard deviations, (n, ny)."""
-        return self._state[:, self._end + 2 :]
+        return self._state[:, self._end + 3 :]
 
     @property
     def estimate(self) -> np.ndarray:
@@ -162,7 +172,8 @@ class Tracker:
         if not self._batch:  # a single sample: every call of numpy would be felt
             acted = len(z) > nz and (z.item(nz) != 0.0 or any(z[nz:].tolist()))
             calibrated = self._calibrated if acted else self._free_calibrated
-            if age >= self._window or self._known.item(0):
+            seen = self._state.item(self._end + 2)
+            if seen >= self._window or self._known.item(0):
                 state, P = self._looked_at
                 if state is not self._state:
                     state, P = self._looked_at = self._state, self._P[0]
@@ -170,21 +181,21 @@ class Tracker:
                 single: np.ndarray = P * scale
                 return single
             heard = self._heard
-            said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age))
+            said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age), seen)
             return self._soon(said, *calibrated.at(np.array([age])))[0]
         heard, n, nx = self._heard, len(self._state), self._flow.nx
         heard = heard if heard is not None and heard[0] is z else None
         z = z.reshape(n, z.shape[-1])
         ages, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
         P = (self._state[:, nx : self._end] * self._scales(ages, acted)).reshape(n, nx, nx)
-        soon = (ages < self._window) & ~self._known
+        soon = (self._seen < self._window) & ~self._known
         if soon.any():
             ages = np.broadcast_to(ages, n)[soon]
             if heard is not None and heard[1][soon].all():
                 _, asked, (x, covariance) = heard
                 said = x[soon[asked]], covariance[soon[asked]]
             else:
-                said = self._said(z[soon], ages)
+                said = self._said(z[soon], ages, self._seen[soon])
             P[soon] = self._soon(said, *self._factors(ages, acted[soon]), soon)
         return P.reshape(*self._batch, nx, nx)
 
@@ -222,12 +233,14 @@ class Tracker:
         """Begin with what T_inv says of z, (..., size), at ages in samples, or with states that are known."""
         self._batch = z.shape[:-1]
         if x0 is not None:
-            x = np.reshape(x0, (-1, self._flow.nx)).astype(float)
-            self._begin(x, np.broadcast_to(np.diag((KNOWN * self._flow.x_scale) ** 2), (*x.shape, x.shape[-1])))
+            x = np.reshape(x0, (-1, self._flow.nx))
+            P = np.broadcast_to(np.diag((KNOWN * self._flow.x_scale) ** 2), (*x.shape, x.shape[-1]))
+            self._begin(x, P, float(age))
         elif self._batch:
-            self._begin(*self._said(z.reshape(-1, z.shape[-1]), np.broadcast_to(age, self._batch).ravel()))
+            ages = np.broadcast_to(age, self._batch).ravel()
+            self._begin(*self._said(z.reshape(-1, z.shape[-1]), ages, ages), ages)
         else:
-            self._begin(*self._said_of_one(z, float(age)))
+            self._begin(*self._said_of_one(z, float(age), float(age)), float(age))
         self._known = np.full(len(self._state), x0 is not None)
 
     def restart(self, rows: np.ndarray, z: np.ndarray, age: float, x0: np.ndarray | None = None) -> None:
@@ -256,7 +269,7 @@ class Tracker:
     def go_on(self, other: "Tracker") -> None:
         """Go on where another stands, which may be told other levels of noise or have another flow."""
         self._batch = other._batch
-        self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units)
+        self._begin(other.estimate.reshape(-1, self._flow.nx), other._P * other._units, other._seen)
         self._state[:, self._end :] = other._state[:, other._end :]
         self._known = other._known
 
@@ -289,8 +302,9 @@ class Tracker:
             else:
                 expected, across = self._output(x), P @ self._C.T
                 S = self._C @ across
-            x, P, white = conditioned(x, P, y - expected, S + self._R, across)
-            P, watched = self._watched(P, white, ~np.isnan(y))
+            missing = np.isnan(y)  # and not where h is undefined, which breaks an estimate down
+            x, P, white = conditioned(x, P, y - expected, S + self._R, across, missing)
+            P, watched = self._watched(P, white, ~missing)
             state = self._packed(self._within(x), P, watched)
             sound = np.isfinite(state[:, : self._end].sum(-1))
         taken = sound if rows is None else sound & rows
@@ -301,7 +315,7 @@ class Tracker:
         return expected.reshape(*self._batch, ny)
 
     def _watched(self, P: np.ndarray, white: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Covariances, and the rows' ends (n, 2 + ny), after innovations (n, ny) in units of standard deviations.
+        """Covariances, and the rows' ends (n, 3 + ny), after innovations (n, ny) in units of standard deviations.
 
         A covariance is inflated where they agree with one another.
         """
@@ -316,7 +330,7 @@ class Tracker:
         if agree.any():
             P = np.where(agree[:, None, None], INFLATION * P, P)
             trend_square, trend = np.where(agree, 1.0, trend_square), np.where(agree[:, None], 0.0, trend)
-        return P, np.column_stack([mean_square, trend_square, trend])
+        return P, np.column_stack([mean_square, trend_square, self._seen + (count > 0), trend])
 
     def step_single(
         self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray
@@ -350,15 +364,16 @@ class Tracker:
         """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
         self._heard = None
         if not self._batch:  # a single sample: every call of numpy would be felt
-            age = float(age)
             one = not self._state.item(self._end) <= self._supervision.limit  # lost where it is NaN too
-            if (one or age < self._window) and (rows is None or rows):
-                said = self._said_of_one(z, age, one)
+            seen = self._state.item(self._end + 2)
+            if (one or seen < self._window) and (rows is None or rows):
+                said = self._said_of_one(z, float(age), min(seen, self._window))
                 self._take(said, _FLAGS[one], _FIRST)
                 self._heard = z, _FLAGS[True], said
             return
         lost = ~(self._mean_square <= self._supervision.limit)
-        asked = np.ravel(age) < self._window  # of all rows, or the one age that they share
+        seen = self._seen
+        asked = seen < self._window
         if not asked.any() and not lost.any():  # most often
             return
         age = np.broadcast_to(age, self._batch).ravel()
@@ -370,8 +385,8 @@ class Tracker:
             return
         flat = z.reshape(-1, z.shape[-1])
         if len(where) < len(flat):
-            flat, age, lost = flat[where], age[where], lost[where]
-        said = self._said(flat, age, lost)
+            flat, age, lost, seen = flat[where], age[where], lost[where], seen[where]
+        said = self._said(flat, age, np.minimum(seen, self._window))
         self._take(said, lost, where)
         self._heard = z, asked, said
 
@@ -388,34 +403,46 @@ class Tracker:
         if taken.any():
             self._state = self._state.copy()  # others may look at what there was
             self._x[where[taken]], self._P[where[taken]] = x[taken], P[taken]
-            self._state[where[lost], self._end :] = self._unwatched
+            self._mean_square[where[lost]] = self._trend_square[where[lost]] = 1.0
+            self._trend[where[lost]] = 0.0
 
-    def _said(self, z: np.ndarray, age: np.ndarray, lost: np.ndarray | None = None) -> Gaussian:
-        """What T_inv says of z, (k, size), at ages in samples: estimates, and covariances, in units of the states."""
+    def _said(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray) -> Gaussian:
+        """What T_inv says of z, (k, size), at ages in samples: estimates, and covariances, in units of the states.
+
+        It is as sure of them as z had learned of so many samples, (k,), and forgotten its start for as long.
+        """
         parts, x = self._decoders.estimate(z, age * self._dt)
+        less = learned < age
+        if less.all():
+            return x, self._decoders.covariances(z, learned * self._dt)
         P = self._decoders.covariance(parts)
-        if lost is not None and lost.any():
-            soon = np.minimum(age[lost], self._window) * self._dt
-            P[lost] = self._decoders.covariances(z[lost], soon)
+        if less.any():
+            P[less] = self._decoders.covariances(z[less], learned[less] * self._dt)
         return x, P
 
-    def _said_of_one(self, z: np.ndarray, age: float, lost: bool = False) -> Gaussian:
+    def _said_of_one(self, z: np.ndarray, age: float, learned: float) -> Gaussian:
         """The same of a single sample, (size,); still with an axis of rows."""
-        parts, x = self._decoders.estimate(z, age * self._dt, both=not lost)
-        if lost:
-            return x[None], self._decoders.covariances(z, min(age, self._window) * self._dt)[None]
+        parts, x = self._decoders.estimate(z, age * self._dt, both=learned == age)
+        if learned < age:
+            return x[None], self._decoders.covariances(z, learned * self._dt)[None]
         return x[None], self._decoders.covariance(parts)[None]
 
-    def _begin(self, x: np.ndarray, P: np.ndarray) -> None:
-        """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states."""
+    def _begin(self, x: np.ndarray, P: np.ndarray, seen: np.ndarray | float) -> None:
+        """Begin with estimates (n, nx) of covariances (n, nx, nx), in units of the states, after so many samples."""
+        watched = np.tile([1.0, 1.0, 0.0, *np.zeros(len(self._R))], (len(x), 1))
+        watched[:, 2] = seen
         self._shown, self._heard = None, None
-        self._state = self._packed(*self._scaled(x, P), np.tile(self._unwatched, (len(x), 1)))
+        self._state = self._packed(*self._scaled(x, P), watched)
 
     def _packed(self, x: np.ndarray, P: np.ndarray, watched: np.ndarray) -> np.ndarray:
         return np.concatenate([x, P.reshape(len(x), x.shape[1] ** 2), watched], axis=1)
 
     def _output(self, s: np.ndarray) -> np.ndarray:
-        return self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
+        y = self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
+        if not np.isfinite(y).all():  # h may be undefined beyond the motion, where sigma points may be
+            within = self._artifact.output(self._flow.x_offset + self._flow.x_scale * self._within(s))
+            y = np.where(np.isfinite(y), y, within)
+        return y
 
     def _scaled(self, x: np.ndarray, P: np.ndarray) -> Gaussian:
         s = (x - self._flow.x_offset) / self._flow.x_scale

@@ -131,7 +131,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
                         row[nx + nx * i + j] = P[k, i, j] / (states[i, _SCALE] * states[j, _SCALE])
                 if lost[k]:
                     row[nx + nx * nx] = row[nx + nx * nx + 1] = 1.0
-                    row[nx + nx * nx + 2 :] = 0.0
+                    row[nx + nx * nx + 3 :] = 0.0
 
     return one, step_lanes, take
 
@@ -410,7 +410,7 @@ def _step(
             for k in range(ny):
                 for r in range(lanes):
                     now = min(first + r, n - 1)
-                    sample[r], trends[k, r] = y[now, k], state[now, nx + cut + 2 + k]
+                    sample[r], trends[k, r] = y[now, k], state[now, nx + cut + 3 + k]
                 correct(outputs[k], sample, mean, P, across, apart, pivot, squared, seen, there, trends[k], raised)
             for r in range(size):
                 row, total = state[first + r], 0.0
@@ -429,13 +429,14 @@ def _step(
                         counted, trend = seen[r] / ny, outputs[0, _TREND_GAIN] * raised[r] / seen[r]
                         row[nx + cut] += outputs[0, _SHARE] * counted * (squared[r] / seen[r] - row[nx + cut])
                         row[nx + cut + 1] += outputs[0, _TREND_SQUARE_SHARE] * counted * (trend - row[nx + cut + 1])
+                        row[nx + cut + 2] += 1.0
                         for k in range(ny):
-                            row[nx + cut + 2 + k] = trends[k, r]
+                            row[nx + cut + 3 + k] = trends[k, r]
                         if row[nx + cut + 1] > outputs[0, _TREND_LIMIT]:
                             for i in range(nx, nx + cut):
                                 row[i] *= INFLATION
                             row[nx + cut + 1] = 1.0
-                            row[nx + cut + 2 :] = 0.0
+                            row[nx + cut + 3 :] = 0.0
                 elif rows[first + r]:
                     row[nx + cut] = np.inf
                 for i in range(nx):

@@ -5,13 +5,12 @@ where it has a weight (Wan and van der Merwe, 2000, with alpha = 1). They are dr
 linear.
 """
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-
-LEAST_EIGENVALUE = 1e-13  # of a covariance, over its largest: below that its factor would be rounding
 
 Gaussian = tuple[np.ndarray, np.ndarray]
 """Means (n, nx) and covariances (n, nx, nx)."""
@@ -155,7 +154,12 @@ def transformed(
 
 
 def conditioned(
-    x: np.ndarray, P: np.ndarray, innovation: np.ndarray, S: np.ndarray, across: np.ndarray
+    x: np.ndarray,
+    P: np.ndarray,
+    innovation: np.ndarray,
+    S: np.ndarray,
+    across: np.ndarray,
+    missing: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Condition a batch of Gaussians on what samples differ by from what was expected.
 
@@ -164,9 +168,11 @@ def conditioned(
     x, P : ndarray, shapes (n, nx) and (n, nx, nx)
         Means and covariances.
     innovation : ndarray, shape (n, ny)
-        Samples less what was expected; NaN where they are missing, which corrects nothing.
+        Samples less what was expected.
     S, across : ndarray, shapes (n, ny, ny) and (n, nx, ny)
         Covariances of the innovations, and of the states with them.
+    missing : ndarray of bool, shape (n, ny), optional
+        The samples that are missing, which correct nothing; by default where the innovation is NaN.
 
     Returns
     -------
@@ -176,7 +182,7 @@ def conditioned(
         Innovations less what those of the outputs before say of them, in units of their standard deviation: where all
         is as assumed, they are independent and of variance 1. 0 where samples are missing.
     """
-    missing = np.isnan(innovation)
+    missing = np.isnan(innovation) if missing is None else missing
     if missing.any():
         innovation = np.where(missing, 0.0, innovation)
         across = np.where(missing[:, None, :], 0.0, across)
@@ -193,10 +199,9 @@ def factor(P: np.ndarray) -> np.ndarray:
         found: np.ndarray = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:  # which says that there is one, not which
         found = np.full_like(P, np.nan)
-        sound = np.isfinite(P).all((1, 2))
-        eigenvalues = np.linalg.eigvalsh(P[sound])
-        sound[sound] = eigenvalues[:, 0] > LEAST_EIGENVALUE * eigenvalues[:, -1]
-        found[sound] = np.linalg.cholesky(P[sound])
+        for i in np.flatnonzero(np.isfinite(P).all((1, 2))):
+            with contextlib.suppress(np.linalg.LinAlgError):
+                found[i] = np.linalg.cholesky(P[i])
     return found
 
 

@@ -30,6 +30,7 @@ FACTOR = 2.0  # of X, from which they start: states beyond X are to be found too
 SETTLED = 5.0  # s at the pace of the shipped systems, after which errors count as those of any later age
 AGES = 30  # at which they are looked at
 WINDOW = 0.5  # s at that pace, over which innovations are averaged
+ROUNDING = 1e-9  # of its largest entry, by which Q may miss being symmetric and positive
 CHANCE = 1e-9  # that their mean square is as large as its limit where model and levels of noise hold
 
 
@@ -203,8 +204,10 @@ class GuidedKalmanFilter:
         else:
             self._observer.advance(y, u)
         self._filter.advance(y.reshape(-1, ny), u.reshape(self._age.size, nu))
-        self._age += 1
-        self._mean_square += self._share * ~missing.ravel() * (self._filter.nis - self._mean_square)
+        nis, seen = self._filter.nis, (~np.isnan(y)).mean(-1).ravel()  # in part it scatters more, and counts less
+        self._age += seen > 0.0
+        step = np.where(np.isinf(nis), 0.0, nis) - self._mean_square
+        self._mean_square = np.where(np.isinf(nis), np.inf, self._mean_square + self._share * seen * step)
         return self._supervised()
 
     def _supervised(self) -> np.ndarray:
@@ -231,9 +234,11 @@ class GuidedKalmanFilter:
 def _checked(Q: np.ndarray, nx: int) -> np.ndarray:
     """The intensity of the process noise; ValueError if it is none."""
     Q = real_array("Q", Q)
-    if Q.shape != (nx, nx) or not np.isfinite(Q).all() or (Q != Q.T).any() or (np.linalg.eigvalsh(Q) < 0).any():
+    sound = Q.shape == (nx, nx) and np.isfinite(Q).all()
+    rounding = ROUNDING * np.abs(Q).max(initial=0.0)
+    if not sound or np.abs(Q - Q.T).max() > rounding or np.linalg.eigvalsh(Q)[0] < -rounding:
         raise ValueError(f"Q must be a symmetric, positive semidefinite matrix of shape {(nx, nx)}, got {shown(Q)}")
-    return Q
+    return (Q + Q.T) / 2
 
 
 def _errors_by_age(

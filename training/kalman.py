@@ -11,7 +11,6 @@ from observers import unscented
 from observers.unscented import Gaussian
 from training.trajectories.derivatives import evaluate, jacobian, with_sensitivity
 
-UNSEEN = 1e12  # variance of an output that is missing, in multiples of the largest of those measured
 NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in multiples of the system's default
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
@@ -196,14 +195,6 @@ class KalmanFilter(ABC):
         inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
         return inside
 
-    def _innovation(self, y: np.ndarray, expected: np.ndarray) -> Gaussian:
-        """Samples less what was expected, (n, ny), and R; where one is missing 0, and a huge variance."""
-        missing = np.isnan(y)
-        if not missing.any():
-            return y - expected, self._R
-        unseen = UNSEEN * self._R.max() * np.eye(y.shape[1])
-        return np.where(missing, 0.0, y - expected), self._R + missing[:, None, :] * unseen
-
     @abstractmethod
     def _predicted(self, u: np.ndarray) -> Gaussian:
         """Mean and covariance one sample later under held inputs, (nu, n)."""
@@ -248,8 +239,11 @@ class ExtendedKalmanFilter(KalmanFilter):
         if not inside.all():
             x, P = x.copy(), P.copy()
             x[~inside], P[~inside] = self._start
-        H = evaluate(self._outputs, x)
-        innovation, R = self._innovation(y, self._system.output(x))
+        H, R, missing = evaluate(self._outputs, x), self._R, np.isnan(y)
+        innovation = y - self._system.output(x)
+        if missing.any():
+            innovation, H = np.where(missing, 0.0, innovation), np.where(missing[..., None], 0.0, H)
+            R = np.where(missing[:, None, :] | missing[..., None], np.eye(len(R)), R)  # apart from those measured
         S = H @ P @ H.mT + R
         K = np.linalg.solve(S, H @ P).mT
         x = x + (K @ innovation[..., None])[..., 0]

@@ -372,7 +372,8 @@ class KKLVectorObservation(VectorEstimate):
                 known_start=known_start,
                 uncertainty=uncertainty,
             )
-            if estimator.observer.artifact.process_noise_max is not None:
+            told = estimator.observer.artifact
+            if told.process_noise_max is not None or told.flow is not None:
                 plant_of(env, "process_noise")
         super().__init__(env, estimator)
         self._estimator: KKLEstimator = estimator

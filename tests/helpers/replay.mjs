@@ -10,8 +10,7 @@ const observer = new Observer(bytes.buffer.slice(bytes.byteOffset, bytes.byteOff
 if (noise) observer.tell(...noise);
 const found = { x_hat: [], score: [], covariance: [] };
 for (let k = 0; k < y.length; k++) {
-  const sample = y[k] && y[k].map((value) => value ?? NaN);
-  found.x_hat.push(k ? observer.step(sample, u[k - 1]) : observer.reset(sample));
+  found.x_hat.push(k ? observer.step(y[k], u[k - 1]) : observer.reset(y[k])); // null is missing, as NaN is
   found.score.push(observer.score);
   found.covariance.push(observer.covariance);
 }

@@ -125,7 +125,8 @@ def test_rows_are_lost_found_and_taken_as_numpy_does_it(monkeypatch):
         np.testing.assert_allclose(
             tracker._state[:, tracker._end :], beside._state[:, tracker._end :], rtol=1e-4, atol=1e-4
         )
-        said = tracker._scaled(*tracker._said(one._z, np.full(ROWS, float(k))))[1]
+        learned = np.minimum(tracker._seen, tracker._window)
+        said = tracker._scaled(*tracker._said(one._z, one._age.astype(float), learned))[1]
         same = np.isclose(tracker._P, said, rtol=1e-3).all((1, 2))
         seen += same[rows].sum(), (tracker._mean_square[rows] == 1.0).sum(), (~same[rows]).sum()
     assert (seen > 100).all()
@@ -189,7 +190,7 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
         P, y, before = (
             root @ root.mT / 9 + 1e-6 * np.eye(nx),
             rng.normal(size=(n, ny)),
-            rng.uniform(0.5, 2.0, (n, 2 + ny)),
+            rng.uniform(0.5, 2.0, (n, 3 + ny)),
         )
         y[::3, 0], y[::4] = np.nan, np.nan
         none = np.arange(n) % 10 == 5  # is a covariance there
@@ -214,7 +215,7 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
             np.testing.assert_allclose(machine.advance(state, u, y, None)[1], seen, rtol=1e-5, atol=1e-5)
         there = ~np.isnan(y)
         counted = there.mean(-1)
-        trend = np.where(there, before[:, 2:] + 0.4 * (white - before[:, 2:]), before[:, 2:])
+        trend = np.where(there, before[:, 3:] + 0.4 * (white - before[:, 3:]), before[:, 3:])
         raised = 4.0 * (trend**2 * there).sum(-1) / np.maximum(there.sum(-1), 1)
         trend_square = before[:, 1] + 0.2 * counted * (raised - before[:, 1])
         agree = (trend_square > 1.4) & there.any(-1)
@@ -224,13 +225,13 @@ def test_steps_of_other_sizes(nx, nu, ny, thin):
             P_next * np.where(agree, INFLATION, 1.0)[:, None, None],
             before[:, 0] + 0.1 * counted * ((white**2).sum(-1) / np.maximum(there.sum(-1), 1) - before[:, 0]),
             np.where(agree, 1.0, trend_square),
+            before[:, 2] + there.any(-1),
             np.where(agree[:, None], 0.0, trend),
         ]
         end = nx + nx**2
-        parts = state[:, :nx], state[:, nx:end].reshape(P.shape), state[:, end], state[:, end + 1], state[:, end + 2 :]
-        for one, other, start in zip(
-            parts, wanted, (x, P, np.full(n, np.inf), *before.T[1:2], before[:, 2:]), strict=True
-        ):
+        parts = state[:, :nx], state[:, nx:end].reshape(P.shape), *state.T[end : end + 3], state[:, end + 3 :]
+        begun = x, P, np.full(n, np.inf), *before.T[1:3], before[:, 3:]
+        for one, other, start in zip(parts, wanted, begun, strict=True):
             other[none] = start[none]
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 

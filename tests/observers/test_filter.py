@@ -205,3 +205,12 @@ def test_wrong_numbers_of_inputs_raise(nu):
 def test_repeated_poles_are_allowed_where_diagonal():
     linear = LinearFilter(-np.eye(2), np.ones((2, 1)), DT)
     assert np.allclose(linear.transition, np.exp(-DT) * np.eye(2))
+
+
+def test_a_filter_keeps_what_it_was_made_of():
+    A, B = np.diag([-1.0, -2.0]), np.ones((2, 1))
+    linear = LinearFilter(A, B, dt=0.1)
+    A[0, 0] = 5.0
+    assert linear.A[0, 0] == -1.0
+    with pytest.raises(ValueError, match="read-only"):
+        linear.B[0] = 2.0

@@ -211,3 +211,18 @@ def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
         observer.reset(y[0], start)
         scores.append(np.median(observer.mismatch))
     assert scores[1] > 5 * scores[0]
+
+
+def test_a_known_start_may_be_any_array_of_numbers():
+    """Of a tracker, which begins there, too."""
+    torch = pytest.importorskip("torch")
+    observer = observers.load("van_der_pol-small")
+    expected = observer.reset([1.0], np.array([1.0, 0.5]))
+    for x0 in (torch.tensor([1.0, 0.5]), np.ma.array([1.0, 0.5]), [1, 0.5]):
+        found = observer.reset([1.0], x0)
+        assert type(found) is np.ndarray
+        np.testing.assert_array_equal(found, expected)
+        assert type(observer.step([1.0])) is np.ndarray
+        with pytest.raises(ValueError, match="x0"):
+            observer.reset([2.0], np.array([1.0, np.nan]))
+        assert observer.z.shape == (len(observer.z),)

@@ -96,3 +96,22 @@ def test_a_few_false_samples_are_forgotten(name):
         y[500:505] = false * outputs.std() / 2
         apart = (observer.estimate(y) - x)[-200:] / system.scale
         assert np.sum(np.sqrt((apart**2).mean((0, 2))) > 0.5) <= 1, "13 s later"  # one may just be at a turn
+
+
+@pytest.mark.parametrize(("name", "rms"), [("lorenz", 0.03), ("van_der_pol", 0.1)])
+def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_was_there_allows(name, rms):
+    """Of the states' scale, after 3 s of one sample in ten; and error bars hold at all ages."""
+    n, level, system, rng = 200, 0.5, get_system(name), np.random.default_rng(3)
+    x = simulate(system, rng.uniform(*system.box(), (n, system.nx)), 300, 0.01)
+    y = system.output(x) + level * rng.standard_normal((301, n, 1))
+    for first, every in ((30, 1), (10, 10)):
+        observer = observers.load(name, measurement_noise=level, process_noise=0.0)
+        observer.reset(y[0])
+        for k in range(1, 301):
+            seen = k >= first and k % every == 0
+            x_hat = observer.step(y[k] if seen else None)
+            if k in (29, 80, 300):
+                error = x[k] - x_hat
+                squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(observer.covariance), error)
+                assert np.mean(squared < {2: 4.605, 3: 6.251}[system.nx]) > 0.7
+    assert np.sqrt(np.mean((error / system.scale) ** 2)) < rms

@@ -156,6 +156,14 @@ def test_a_map_that_nobody_trained_does_no_harm():
     assert (ours.restarts == 0).all()
 
 
+def test_an_intensity_may_miss_symmetry_and_zero_by_rounding():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        F, B = rng.normal(size=(2, 2)), rng.normal(size=(2, 1))
+        guided(Q=F @ np.diag([0.1, 0.2]) @ F.T)
+        guided(Q=B @ B.T)
+
+
 def test_outputs_beyond_all_bounds_do_not_spoil_what_comes_after():
     x, y = measured()
     y[50:54, 0] = 1e3

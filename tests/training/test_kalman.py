@@ -208,3 +208,11 @@ def test_missing_outputs_correct_nothing(filters):
     np.testing.assert_allclose(both.x, x @ Phi.T, rtol=1e-8)
     np.testing.assert_allclose(both.P, Phi @ P @ Phi.T + Q * dt, rtol=1e-7)
     assert (both.nis == 0).all()
+
+
+def test_a_first_output_that_is_missing_says_nothing_however_little_noise_there_is(filters):
+    start = np.array([0.2, -0.1]), np.diag([1e8, 1e8])
+    both = filters(TwoOutputs(), 0.02, Q=np.eye(2), R=1e-6 * np.eye(2), start=start)
+    both.reset(np.array([[np.nan, 0.3]]))
+    np.testing.assert_allclose(both.P[0, 0, 0], 1e8, rtol=1e-6)
+    np.testing.assert_allclose(both.P[0, 1, 1], 1e-6, rtol=0.1)

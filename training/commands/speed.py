@@ -294,7 +294,7 @@ def _parts(env: gym.vector.VectorEnv, info: Mapping[str, Any], step: float) -> d
         system, x = base.plant.system, info["x"].T.copy()
         u, w, advance = np.zeros((system.nu, x.shape[1])), np.zeros_like(x), batch_step(system)
         shares["simulation"] = _share(lambda: advance(x, u, w, base.plant.dt), step)
-    if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x":
+    if isinstance(env, kkl_gym.KKLVectorObservation) and env.estimate == "x" and env.observer.artifact.flow is None:
         shares["network"] = _share(lambda: _decoded(env.observer, error_bars="x_cov" in info), step)
     return shares
 

@@ -4,6 +4,7 @@ FIELDS = """\
     double x[{nx}], P[{nx}][{nx}]; /* the estimate and its covariance, in scaled states */
     double mean_square; /* of the innovations; beyond its limit the estimate is lost */
     double trend[{ny}], trend_square; /* their running mean, and its mean square; beyond its limit P is inflated */
+    unsigned long seen; /* samples of which anything was there, as far as that matters */
 """
 
 INTERPOLATED = """
@@ -195,6 +196,8 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
         observer->trend_square += {trend_square_share} * counted * (raised - observer->trend_square);
         for (size_t k = 0; k < {ny}; k++)
             observer->trend[k] = trend[k];
+        if (observer->seen < {window}ul)
+            observer->seen++;
     }}
     if (seen && observer->trend_square > {trend_limit}) {{ /* innovations agree with one another */
         for (size_t i = 0; i < {nx}; i++)
@@ -210,10 +213,10 @@ static void supervise({NAME}_observer *observer)
     int lost = !(observer->mean_square <= {limit}); /* also where it is no number */
     double P[{nx}][{nx}], ours = 0.0, theirs = 0.0;
     real x_hat[{nx}];
-    if (!lost && observer->age >= {window}ul)
+    if (!lost && observer->seen >= {window}ul)
         return;
     /* what came before it was lost may have misled z: T_inv is no surer than so soon after a reset */
-    covariance(observer, observer->age < {window}ul ? observer->age : {window}ul, P);
+    covariance(observer, observer->seen, P);
     for (size_t i = 0; i < {nx}; i++) {{
         ours += observer->P[i][i];
         theirs += P[i][i];
@@ -256,6 +259,7 @@ ESTIMATE_TRACKED = """
 
 BEGIN = """\
     observer->mean_square = INFINITY; /* lost as yet */
+    observer->seen = 0;
     supervise(observer);
 """
 

@@ -196,6 +196,7 @@ class Tracker {
   /** Begin with what a map says of z, at an age in samples. */
   begin(map, z, age) {
     this.meanSquare = Infinity; // lost as yet
+    this.seen = 0; // samples of which anything was there
     this.trend = new Array(this.ny).fill(0);
     this.supervise(map, z, age);
   }
@@ -276,6 +277,7 @@ class Tracker {
     [this.x, this.P] = [this.#within(x), P];
     if (!seen) return whole;
     const counted = seen / this.ny;
+    this.seen++;
     this.trend = trend;
     this.meanSquare += this.share * counted * (squared / seen - this.meanSquare);
     this.trendSquare += this.trend_square_share * counted * ((this.trend_gain * raised) / seen - this.trendSquare);
@@ -289,9 +291,9 @@ class Tracker {
   /** Let a map say where to begin, of z at an age in samples: soon after a reset where it is surer, and where all is lost. */
   supervise(map, z, age) {
     const lost = !(this.meanSquare <= this.limit); // also where it is no number
-    if (!lost && age >= this.window) return;
+    if (!lost && this.seen >= this.window) return;
     // What came before it was lost may have misled z: the map is no surer than so soon after a reset.
-    const P = scaled(map.covariance(z, Math.min(age, this.window) * this.dt), this.x_scale, -1);
+    const P = scaled(map.covariance(z, Math.min(this.seen, this.window) * this.dt), this.x_scale, -1);
     const trace = (matrix) => matrix.reduce((sum, row, i) => sum + row[i], 0);
     if (!lost && !(trace(P) < trace(this.P))) return;
     this.x = this.#within(map.mean(z, age * this.dt).map((value, i) => (value - this.x_offset[i]) / this.x_scale[i]));
@@ -304,8 +306,8 @@ class Tracker {
     const { ages, logs, doubts } = this.calibrated[Number(free)];
     const factor = Math.exp(interpolate(age * this.dt, ages, logs)), doubt = interpolate(age * this.dt, ages, doubts);
     const P = scaled(this.P, this.x_scale, 1);
-    if (age >= this.window) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
-    const said = map.covariance(z, age * this.dt), estimate = this.estimate;
+    if (this.seen >= this.window) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
+    const said = map.covariance(z, this.seen * this.dt), estimate = this.estimate;
     const apart = map.mean(z, age * this.dt).map((value, i) => value - estimate[i]);
     return P.map((row, i) => row.map((value, j) => factor * (value + doubt * (said[i][j] + apart[i] * apart[j] - value))));
   }
@@ -374,11 +376,14 @@ export class Observer {
     this.driven = new InverseMap(tensors, "driven.", driven);
     this.free = free && new InverseMap(tensors, "free.", free);
     this.tracker = this.described.flow ? new Tracker(tensors, { ...this.described.flow, dt: this.dt }, this.C) : null;
-    this.tell(this.described.measurement_noise, this.described.process_noise);
+    const { measurement_noise: measurement = 0, process_noise: process = 0 } = this.described;
+    this.levels = { measurement, process };
+    this.tell();
   }
 
   /** The levels of noise that are assumed: of all outputs or each, and of the state. The monitor begins anew. */
-  tell(measurementNoise = 0, processNoise = 0) {
+  tell(measurementNoise = this.levels.measurement, processNoise = this.levels.process) {
+    this.levels = { measurement: measurementNoise, process: processNoise };
     const ends = this.driven.measurement_noise_max ?? Infinity;
     const each = Array.from({ length: this.ny }, (_, i) => {
       const [level, end] = [measurementNoise, ends].map((values) => (Array.isArray(values) ? values[i] ?? values[0] : values));
@@ -409,7 +414,7 @@ export class Observer {
    * Outputs that are missing, NaN among several, are predicted, which needs a map with a linear output.
    */
   step(y, u = new Array(this.nu).fill(0)) {
-    const missing = this.y.map((_, i) => y === null || Number.isNaN(y[i]));
+    const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
     let now = y;
     if (this.tracker) {
       now = this.tracker.advance(missing.map((gap, i) => (gap ? NaN : y[i])), u, this.y);

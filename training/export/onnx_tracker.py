@@ -1,8 +1,8 @@
 """A tracking observer's own part as nodes of an ONNX graph: :mod:`observers.tracker` for outputs C x.
 
 A row of the tracker's state holds the estimate and its covariance, both of scaled states, the mean squares of the
-innovations and of their trend, that trend, and the last sample, in which what was missing is replaced by what was
-predicted. All are doubles.
+innovations and of their trend, the number of samples of which anything was there, that trend, and the last sample, in
+which what was missing is replaced by what was predicted. All are doubles.
 """
 
 import itertools
@@ -17,12 +17,13 @@ from observers.supervision import INFLATION, Supervision
 from training.export.onnx_map import Maps
 from training.export.onnx_nodes import Graph
 
-Parts = tuple[str, str, str, str, str]  # estimate, covariance (n, nx, nx), mean squares (n, 1), and trend (n, ny)
+# Estimate, covariance (n, nx, nx), mean squares (n, 1), number of samples (n, 1), and trend (n, ny).
+Parts = tuple[str, str, str, str, str, str]
 
 
 def state_width(artifact: Artifact) -> int:
     """Numbers in a row of the state."""
-    return artifact.nx + artifact.nx**2 + 2 + 2 * artifact.ny
+    return artifact.nx + artifact.nx**2 + 3 + 2 * artifact.ny
 
 
 class TrackerNodes:
@@ -48,12 +49,12 @@ class TrackerNodes:
         self._low, self._high = flow.scaled_bounds
         self._watch = Supervision.of(flow, artifact.filter.dt)
         nx, ny = artifact.nx, artifact.ny
-        ends = np.cumsum([0, nx, nx * nx, 1, 1, ny, ny])
-        x, P, mean_square, trend_square, trend, y = (
+        ends = np.cumsum([0, nx, nx * nx, 1, 1, 1, ny, ny])
+        x, P, mean_square, trend_square, count, trend, y = (
             graph("Gather", given["tracker"], graph.constant(np.arange(a, b), np.int64), axis=1)
             for a, b in itertools.pairwise(ends)
         )
-        self._before: Parts = (x, self._matrix(P), mean_square, trend_square, trend)
+        self._before: Parts = (x, self._matrix(P), mean_square, trend_square, count, trend)
         self.y = y  # the last sample, (n, ny)
 
     def taken(self) -> tuple[Parts, str]:
@@ -87,15 +88,16 @@ class TrackerNodes:
     def supervised(self, tracked: Parts, maps: Maps, begins: str) -> Parts:
         """Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost."""
         graph, flow, age = self._graph, self._flow, self._given["age"]
-        x, P, mean_square, trend_square, trend = tracked
+        x, P, mean_square, trend_square, count, trend = tracked
         mean_square = graph("Where", begins, graph.constant([math.inf]), mean_square)
+        count = graph("Where", begins, graph.constant([0.0]), count)
         lost = graph("Not", graph("LessOrEqual", mean_square, graph.constant([self._watch.limit])))
         window = graph.constant([float(self._watch.window)])
-        theirs = graph.joined(*maps.covariance(graph("Min", age, window), flow.x_scale))
+        theirs = graph.joined(*maps.covariance(graph("Min", count, window), flow.x_scale))
         ours, nx = self._flat(P, flow.nx**2), flow.nx
         diagonal = graph.constant(np.eye(nx).reshape(-1, 1))
         surer = graph("Less", graph("MatMul", theirs, diagonal), graph("MatMul", ours, diagonal))
-        takes = graph("Or", lost, graph("And", graph("Less", age, window), surer))
+        takes = graph("Or", lost, graph("And", graph("Less", count, window), surer))
         said = graph("Sub", maps.estimate(age), graph.constant(flow.x_offset))
         said = graph.within(graph("Div", said, graph.constant(flow.x_scale)), self._low, self._high)
         return (
@@ -103,6 +105,7 @@ class TrackerNodes:
             self._matrix(graph("Where", takes, theirs, ours)),
             graph("Where", lost, graph.constant([1.0]), mean_square),
             graph("Where", lost, graph.constant([1.0]), trend_square),
+            count,
             graph("Where", lost, graph.constant([0.0]), trend),
         )
 
@@ -192,7 +195,7 @@ class TrackerNodes:
         is 1. They are watched as :mod:`observers.supervision` has it.
         """
         graph, nx, watch, one = self._graph, self._flow.nx, self._watch, self._graph.constant([1.0])
-        x_before, P_before, mean_square, trend_square, trend = self._before
+        x_before, P_before, mean_square, trend_square, count, trend = self._before
         numbers = graph.joined(x, self._flat(P, nx * nx), *root)
         total = graph("ReduceSum", numbers, graph.constant([1], np.int64), keepdims=1)
         sound = self._finite(total)
@@ -212,6 +215,7 @@ class TrackerNodes:
             self._matrix(graph("Where", sound, inflated, self._flat(P_before, nx * nx))),
             graph("Where", sound, mean_square, graph.constant([math.inf])),
             graph("Where", sound, graph("Where", agree, one, trend_square_next), trend_square),
+            graph("Where", sound, graph("Add", count, graph.cast(any_seen, np.float64)), count),
             graph("Where", sound, graph("Where", agree, graph.constant([0.0]), trend_next), trend),
         )
 
