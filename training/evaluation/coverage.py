@@ -87,7 +87,7 @@ def coverage(
     def estimates() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for rows in _chunks(y.shape[1]):
             u = trajectories.u[:, rows] if artifact.nu else None
-            yield observer.estimate(y[:, rows], u), observer.estimate_covariance(y[:, rows], u)
+            yield _followed(observer, y[:, rows], u)
 
     return _judged(trajectories.x, estimates(), spans)
 
@@ -146,6 +146,17 @@ def kalman_coverage(
 
 def _chunks(n: int) -> list[slice]:
     return [slice(first, first + CHUNK) for first in range(0, n, CHUNK)]
+
+
+def _followed(observer: KKLObserver, y: np.ndarray, u: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates and covariances along records."""
+    if observer.artifact.flow is None:  # then whole records are quicker than their steps
+        return observer.estimate(y, u), observer.estimate_covariance(y, u)
+    x_hat, covariance = [observer.reset(y[0])], [observer.covariance]
+    for k in range(1, len(y)):
+        x_hat.append(observer.step(y[k], None if u is None else u[k - 1]))
+        covariance.append(observer.covariance)
+    return np.array(x_hat), np.array(covariance)
 
 
 def _judged(
