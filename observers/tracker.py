@@ -367,7 +367,7 @@ class Tracker:
             one = not self._state.item(self._end) <= self._supervision.limit  # lost where it is NaN too
             seen = self._state.item(self._end + 2)
             if (one or seen < self._window) and (rows is None or rows):
-                said = self._said_of_one(z, float(age), min(seen, self._window))
+                said = self._said_of_one(z, float(age), min(seen, self._window), one)
                 self._take(said, _FLAGS[one], _FIRST)
                 self._heard = z, _FLAGS[True], said
             return
@@ -386,7 +386,7 @@ class Tracker:
         flat = z.reshape(-1, z.shape[-1])
         if len(where) < len(flat):
             flat, age, lost, seen = flat[where], age[where], lost[where], seen[where]
-        said = self._said(flat, age, np.minimum(seen, self._window))
+        said = self._said(flat, age, np.minimum(seen, self._window), lost)
         self._take(said, lost, where)
         self._heard = z, asked, said
 
@@ -406,24 +406,24 @@ class Tracker:
             self._mean_square[where[lost]] = self._trend_square[where[lost]] = 1.0
             self._trend[where[lost]] = 0.0
 
-    def _said(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray) -> Gaussian:
+    def _said(self, z: np.ndarray, age: np.ndarray, learned: np.ndarray, lost: np.ndarray | None = None) -> Gaussian:
         """What T_inv says of z, (k, size), at ages in samples: estimates, and covariances, in units of the states.
 
-        It is as sure of them as z had learned of so many samples, (k,), and forgotten its start for as long.
+        It is as sure of them as of z that had learned of so many samples, (k,), and forgotten its start for as long.
+        Of lost rows that is always asked by itself, on which the last digits of published results rest.
         """
         parts, x = self._decoders.estimate(z, age * self._dt)
-        less = learned < age
-        if less.all():
-            return x, self._decoders.covariances(z, learned * self._dt)
         P = self._decoders.covariance(parts)
+        less = learned < age if lost is None else lost | (learned < age)
         if less.any():
             P[less] = self._decoders.covariances(z[less], learned[less] * self._dt)
         return x, P
 
-    def _said_of_one(self, z: np.ndarray, age: float, learned: float) -> Gaussian:
+    def _said_of_one(self, z: np.ndarray, age: float, learned: float, lost: bool = False) -> Gaussian:
         """The same of a single sample, (size,); still with an axis of rows."""
-        parts, x = self._decoders.estimate(z, age * self._dt, both=learned == age)
-        if learned < age:
+        less = lost or learned < age
+        parts, x = self._decoders.estimate(z, age * self._dt, both=not less)
+        if less:
             return x[None], self._decoders.covariances(z, learned * self._dt)[None]
         return x[None], self._decoders.covariance(parts)[None]
 
