@@ -178,7 +178,9 @@ class KKLObserver:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        if self._compiled and available() and (self._z is None or self._z.ndim == 1):
+        if not available():
+            self._compiled, self._compile = False, None if self._compile else self._compile
+        elif self._compiled and (self._z is None or self._z.ndim == 1):
             self._warm_up()  # in another process there is no machine code yet
 
     def _warm_up(self) -> None:
@@ -447,7 +449,7 @@ class KKLObserver:
             self._age = self._age + rows
         self._x_hat, self._parts = None, None
         if tracker is not None:
-            tracker.supervise(self._z, self._age, rows)
+            tracker.supervise(self._z, self._age, rows, True if gaps is None else ~gaps.all(-1))
         if self._monitor is not None and not missing:
             self._x_hat = self.decode()
             seen = None if rows is None else rows[..., None]

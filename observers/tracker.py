@@ -34,6 +34,11 @@ class _Calibrated:
         """Factors and doubts, (n,)."""
         return np.exp(2 * np.interp(age, self._ages, self._logs)), np.interp(age, self._ages, self._doubts)
 
+    def within(self, seen: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The larger ones of those after so many samples and at that age, between which some were missing."""
+        (factor, doubt), (factor_at, doubt_at) = self.at(seen), self.at(age)
+        return np.maximum(factor, factor_at), np.maximum(doubt, doubt_at)
+
     def scales(self, factor: np.ndarray, doubt: np.ndarray) -> np.ndarray:
         """What is multiplied with covariances (n, nx, nx) where T_inv is not asked, entry by entry."""
         weights = np.column_stack([factor, factor * (1.0 - doubt)])
@@ -64,7 +69,8 @@ class Tracker:
     surer than so soon after a reset as the window is long.
 
     Windows are of samples that were there. While they are missing z forgets its start as it does else, which the
-    estimate of T_inv has to be told, but learns nothing, so that T_inv is no surer than after those that were there.
+    estimate of T_inv has to be told, but learns nothing: T_inv is then not asked, and later no surer than after those
+    that were there.
 
     An estimate that is off by less than the noise is not lost, and may be off by many times what the filter believes.
     Its innovations then agree with one another. Where the mean square of their running mean is beyond chance, the
@@ -182,7 +188,7 @@ class Tracker:
                 return single
             heard = self._heard
             said = heard[2] if heard is not None and heard[0] is z else self._said_of_one(z, float(age), seen)
-            return self._soon(said, *calibrated.at(np.array([age])))[0]
+            return self._soon(said, *calibrated.within(np.array([seen]), np.array([age])))[0]
         heard, n, nx = self._heard, len(self._state), self._flow.nx
         heard = heard if heard is not None and heard[0] is z else None
         z = z.reshape(n, z.shape[-1])
@@ -196,14 +202,21 @@ class Tracker:
                 said = x[soon[asked]], covariance[soon[asked]]
             else:
                 said = self._said(z[soon], ages, self._seen[soon])
-            P[soon] = self._soon(said, *self._factors(ages, acted[soon]), soon)
+            P[soon] = self._soon(said, *self._factors(ages, acted[soon], self._seen[soon]), soon)
         return P.reshape(*self._batch, nx, nx)
 
-    def _factors(self, age: np.ndarray, acted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Factors and doubts, (n,), at ages in samples; of rows on which an input has acted, and of others."""
-        factor, doubt = self._calibrated.at(age)
+    def _factors(
+        self, age: np.ndarray, acted: np.ndarray, seen: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Factors and doubts, (n,), at ages in samples; of rows on which an input has acted, and of others.
+
+        Within the window they are those after so many samples, too.
+        """
+        found = self._calibrated.at(age) if seen is None else self._calibrated.within(seen, age)
+        factor, doubt = found
         if not acted.all():
-            factor[~acted], doubt[~acted] = self._free_calibrated.at(age[~acted])
+            free, age = self._free_calibrated, age[~acted]
+            factor[~acted], doubt[~acted] = free.at(age) if seen is None else free.within(seen[~acted], age)
         return factor, doubt
 
     def _scales(self, age: np.ndarray, acted: np.ndarray) -> np.ndarray:
@@ -360,20 +373,29 @@ class Tracker:
             P = P + (flow.bend * moved[:, None])[:, :, None] ** 2 * np.eye(flow.nx)
         return x, P
 
-    def supervise(self, z: np.ndarray, age: np.ndarray | float, rows: np.ndarray | None = None) -> None:
-        """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,)."""
+    def supervise(
+        self,
+        z: np.ndarray,
+        age: np.ndarray | float,
+        rows: np.ndarray | None = None,
+        seen: np.ndarray | np.bool_ | bool = True,
+    ) -> None:
+        """Let T_inv say where it is to, of z, (..., size), at ages in samples, in all rows or some (...,).
+
+        ``seen`` is where anything of the last sample was there, in all rows or (...,).
+        """
         self._heard = None
         if not self._batch:  # a single sample: every call of numpy would be felt
             one = not self._state.item(self._end) <= self._supervision.limit  # lost where it is NaN too
-            seen = self._state.item(self._end + 2)
-            if (one or seen < self._window) and (rows is None or rows):
-                said = self._said_of_one(z, float(age), min(seen, self._window), one)
+            count = self._state.item(self._end + 2)
+            if (one or (seen and count < self._window)) and (rows is None or rows):
+                said = self._said_of_one(z, float(age), min(count, self._window), one)
                 self._take(said, _FLAGS[one], _FIRST)
                 self._heard = z, _FLAGS[True], said
             return
         lost = ~(self._mean_square <= self._supervision.limit)
-        seen = self._seen
-        asked = seen < self._window
+        count = self._seen
+        asked = count < self._window if seen is True else (count < self._window) & np.ravel(seen)
         if not asked.any() and not lost.any():  # most often
             return
         age = np.broadcast_to(age, self._batch).ravel()
@@ -385,8 +407,8 @@ class Tracker:
             return
         flat = z.reshape(-1, z.shape[-1])
         if len(where) < len(flat):
-            flat, age, lost, seen = flat[where], age[where], lost[where], seen[where]
-        said = self._said(flat, age, np.minimum(seen, self._window), lost)
+            flat, age, lost, count = flat[where], age[where], lost[where], count[where]
+        said = self._said(flat, age, np.minimum(count, self._window), lost)
         self._take(said, lost, where)
         self._heard = z, asked, said
 
@@ -413,8 +435,10 @@ class Tracker:
         Of lost rows that is always asked by itself, on which the last digits of published results rest.
         """
         parts, x = self._decoders.estimate(z, age * self._dt)
-        P = self._decoders.covariance(parts)
         less = learned < age if lost is None else lost | (learned < age)
+        if less.all():
+            return x, self._decoders.covariances(z, learned * self._dt)
+        P = self._decoders.covariance(parts)
         if less.any():
             P[less] = self._decoders.covariances(z[less], learned[less] * self._dt)
         return x, P
@@ -439,9 +463,12 @@ class Tracker:
 
     def _output(self, s: np.ndarray) -> np.ndarray:
         y = self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
-        if not np.isfinite(y).all():  # h may be undefined beyond the motion, where sigma points may be
-            within = self._artifact.output(self._flow.x_offset + self._flow.x_scale * self._within(s))
-            y = np.where(np.isfinite(y), y, within)
+        if (
+            not np.isfinite(y).all() and s.ndim == 3
+        ):  # beyond the motion, where sigma points may be, h need not be defined
+            for nearer in (self._within(s), s.mean(0, keepdims=True)):
+                there = self._artifact.output(self._flow.x_offset + self._flow.x_scale * nearer)
+                y = np.where(np.isfinite(y), y, there)
         return y
 
     def _scaled(self, x: np.ndarray, P: np.ndarray) -> Gaussian:

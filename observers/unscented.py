@@ -5,7 +5,6 @@ where it has a weight (Wan and van der Merwe, 2000, with alpha = 1). They are dr
 linear.
 """
 
-import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -199,9 +198,10 @@ def factor(P: np.ndarray) -> np.ndarray:
         found: np.ndarray = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:  # which says that there is one, not which
         found = np.full_like(P, np.nan)
-        for i in np.flatnonzero(np.isfinite(P).all((1, 2))):
-            with contextlib.suppress(np.linalg.LinAlgError):
-                found[i] = np.linalg.cholesky(P[i])
+        rows = np.flatnonzero(np.isfinite(P).all((1, 2)))
+        if len(P) > 1:
+            for half in np.array_split(rows, 2):
+                found[half] = factor(P[half])
     return found
 
 

@@ -98,7 +98,7 @@ def test_a_few_false_samples_are_forgotten(name):
         assert np.sum(np.sqrt((apart**2).mean((0, 2))) > 0.5) <= 1, "13 s later"  # one may just be at a turn
 
 
-@pytest.mark.parametrize(("name", "rms"), [("lorenz", 0.03), ("van_der_pol", 0.1)])
+@pytest.mark.parametrize(("name", "rms"), [("lorenz", 0.02), ("van_der_pol", 0.1)])
 def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_was_there_allows(name, rms):
     """Of the states' scale, after 3 s of one sample in ten; and error bars hold at all ages."""
     n, level, system, rng = 200, 0.5, get_system(name), np.random.default_rng(3)
@@ -110,7 +110,7 @@ def test_where_samples_are_missing_from_the_start_t_inv_is_no_surer_than_what_wa
         for k in range(1, 301):
             seen = k >= first and k % every == 0
             x_hat = observer.step(y[k] if seen else None)
-            if k in (29, 80, 300):
+            if k in (29, 80, 100, 300):
                 error = x[k] - x_hat
                 squared = np.einsum("ni,nij,nj->n", error, np.linalg.inv(observer.covariance), error)
                 assert np.mean(squared < {2: 4.605, 3: 6.251}[system.nx]) > 0.7

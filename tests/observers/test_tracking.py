@@ -13,6 +13,7 @@ from safetensors import safe_open
 from scipy.linalg import solve_discrete_are
 from tracking import DT, PROCESS, STD, KalmanFilter, exact_flow, exact_motion, plain_observer, tracking_observer
 
+import observers.observer as observer_module
 from observers import MLP, Artifact, ArtifactError, Expression, Factors, KKLObserver, LinearFilter, load, unscented
 
 LEVEL = 0.2
@@ -462,6 +463,29 @@ def test_covariances_that_are_none_have_no_factor():
     found = unscented.factor(P)
     np.testing.assert_allclose(found[[0, 3]], [np.eye(2), 2.0 * np.eye(2)])
     assert np.isnan(found[[1, 2]]).all()
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_where_nothing_was_there_t_inv_is_not_asked(batch, monkeypatch):
+    observer = KKLObserver(tracking_observer(), LEVEL)
+    observer.reset(np.zeros((*batch, 1)))
+
+    def estimate(*_, **__):
+        raise AssertionError("T_inv is asked")
+
+    monkeypatch.setattr(type(observer._tracker._decoders), "estimate", estimate)
+    for _ in range(3):
+        observer.step(None)
+    with pytest.raises(AssertionError, match="asked"):
+        observer.step(np.zeros((*batch, 1)))
+
+
+def test_without_numba_an_observer_that_was_compiled_goes_on(monkeypatch):
+    kept = pickle.dumps(load("lorenz-small", compiled=True))
+    monkeypatch.setattr(observer_module, "available", lambda: False)
+    observer, y = pickle.loads(kept), np.ones((4, 1))
+    found = np.array([observer.reset(y[0]), *(observer.step(sample) for sample in y[1:])])
+    np.testing.assert_allclose(observer.estimate(y), found, rtol=1e-4, atol=1e-4)
 
 
 def test_whether_a_covariance_has_a_factor_no_other_decides():

@@ -156,7 +156,7 @@ def _source(exported: Exported, words: dict[str, Any]) -> str:
             take="" if flow is None else c_tracker_templates.TAKE.format(**words),
             inputs=c_templates.INPUTS.format(**words) if linear.nu else "",
             age_next=f"    if (observer->age < {last}ul)\n        observer->age++;\n" if last else "",
-            supervise="" if flow is None else "    supervise(observer);\n",
+            supervise="" if flow is None else "    supervise(observer, told);\n",
         )
     )
     return "".join(parts)

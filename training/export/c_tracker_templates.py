@@ -137,8 +137,9 @@ static void without_trend({NAME}_observer *observer)
         observer->trend[k] = 0.0;
 }}
 
-/* Predict, and take in a sample, one output after another. What is missing is replaced by what was predicted. */
-static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{ny}])
+/* Predict, and take in a sample, one output after another. What is missing is replaced by what was predicted. Returns
+   whether anything was there. */
+static int track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{ny}])
 {{
     double x[{nx}], P[{nx}][{nx}], trend[{ny}], across[{nx}], squared = 0.0, raised = 0.0, total = 0.0;
     size_t seen = 0;
@@ -182,7 +183,7 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
     }}
     if (!isfinite(total)) {{
         observer->mean_square = INFINITY; /* lost */
-        return;
+        return 0;
     }}
     for (size_t i = 0; i < {nx}; i++) {{
         observer->x[i] = within(x[i], i);
@@ -205,15 +206,16 @@ static void track({NAME}_observer *observer, const real y[{ny}]{u}, real whole[{
                 observer->P[i][j] *= {inflation};
         without_trend(observer);
     }}
+    return seen > 0;
 }}
 
 /* Let T_inv say where to begin, soon after a reset where it is surer, and where the estimate is lost. */
-static void supervise({NAME}_observer *observer)
+static void supervise({NAME}_observer *observer, int told)
 {{
     int lost = !(observer->mean_square <= {limit}); /* also where it is no number */
     double P[{nx}][{nx}], ours = 0.0, theirs = 0.0;
     real x_hat[{nx}];
-    if (!lost && observer->seen >= {window}ul)
+    if (!lost && (!told || observer->seen >= {window}ul))
         return;
     /* what came before it was lost may have misled z: T_inv is no surer than so soon after a reset */
     covariance(observer, observer->seen, P);
@@ -260,11 +262,11 @@ ESTIMATE_TRACKED = """
 BEGIN = """\
     observer->mean_square = INFINITY; /* lost as yet */
     observer->seen = 0;
-    supervise(observer);
+    supervise(observer, 1);
 """
 
 TAKE = """\
     real whole[{ny}];
-    track(observer, y{pass_u}, whole);
+    int told = track(observer, y{pass_u}, whole);
     y = whole;
 """

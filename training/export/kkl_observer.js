@@ -289,9 +289,9 @@ class Tracker {
   }
 
   /** Let a map say where to begin, of z at an age in samples: soon after a reset where it is surer, and where all is lost. */
-  supervise(map, z, age) {
+  supervise(map, z, age, told = true) {
     const lost = !(this.meanSquare <= this.limit); // also where it is no number
-    if (!lost && this.seen >= this.window) return;
+    if (!lost && (!told || this.seen >= this.window)) return;
     // What came before it was lost may have misled z: the map is no surer than so soon after a reset.
     const P = scaled(map.covariance(z, Math.min(this.seen, this.window) * this.dt), this.x_scale, -1);
     const trace = (matrix) => matrix.reduce((sum, row, i) => sum + row[i], 0);
@@ -304,9 +304,14 @@ class Tracker {
   /** The covariance of the estimate's error; the map is that of free motion until an input acts. */
   covariance(map, z, age, free) {
     const { ages, logs, doubts } = this.calibrated[Number(free)];
-    const factor = Math.exp(interpolate(age * this.dt, ages, logs)), doubt = interpolate(age * this.dt, ages, doubts);
+    const within = this.seen < this.window;
+    const at = (values) => { // and soon after a start the larger one of that after so many samples
+      const own = interpolate(age * this.dt, ages, values);
+      return within ? Math.max(own, interpolate(this.seen * this.dt, ages, values)) : own;
+    };
+    const factor = Math.exp(at(logs)), doubt = at(doubts);
     const P = scaled(this.P, this.x_scale, 1);
-    if (this.seen >= this.window) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
+    if (!within) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
     const said = map.covariance(z, this.seen * this.dt), estimate = this.estimate;
     const apart = map.mean(z, age * this.dt).map((value, i) => value - estimate[i]);
     return P.map((row, i) => row.map((value, j) => factor * (value + doubt * (said[i][j] + apart[i] * apart[j] - value))));
@@ -398,6 +403,7 @@ export class Observer {
 
   /** Forget the past and take in the first sample; returns the estimate. */
   reset(y0) {
+    if (y0?.length !== this.ny || !Array.from(y0).every(Number.isFinite)) throw new Error(`the first sample has ${this.ny} finite outputs`);
     const { equilibrium } = this.tensors;
     this.z = new Float64Array(this.nz * (1 + this.nu));
     for (let i = 0; i < this.nz; i++) this.z[i] = this.#dot(equilibrium.data, i, y0);
@@ -414,6 +420,7 @@ export class Observer {
    * Outputs that are missing, NaN among several, are predicted, which needs a map with a linear output.
    */
   step(y, u = new Array(this.nu).fill(0)) {
+    if (y !== null && y?.length !== this.ny) throw new Error(`a sample has ${this.ny} outputs, or is null`);
     const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
     let now = y;
     if (this.tracker) {
@@ -427,7 +434,7 @@ export class Observer {
     this.z = this.#advanced(now, u);
     this.y = [...now];
     this.age++;
-    this.tracker?.supervise(this.#map(this.z), this.z, this.age);
+    this.tracker?.supervise(this.#map(this.z), this.z, this.age, missing.includes(false));
     this.xHat = this.tracker ? this.tracker.estimate : this.#estimate(this.z, this.age * this.dt);
     if (this.monitor && y !== null) {
       this.monitor.update(this.y.map((value, i) => value - this.#dot(this.C.data, i, this.xHat)), missing.map((gap) => !gap));

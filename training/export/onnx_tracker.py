@@ -97,7 +97,9 @@ class TrackerNodes:
         ours, nx = self._flat(P, flow.nx**2), flow.nx
         diagonal = graph.constant(np.eye(nx).reshape(-1, 1))
         surer = graph("Less", graph("MatMul", theirs, diagonal), graph("MatMul", ours, diagonal))
-        takes = graph("Or", lost, graph("And", graph("Less", count, window), surer))
+        told = graph("Less", self._before[4], count)  # by this sample
+        soon = graph("And", graph("Less", count, window), told)
+        takes = graph("Or", lost, graph("And", soon, surer))
         said = graph("Sub", maps.estimate(age), graph.constant(flow.x_offset))
         said = graph.within(graph("Div", said, graph.constant(flow.x_scale)), self._low, self._high)
         return (

@@ -123,6 +123,25 @@ def test_error_bars(process, options, make_artifact, tmp_path):
     assert np.allclose(found, covariances, rtol=1e-3, atol=1e-5 * np.abs(covariances).max())
 
 
+@pytest.mark.parametrize("sample", ["0.5", "[]", "undefined", "[1, 2]"])
+def test_what_is_no_sample_is_refused(sample, make_artifact, tmp_path):
+    write_step(tmp_path / "step.safetensors", exported_of(make_artifact(), tmp_path))
+    (tmp_path / "kkl_observer.mjs").write_text(javascript(), encoding="utf-8")
+    program = f"""
+        import {{ readFileSync }} from "node:fs";
+        import {{ Observer }} from "./kkl_observer.mjs";
+        const observer = new Observer(new Uint8Array(readFileSync("step.safetensors")).buffer);
+        for (const first of [[null], [NaN], {sample}]) {{
+          try {{ observer.reset(first); }} catch (error) {{ console.log(error.message); }}
+        }}
+        observer.reset([1]);
+        observer.step({sample});
+    """
+    done = subprocess.run(["node", "--input-type=module", "-e", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == 3 * "the first sample has 1 finite outputs\n"
+    assert "a sample has 1 outputs, or is null" in done.stderr
+
+
 @pytest.mark.parametrize("options", KINDS)
 def test_maps_that_track(options, tmp_path):
     exported = exported_of(tracking(**options), tmp_path, precision="double")  # compared with a step in doubles
