@@ -44,7 +44,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 
 # Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
 # NAME and NAME-small, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
-# One thread each, with which the same machine makes the same files to the last bit.
+# One thread each, with which the same machine makes the same numbers to the last bit.
 maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, two hours, or one with make -j 2 maps; resumable
 
 maps-%: $(VENV)/ready
