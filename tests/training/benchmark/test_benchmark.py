@@ -316,14 +316,14 @@ def test_step_time_is_that_of_the_fastest_round_and_of_whole_batches(monkeypatch
 
         def step(self, y):
             self.batches.append(y.shape)
-            self.now += 1 / 64 if len(self.batches) <= 4 else 1 / 256
+            self.now += 1 / 64 if len(self.batches) <= 104 else 1 / 256
 
     method = Slow(None)
     monkeypatch.setattr(protocol_module, "time", method)
     found = step_time(method, None, system=get_system("lorenz"), dt=0.01, batch=7, seconds=5 / 16)
     assert found == 1e6 / 256
     assert set(method.batches) == {(7, 1)}
-    assert len(method.batches) == 4 + 4 * 16  # a fifth of the time in each round
+    assert len(method.batches) == 5 * 100 + 4 + 4 * 16  # a fifth of the time in each round, after what is not timed
 
 
 def test_a_toy_method_takes_one_class(toy, tiny, tmp_path):
