@@ -403,7 +403,7 @@ export class Observer {
 
   /** Forget the past and take in the first sample; returns the estimate. */
   reset(y0) {
-    if (y0?.length !== this.ny || !Array.from(y0).every(Number.isFinite)) throw new Error(`the first sample has ${this.ny} finite outputs`);
+    if (y0?.length !== this.ny || !Array.from(y0).every(Number.isFinite)) throw new Error(`the first sample has ${this.ny} finite outputs, got ${y0}`);
     const { equilibrium } = this.tensors;
     this.z = new Float64Array(this.nz * (1 + this.nu));
     for (let i = 0; i < this.nz; i++) this.z[i] = this.#dot(equilibrium.data, i, y0);
@@ -420,7 +420,7 @@ export class Observer {
    * Outputs that are missing, NaN among several, are predicted, which needs a map with a linear output.
    */
   step(y, u = new Array(this.nu).fill(0)) {
-    if (y !== null && y?.length !== this.ny) throw new Error(`a sample has ${this.ny} outputs, or is null`);
+    if (y !== null && y?.length !== this.ny) throw new Error(`a sample has ${this.ny} outputs, or is null, got ${y}`);
     const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
     let now = y;
     if (this.tracker) {
