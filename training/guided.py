@@ -17,7 +17,7 @@ from training.kalman import (
     FLOOR_WHERE_WATCHED,
     LEAST_VARIANCE,
     LEAST_WHERE_WATCHED,
-    UnscentedKalmanFilter,
+    IteratedKalmanFilter,
     measurement_covariance,
     process_intensity,
 )
@@ -37,9 +37,10 @@ CHANCE = 1e-9  # that their mean square is as large as its limit where model and
 class GuidedKalmanFilter:
     """An unscented Kalman filter beside a KKL observer, which says where to begin.
 
-    The Kalman filter has the system's equations and is as good as they are, once it is near the state. The observer
-    finds the state from anywhere and cannot lose it. Both run all the time, each row of a batch by itself, and what is
-    returned is the Kalman filter's estimate. It is replaced by the observer's, in the rows concerned,
+    The Kalman filter takes each step twice, see :class:`training.kalman.IteratedKalmanFilter`. It has the system's
+    equations and is as good as they are, once it is near the state. The observer finds the state from anywhere and
+    cannot lose it. Both run all the time, each row of a batch by itself, and what is returned is the Kalman filter's
+    estimate. It is replaced by the observer's, in the rows concerned,
 
     - where the observer is surer: its covariance has the smaller determinant. That is so early on, if at all.
     - where the innovations say that the filter is lost: their mean square over the last half second, at the pace of the
@@ -103,7 +104,7 @@ class GuidedKalmanFilter:
         self._batch: tuple[int, ...] | None = None
         artifact = dataclasses.replace(artifact, flow=None)  # which would be a second filter of the kind
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
-        self._filter = UnscentedKalmanFilter(
+        self._filter = IteratedKalmanFilter(
             system, dt, Q=Q, R=measurement_covariance(system, level, floor=FLOOR_WHERE_WATCHED)
         )
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)

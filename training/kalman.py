@@ -16,7 +16,7 @@ STARTS = 10_000  # of which mean and covariance are taken where a system draws i
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
 LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
 # The same of filters that are taken back where they are lost, and so may trust their samples and their model more.
-FLOOR_WHERE_WATCHED, LEAST_WHERE_WATCHED = 0.001, 0.002
+FLOOR_WHERE_WATCHED, LEAST_WHERE_WATCHED = 0.001, 0.0005
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""
@@ -177,7 +177,7 @@ class KalmanFilter(ABC):
             Which rows move; by default all of them.
         """
         held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
-        x, P, nis = self._corrected(*self._predicted(held), y)
+        x, P, nis = self._moved(held, y)
         if rows is not None:
             x, P = np.where(rows[:, None], x, self.x), np.where(rows[:, None, None], P, self.P)
             nis = np.where(rows, nis, self.nis)
@@ -194,6 +194,10 @@ class KalmanFilter(ABC):
     def _inside(self, x: np.ndarray, P: np.ndarray) -> np.ndarray:
         inside: np.ndarray = np.isfinite(P).all((1, 2)) & (x >= self._low).all(-1) & (x <= self._high).all(-1)
         return inside
+
+    def _moved(self, u: np.ndarray, y: np.ndarray) -> Corrected:
+        """What :meth:`_corrected` makes of the samples y, one sample later under held inputs, (nu, n)."""
+        return self._corrected(*self._predicted(u), y)
 
     @abstractmethod
     def _predicted(self, u: np.ndarray) -> Gaussian:
@@ -260,14 +264,20 @@ class UnscentedKalmanFilter(KalmanFilter):
     Parameters are those of :class:`KalmanFilter`.
     """
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _predicted(self, u: np.ndarray) -> Gaussian:
+        x, P, _ = self._carried(self.x, self.P, u)
+        return x, P + self._Q * self._dt
+
+    def _carried(self, x: np.ndarray, P: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the equations make of Gaussians in one sample, as :func:`observers.unscented.transformed` has it."""
+
         def move(points: np.ndarray) -> np.ndarray:
             flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
             moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
             return moved.T.reshape(points.shape)
 
-        with np.errstate(over="ignore", invalid="ignore"):
-            return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt, points=self._points)
+        return unscented.transformed(x, P, function=move, points=self._points)
 
     @np.errstate(over="ignore", invalid="ignore")
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
@@ -284,3 +294,39 @@ class UnscentedKalmanFilter(KalmanFilter):
     @property
     def _points(self) -> unscented.Points:
         return unscented.Points(kappa=3.0 - self._system.nx, beta=2.0)
+
+
+class IteratedKalmanFilter(UnscentedKalmanFilter):
+    """A batch of unscented Kalman filters that take each step twice (Kullberg, Skog and Hendeby, 2023).
+
+    Once a sample has corrected the prediction, it also says more of where the step began. The equations are made linear
+    anew over what is left of that uncertainty, by sigma points, and the step is taken again from the same start. That
+    pays where the state is hardly known yet: the equations bend over its whole spread, and little over what is left.
+    Parameters are those of :class:`KalmanFilter`.
+    """
+
+    @np.errstate(over="ignore", invalid="ignore")  # of rows that are lost, which start anew
+    def _moved(self, u: np.ndarray, y: np.ndarray) -> Corrected:
+        Q = self._Q * self._dt
+        x, P, across = self._carried(self.x, self.P, u)
+        P = P + Q
+        known, left, _ = self._updated(x, P, y)
+        back = _solved(P, across.mT).mT  # the gain of a smoother (Rauch, Tung and Striebel, 1965)
+        before = self.x + (back @ (known - x)[..., None])[..., 0]
+        spread = self.P + back @ (left - P) @ back.mT
+        spread = (spread + spread.mT) / 2
+        around, curved, across = self._carried(before, spread, u)
+        A = _solved(spread, across).mT
+        curved = curved - A @ across  # what is not linear, as noise
+        again = around + (A @ (self.x - before)[..., None])[..., 0]
+        covariance = A @ self.P @ A.mT + (curved + curved.mT) / 2 + Q
+        sound = np.isfinite(again).all(-1) & np.isfinite(unscented.factor(covariance)).all((1, 2))
+        x, P = np.where(sound[:, None], again, x), np.where(sound[:, None, None], covariance, P)
+        return self._corrected(x, P, y)
+
+
+def _solved(P: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Solve P X = b, (n, nx, k), for covariances P; NaN where one is none."""
+    root = unscented.factor(P)
+    solved: np.ndarray = np.linalg.solve(root.mT, np.linalg.solve(root, b))
+    return solved

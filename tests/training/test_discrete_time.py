@@ -17,7 +17,7 @@ from kkl_gym.simulate import simulate
 from training import errors, preset, train, unseen_trajectories
 from training.benchmark.protocol import run
 from training.jobs import describe
-from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter
+from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter
 from training.smoothness import smooth_spectrum
 from training.systems import controller
 from training.trajectories.derivatives import with_sensitivity
@@ -58,7 +58,7 @@ def test_another_interval_is_refused():
 
 def test_the_kalman_filters_follow_a_map_as_they_follow_its_integration():
     y, u = np.random.default_rng(0).normal(size=(60, 2, 1)), np.random.default_rng(1).uniform(-0.5, 0.5, (60, 2, 1))
-    for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter):
+    for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter, IteratedKalmanFilter):
         found = []
         for system in (Sampled(), Oscillator()):
             one = kind(system, DT, Q=np.diag([0.01, 0.02]), R=np.array([[0.3]]))

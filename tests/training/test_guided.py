@@ -12,7 +12,7 @@ from kkl_gym.simulate import simulate
 from observers import ArtifactError, KKLObserver
 from training.benchmark.protocol import run
 from training.guided import GuidedKalmanFilter
-from training.kalman import UnscentedKalmanFilter, measurement_covariance
+from training.kalman import IteratedKalmanFilter, measurement_covariance
 
 DT, NOISE = 0.05, 0.1
 Q = np.diag([1e-4, 2e-4])
@@ -83,7 +83,7 @@ def test_after_a_jump_it_starts_again_from_the_observer_in_that_row_alone():
     sure = 1e-8 * np.eye(2)
     ours, alone = (
         guided(Q=sure),
-        UnscentedKalmanFilter(Oscillator(), DT, Q=sure, R=measurement_covariance(Oscillator(), NOISE)),
+        IteratedKalmanFilter(Oscillator(), DT, Q=sure, R=measurement_covariance(Oscillator(), NOISE)),
     )
     found, lost = run(ours, y), run(alone, y)
     assert ours.restarts[0] > 0
@@ -149,7 +149,7 @@ def test_a_map_that_nobody_trained_does_no_harm():
     y = system.output(x) + 0.5 * rng.normal(size=(101, 2, 1))
     how = {"Q": 1e-4 * np.eye(2)}
     ours = GuidedKalmanFilter(system, artifact=random_artifact(), dt=0.01, measurement_noise=0.5, **how)
-    kalman = UnscentedKalmanFilter(system, 0.01, R=0.25 * np.eye(1), **how)
+    kalman = IteratedKalmanFilter(system, 0.01, R=0.25 * np.eye(1), **how)
     np.testing.assert_allclose(ours.reset(y[0]), kalman.reset(y[0]), rtol=1e-12)
     for k in range(100):
         np.testing.assert_allclose(ours.step(y[k + 1], u[k]), kalman.step(y[k + 1], u[k]), rtol=1e-12)

@@ -11,13 +11,13 @@ from scipy.linalg import expm
 from kkl_gym import get_system
 from kkl_gym.simulate import advance, simulate
 from training.benchmark.protocol import run
-from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter, unknown_start
+from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.trajectories.derivatives import jacobian
 
 SYSTEMS = ["reverse_duffing", "van_der_pol", "rossler", "lorenz"]
 
 
-@pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter])
+@pytest.fixture(params=[ExtendedKalmanFilter, UnscentedKalmanFilter, IteratedKalmanFilter])
 def filters(request):
     return request.param
 
@@ -150,26 +150,60 @@ def test_a_filter_that_starts_anew_says_so(filters):
     assert np.isfinite(observer.nis[1])
 
 
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, IteratedKalmanFilter])
 @pytest.mark.parametrize("P", [-np.eye(2), np.diag([1.0, -1e-3]), np.full((2, 2), np.nan), np.diag([np.inf, 1.0])])
-def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(P):
-    observer, untouched = of_van_der_pol(UnscentedKalmanFilter), of_van_der_pol(UnscentedKalmanFilter)
+def test_a_ukf_whose_covariance_is_none_starts_anew_without_the_others(kind, P):
+    observer, untouched = of_van_der_pol(kind), of_van_der_pol(kind)
     y = np.array([[0.7], [-0.4]])
     for one in (observer, untouched):
         one.reset(y)
     observer.P[0] = P
     found, expected = observer.step(y), untouched.step(y)
-    fresh = of_van_der_pol(UnscentedKalmanFilter).reset(y)
+    fresh = of_van_der_pol(kind).reset(y)
     np.testing.assert_allclose(found, [fresh[0], expected[1]], rtol=1e-12)
     assert np.isfinite(observer.P).all()
     assert np.abs(fresh[0] - expected[0]).max() > 1e-3
 
 
-def test_a_batch_of_many_is_each_alone():
+@pytest.mark.parametrize("kind", [UnscentedKalmanFilter, IteratedKalmanFilter])
+def test_a_batch_of_many_is_each_alone(kind):
     y = np.random.default_rng(0).normal(size=(30, 40, 1))
-    many = run(of_van_der_pol(UnscentedKalmanFilter), y)
+    many = run(of_van_der_pol(kind), y)
     for i in (0, 17, 39):
-        alone = run(of_van_der_pol(UnscentedKalmanFilter), y[:, i : i + 1])
+        alone = run(of_van_der_pol(kind), y[:, i : i + 1])
         np.testing.assert_allclose(many[:, i], alone[:, 0], rtol=1e-9, atol=1e-11)
+
+
+def test_a_step_that_is_taken_twice_is_nearer_to_what_bayes_has_it():
+    """Means given two exact outputs, beside those of all states on a fine grid that could have brought them."""
+    system, dt, noise = get_system("van_der_pol"), 0.1, 0.002
+    (y0, rate), spread = (0.5, np.linspace(-2, 2, 9)), 0.6
+    start = np.array([y0, 0.0]), np.diag([noise**2, spread**2])
+    later = simulate(system, np.column_stack([np.full(9, y0), rate]), 1, dt)[1]
+    y = np.stack([np.full((9, 1), y0), later[:, :1]])
+    grid = np.linspace(-3, 3, 60_001)
+    moved = simulate(system, np.column_stack([np.full(len(grid), y0), grid]), 1, dt)[1]
+    exact = np.empty((9, 2))
+    for i in range(9):
+        log = -0.5 * ((moved[:, 0] - y[1, i, 0]) / noise) ** 2 - 0.5 * (grid / spread) ** 2
+        weights = np.exp(log - log.max())
+        exact[i] = weights @ moved / weights.sum()
+    off = {}
+    for kind in (UnscentedKalmanFilter, IteratedKalmanFilter):
+        found = run(kind(system, dt, Q=np.zeros((2, 2)), R=noise**2 * np.eye(1), start=start), y)[1]
+        off[kind] = np.abs(found - exact)[:, 1].max()
+    assert off[IteratedKalmanFilter] < 0.2 * off[UnscentedKalmanFilter]
+
+
+def test_a_step_is_taken_once_where_its_start_is_known_to_rounding():
+    """Samples as good as exact, and no process noise: what is left may be no covariance, and nothing is lost."""
+    system = get_system("van_der_pol")
+    x = simulate(system, np.array([[0.5, 1.0]]), 200, 0.01)
+    ours = IteratedKalmanFilter(system, 0.01, Q=np.zeros((2, 2)), R=1e-20 * np.eye(1))
+    for k, y in enumerate(system.output(x)):
+        found = ours.step(y) if k else ours.reset(y)
+        assert np.isfinite(ours.nis).all()
+        assert k < 5 or np.abs(found - x[k]).max() < 1e-9
 
 
 def test_innovations_are_as_large_as_expected_where_the_model_holds(filters):
