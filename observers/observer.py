@@ -180,7 +180,7 @@ class KKLObserver:
         vars(self).update(state)
         if not available():
             self._compiled, self._compile = False, None if self._compile else self._compile
-        elif self._compiled and (self._z is None or self._z.ndim == 1):
+        elif self._compiled and (self._compile or self._z is None or self._z.ndim == 1):
             self._warm_up()  # in another process there is no machine code yet
 
     def _warm_up(self) -> None:

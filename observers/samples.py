@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import all_finite, real_array
+from observers.checks import LARGEST, all_finite, real_array
 
 
 def check_output(
@@ -40,12 +40,15 @@ def check_output(
         return None
     if artifact.ny == 1 and not batch:
         hint = "the first sample must be there" if first else "a missing sample is step(None, u)"
-        raise ValueError(f"y holds NaN, infinity or values beyond 1e15; {hint}")
+        raise ValueError(f"y holds NaN, infinity or values beyond 1e15: {_first_of('y', y)}; {hint}")
     gaps = np.isnan(y)
-    if not all_finite(np.where(gaps, 0.0, y)):
-        raise ValueError("y holds infinity or values beyond 1e15; NaN is what says that an output is missing")
+    there = np.where(gaps, 0.0, y)
+    if not all_finite(there):
+        found = _first_of("y", there)
+        raise ValueError(f"y holds infinity or values beyond 1e15: {found}; NaN is what says that an output is missing")
     if first:
-        raise ValueError("y holds NaN: outputs may be missing later, but the first sample must be whole")
+        found = _first_of("y", y)
+        raise ValueError(f"y holds NaN: {found}; outputs may be missing later, but the first sample must be whole")
     return gaps
 
 
@@ -87,7 +90,7 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
     if u.shape != (*batch, nu):
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
     if not all_finite(u):
-        raise ValueError("u holds NaN, infinity or values beyond 1e15")
+        raise ValueError(f"u holds NaN, infinity or values beyond 1e15: {_first_of('u', u)}")
     return u
 
 
@@ -122,7 +125,8 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     if x0.shape != shape:
         raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
     if not all_finite(x0):
-        raise ValueError("x0 holds NaN, infinity or values beyond 1e15; leave x0 out where the state is unknown")
+        found = _first_of("x0", x0)
+        raise ValueError(f"x0 holds NaN, infinity or values beyond 1e15: {found}; leave x0 out where it is unknown")
     if artifact.forward is None:  # where the tracker begins
         return artifact.filter.start(y0), 0
     z0 = np.zeros((*shape[:-1], artifact.filter.size))
@@ -170,3 +174,9 @@ def checked_record(
         if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
             raise ValueError(f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}")
     return y, u, gaps
+
+
+def _first_of(name: str, values: np.ndarray) -> str:
+    """Name the first entry that is no number, or beyond what is taken for one."""
+    at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
+    return f"{name}[{', '.join(map(str, at))}] = {values[at]}"

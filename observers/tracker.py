@@ -15,6 +15,7 @@ from observers.thresholds import MANY_ROWS
 from observers.unscented import Gaussian, conditioned, predicted, transformed
 
 KNOWN = 1e-3  # standard deviation of a state that is said to be known, in scaled states
+KEPT = 4096  # of what scales single covariances, which else grows by one with each sample of short dt
 _FIRST, _FLAGS = np.zeros(1, dtype=np.intp), (np.array([False]), np.array([True]))  # the row of a single sample
 
 
@@ -25,7 +26,7 @@ class _Calibrated:
         self._ages, self._logs, self._doubts = factors.ages / dt, factors.log_roots(*shares), factors.doubts(*shares)
         self._parts = np.array([units * np.eye(len(units)), units * (1.0 - np.eye(len(units)))])  # along, and across
         self.last = float(self._ages[-1])  # after which nothing changes
-        self._scales = dict[float, np.ndarray]()  # of single samples, for which all this takes too long
+        self._scales = dict[tuple[float, float], np.ndarray]()  # of single samples, for which all this takes too long
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_scales": {}}
@@ -36,6 +37,8 @@ class _Calibrated:
 
     def within(self, seen: np.ndarray, age: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The larger ones of those after so many samples and at that age, between which some were missing."""
+        if (seen == age).all():
+            return self.at(age)
         (factor, doubt), (factor_at, doubt_at) = self.at(seen), self.at(age)
         return np.maximum(factor, factor_at), np.maximum(doubt, doubt_at)
 
@@ -44,18 +47,20 @@ class _Calibrated:
         weights = np.column_stack([factor, factor * (1.0 - doubt)])
         return np.asarray(weights @ self._parts.reshape(2, -1)).reshape(-1, *self._parts.shape[1:])
 
-    def scale(self, age: float) -> np.ndarray:
+    def scale(self, seen: float, age: float) -> np.ndarray:
         """The same of a single sample, (nx, nx)."""
-        age = min(age, self.last)
-        scale = self._scales.get(age)
+        key = seen, age = min(seen, self.last), min(age, self.last)
+        scale = self._scales.get(key)
         if scale is None:
-            scale = self._scales[age] = self.scales(*self.at(np.array([age])))[0]
+            if len(self._scales) == KEPT:
+                self._scales.clear()
+            scale = self._scales[key] = self.scales(*self.within(np.array([seen]), np.array([age])))[0]
         return scale
 
     @functools.cached_property
     def last_scale(self) -> np.ndarray:
         """The same from the last age on."""
-        return self.scale(self.last)
+        return self.scale(self.last, self.last)
 
 
 class Tracker:
@@ -183,7 +188,7 @@ class Tracker:
                 state, P = self._looked_at
                 if state is not self._state:
                     state, P = self._looked_at = self._state, self._P[0]
-                scale = calibrated.last_scale if age >= calibrated.last else calibrated.scale(float(age))
+                scale = calibrated.last_scale if seen >= calibrated.last else calibrated.scale(seen, float(age))
                 single: np.ndarray = P * scale
                 return single
             heard = self._heard
@@ -192,44 +197,40 @@ class Tracker:
         heard, n, nx = self._heard, len(self._state), self._flow.nx
         heard = heard if heard is not None and heard[0] is z else None
         z = z.reshape(n, z.shape[-1])
-        ages, acted = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:])
-        P = (self._state[:, nx : self._end] * self._scales(ages, acted)).reshape(n, nx, nx)
-        soon = (self._seen < self._window) & ~self._known
+        ages, acted, seen = np.ravel(np.asarray(age, dtype=float)), _acted(z[:, nz:]), self._seen
+        P = (self._state[:, nx : self._end] * self._scales(seen, ages, acted)).reshape(n, nx, nx)
+        soon = (seen < self._window) & ~self._known
         if soon.any():
             ages = np.broadcast_to(ages, n)[soon]
             if heard is not None and heard[1][soon].all():
                 _, asked, (x, covariance) = heard
                 said = x[soon[asked]], covariance[soon[asked]]
             else:
-                said = self._said(z[soon], ages, self._seen[soon])
-            P[soon] = self._soon(said, *self._factors(ages, acted[soon], self._seen[soon]), soon)
+                said = self._said(z[soon], ages, seen[soon])
+            P[soon] = self._soon(said, *self._factors(seen[soon], ages, acted[soon]), soon)
         return P.reshape(*self._batch, nx, nx)
 
-    def _factors(
-        self, age: np.ndarray, acted: np.ndarray, seen: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Factors and doubts, (n,), at ages in samples; of rows on which an input has acted, and of others.
-
-        Within the window they are those after so many samples, too.
-        """
-        found = self._calibrated.at(age) if seen is None else self._calibrated.within(seen, age)
-        factor, doubt = found
+    def _factors(self, seen: np.ndarray, age: np.ndarray, acted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Factors and doubts, (n,), after so many samples, at ages; of rows on which an input has acted, and others."""
+        factor, doubt = self._calibrated.within(seen, age)
         if not acted.all():
-            free, age = self._free_calibrated, age[~acted]
-            factor[~acted], doubt[~acted] = free.at(age) if seen is None else free.within(seen[~acted], age)
+            factor[~acted], doubt[~acted] = self._free_calibrated.within(seen[~acted], age[~acted])
         return factor, doubt
 
-    def _scales(self, age: np.ndarray, acted: np.ndarray) -> np.ndarray:
+    def _scales(self, seen: np.ndarray, age: np.ndarray, acted: np.ndarray) -> np.ndarray:
         """What is multiplied with covariances where T_inv is not asked, (n, nx^2), or of all rows (1, nx^2).
 
         Ages are those of all rows, (n,), or the one that they share, (1,).
         """
         both = self._calibrated, self._free_calibrated
         last = max(each.last for each in both)
-        if len(age) == 1 or age.min(initial=np.inf) >= last:  # most often
-            driven, free = (each.scale(age.item(0) if len(age) == 1 else last).reshape(1, -1) for each in both)
+        late = seen.min(initial=np.inf) >= last
+        if late or (len(age) == 1 and (seen == age).all()):  # most often
+            one = last if late else age.item(0)
+            driven, free = (each.scale(one, one).reshape(1, -1) for each in both)
             return driven if acted.all() else free if not acted.any() else np.where(acted[:, None], driven, free)
-        return self._calibrated.scales(*self._factors(age, acted)).reshape(len(age), len(self._units) ** 2)
+        age = np.broadcast_to(age, seen.shape)
+        return self._calibrated.scales(*self._factors(seen, age, acted)).reshape(len(seen), len(self._units) ** 2)
 
     def _soon(
         self, said: Gaussian, factor: np.ndarray, doubt: np.ndarray, rows: np.ndarray | slice = slice(None)

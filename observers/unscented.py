@@ -119,12 +119,12 @@ def corrected(
     Returns
     -------
     x, P : ndarray
-        Means and covariances given the samples; NaN where a covariance was none.
+        Means and covariances given the samples; NaN where a covariance was none, or h is undefined at a sigma point.
     nis : ndarray, shape (n,)
         Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
     """
     expected, S, across = transformed(x, P, function=output, points=points)
-    x, P, white = conditioned(x, P, y - expected, S + R, across)
+    x, P, white = conditioned(x, P, y - expected, S + R, across, np.isnan(y))
     return x, P, (white**2).sum(-1) / np.maximum((~np.isnan(y)).sum(-1), 1)
 
 

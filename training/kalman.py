@@ -219,7 +219,8 @@ class ExtendedKalmanFilter(KalmanFilter):
     """A batch of extended Kalman filters (Jazwinski, 1970, sec. 8.3).
 
     Mean and sensitivity Phi are moved together over each sample, P = Phi P Phi^T + Q dt. A filter whose predicted mean
-    leaves the system's declared bounds starts anew. Parameters are those of :class:`KalmanFilter`.
+    leaves the system's declared bounds starts anew. An output that is undefined there, or its slope, corrects nothing.
+    Parameters are those of :class:`KalmanFilter`.
     """
 
     def __init__(
@@ -245,6 +246,8 @@ class ExtendedKalmanFilter(KalmanFilter):
             x[~inside], P[~inside] = self._start
         H, R, missing = evaluate(self._outputs, x), self._R, np.isnan(y)
         innovation = y - self._system.output(x)
+        undefined = ~missing & ~(np.isfinite(innovation) & np.isfinite(H).all(-1))  # as h or its slope may be
+        inside, missing = inside & ~undefined.any(-1), missing | undefined
         if missing.any():
             innovation, H = np.where(missing, 0.0, innovation), np.where(missing[..., None], 0.0, H)
             R = np.where(missing[:, None, :] | missing[..., None], np.eye(len(R)), R)  # apart from those measured
@@ -259,9 +262,9 @@ class ExtendedKalmanFilter(KalmanFilter):
 class UnscentedKalmanFilter(KalmanFilter):
     """A batch of unscented Kalman filters (Wan and van der Merwe, 2000), see :mod:`observers.unscented`.
 
-    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. A filter starts anew if
-    its corrected mean leaves the system's declared bounds, or if its covariance is no longer positive definite.
-    Parameters are those of :class:`KalmanFilter`.
+    Their sigma points are those with alpha = 1, beta = 2 and kappa = 3 - nx, which are usual. Where h is undefined at
+    one, it is taken at their mean. A filter starts anew if its corrected mean leaves the system's declared bounds, or
+    if its covariance is no longer positive definite. Parameters are those of :class:`KalmanFilter`.
     """
 
     @np.errstate(over="ignore", invalid="ignore")
@@ -284,12 +287,22 @@ class UnscentedKalmanFilter(KalmanFilter):
         x, P, nis = self._updated(x, P, y)
         lost = ~self._inside(x, P)
         if lost.any():
-            x[lost], P[lost], _ = self._updated(*self._starts(int(lost.sum())), y[lost])
+            start = self._starts(int(lost.sum()))
+            anew = self._updated(*start, y[lost])
+            sound = self._inside(*anew[:2])  # or else the start stands as it is
+            x[lost] = np.where(sound[:, None], anew[0], start[0])
+            P[lost] = np.where(sound[:, None, None], anew[1], start[1])
             nis[lost] = np.inf
         return x, P, nis
 
     def _updated(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
-        return unscented.corrected(x, P, y, output=self._system.output, R=self._R, points=self._points)
+        return unscented.corrected(x, P, y, output=self._output, R=self._R, points=self._points)
+
+    def _output(self, points: np.ndarray) -> np.ndarray:
+        y = self._system.output(points)
+        if not np.isfinite(y).all():
+            y = np.where(np.isfinite(y), y, self._system.output(points.mean(0, keepdims=True)))
+        return y
 
     @property
     def _points(self) -> unscented.Points:

@@ -168,7 +168,7 @@ class KKLEstimator:
         self._monitor = flag("monitor", monitor)
         self.estimate, self.space, self._blind = estimate, space, blind
         self.observer = KKLObserver(
-            self._asked(artifact), measurement_noise, process_noise=process_noise, monitor=monitor, compiled=compiled
+            self.asked(artifact), measurement_noise, process_noise=process_noise, monitor=monitor, compiled=compiled
         )
 
     @classmethod
@@ -250,11 +250,29 @@ class KKLEstimator:
             If it differs in more than its maps, or holds no forward map and starts are known, or no error bars and
             they are shown.
         """
-        artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
-        self.observer.replace(self._asked(artifact))
+        self.observer.replace(self.asked(observer))
 
-    def _asked(self, artifact: Artifact) -> Artifact:
-        """The artifact if it has what is asked for, without its flow where nobody asks for what that estimates."""
+    def asked(self, observer: str | os.PathLike[str] | Artifact) -> Artifact:
+        """What :meth:`replace` would take.
+
+        Parameters
+        ----------
+        observer : str or path or Artifact
+            As there.
+
+        Returns
+        -------
+        Artifact
+            The observer, without its flow where nobody asks for what that estimates.
+
+        Raises
+        ------
+        ValueError
+            If it holds no forward map and starts are known, or no error bars and they are shown.
+        observers.ArtifactError
+            If the file is missing or damaged.
+        """
+        artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
             artifact.require_known_start()  # an error now, not at the first reset
         if self._uncertainty and self.estimate != "x":

@@ -372,9 +372,7 @@ class KKLVectorObservation(VectorEstimate):
                 known_start=known_start,
                 uncertainty=uncertainty,
             )
-            told = estimator.observer.artifact
-            if told.process_noise_max is not None or told.flow is not None:
-                plant_of(env, "process_noise")
+            _check_process_noise(env, estimator.observer.artifact)
         super().__init__(env, estimator)
         self._estimator: KKLEstimator = estimator
         self.observer = estimator.observer
@@ -395,7 +393,15 @@ class KKLVectorObservation(VectorEstimate):
         observers.ArtifactError
             As there.
         """
-        self._estimator.replace(observer)
+        asked = self._estimator.asked(observer)
+        _check_process_noise(self.env, asked)
+        self._estimator.replace(asked)
+
+
+def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
+    """ValueError if the rows differ in a level of noise that the observer assumes for all of them."""
+    if artifact.environment is None and (artifact.process_noise_max is not None or artifact.flow is not None):
+        plant_of(env, "process_noise")
 
 
 class VectorActionRepeat(VectorWrapper):
@@ -589,8 +595,11 @@ def plant_of(env: VectorEnv, *also: str) -> Plant:
     first = plants[0]
     for plant in plants:
         for name in ("system", "dt", "measurement_noise", *also):
-            if getattr(plant, name) != getattr(first, name):
-                raise ValueError(f"the environments differ in {name}: one observer cannot serve all")
+            one, other = getattr(first, name), getattr(plant, name)
+            if one != other:
+                raise ValueError(
+                    f"the environments differ in {name}, {shown(one)} and {shown(other)}: one observer cannot serve all"
+                )
     return first
 
 

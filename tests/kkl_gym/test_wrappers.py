@@ -310,9 +310,14 @@ def test_the_map_is_told_the_environments_process_noise(saved, level):
     assert np.array_equal(info["x_hat"], expected.reset(info["y"]))
     assert not np.allclose(info["x_hat"], KKLObserver(Artifact.read(path), 0.5, process_noise=0.01).reset(info["y"]))
     mixed = SyncVectorEnv([lambda level=level: KKLEnv("van_der_pol", process_noise=level) for level in (0.0, 0.1)])
-    with pytest.raises(ValueError, match="differ in process_noise"):
+    with pytest.raises(ValueError, match=r"differ in process_noise, 0\.0 and 0\.1"):
         KKLVectorObservation(mixed, path)
-    assert KKLVectorObservation(mixed, saved()).observer.process_noise == 0.0  # a map that does not ask
+    silent = KKLVectorObservation(mixed, saved())  # a map that does not ask
+    assert silent.observer.process_noise == 0.0
+    before = silent.observer.artifact
+    with pytest.raises(ValueError, match="differ in process_noise"):
+        silent.replace_observer(path)
+    assert silent.observer.artifact is before
     many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
     _, info = many.reset(seed=0)
     assert np.allclose(info["x_hat"], expected.reset(info["y"]), atol=1e-6)

@@ -146,7 +146,9 @@ def test_the_first_sample_is_whole():
 def test_what_is_neither_there_nor_missing(wrong):
     observer = KKLObserver(exact())
     for call in (observer.reset, lambda y: observer.estimate([[0.0, 0.0], y])):
-        with pytest.raises(ValueError, match="y holds infinity or values beyond 1e15; NaN is what says"):
+        with pytest.raises(
+            ValueError, match=r"y holds infinity or values beyond 1e15: y\[.*(inf|1e\+16); NaN is what says"
+        ):
             call(wrong)
     observer.reset([0.5, 0.5])
     z = observer.z

@@ -17,7 +17,7 @@ import observers.observer as observer_module
 from observers import MLP, Artifact, ArtifactError, Expression, Factors, KKLObserver, LinearFilter, load, unscented
 
 LEVEL = 0.2
-CLOSE = {"rtol": 1e-5, "atol": 1e-6}
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}  # a network of floats says of a row what it says of it alone, but for rounding
 OLD = 400  # samples: far beyond age_max, where T_inv is asked no more
 
 
@@ -139,8 +139,8 @@ def test_batches_are_rows_and_records_are_steps():
         single = KKLObserver(artifact, LEVEL)
         for k in range(60):
             x_hat = single.step(y[k, i]) if k else single.reset(y[k, i])
-            np.testing.assert_allclose(record[k, i // 2, i % 2], x_hat, rtol=1e-9, atol=1e-12)
-            np.testing.assert_allclose(covariances[k, i], single.covariance, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(record[k, i // 2, i % 2], x_hat, **CLOSE)
+            np.testing.assert_allclose(covariances[k, i], single.covariance, **CLOSE)
     with pytest.raises(RuntimeError, match="reset"):
         batch.decode()  # its own state is as it was
 
@@ -268,7 +268,7 @@ def test_soon_after_a_start_t_inv_is_asked_what_errors_there_may_be(doubt):
         said = plain.covariance + apart[:, :, None] * apart[:, None, :]
         other = said if k < window else sure.covariance * np.eye(2)
         np.testing.assert_allclose(batch.covariance, (1 - doubt) * sure.covariance + doubt * other, rtol=1e-9)
-        np.testing.assert_allclose(single.covariance, batch.covariance[1], rtol=1e-9)
+        np.testing.assert_allclose(single.covariance, batch.covariance[1], **CLOSE)
         np.testing.assert_array_equal(batch.decode_covariance(np.array([True, False, True])), batch.covariance[::2])
     batch.restart(y[k][:1], [False, True, False])
     np.testing.assert_allclose(batch.std[1], [STD, STD])

@@ -1,14 +1,18 @@
 """Kalman filters against filterpy's, and against the linear filter where that is exact."""
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from filterpy.kalman import KalmanFilter, MerweScaledSigmaPoints
 from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
-from linear_system import C, F, Oscillator, TwoOutputs
+from linear_system import Autonomous, C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
 from kkl_gym import get_system
+from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
 from training.benchmark.protocol import run
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
@@ -195,11 +199,18 @@ def test_a_step_that_is_taken_twice_is_nearer_to_what_bayes_has_it():
     assert off[IteratedKalmanFilter] < 0.2 * off[UnscentedKalmanFilter]
 
 
-def test_a_step_is_taken_once_where_its_start_is_known_to_rounding():
-    """Samples as good as exact, and no process noise: what is left may be no covariance, and nothing is lost."""
+def test_a_step_is_taken_once_where_what_is_left_of_its_start_is_no_covariance(monkeypatch):
+    y = np.random.default_rng(0).normal(size=(30, 3, 1))
+    once = run(of_van_der_pol(UnscentedKalmanFilter), y)
+    assert not np.array_equal(run(of_van_der_pol(IteratedKalmanFilter), y), once)
+    monkeypatch.setattr("training.kalman._solved", lambda P, b: np.full_like(b, np.nan))
+    np.testing.assert_array_equal(run(of_van_der_pol(IteratedKalmanFilter), y), once)
+
+
+def test_samples_as_good_as_exact_and_no_process_noise_lose_no_filter():
     system = get_system("van_der_pol")
     x = simulate(system, np.array([[0.5, 1.0]]), 200, 0.01)
-    ours = IteratedKalmanFilter(system, 0.01, Q=np.zeros((2, 2)), R=1e-20 * np.eye(1))
+    ours = IteratedKalmanFilter(system, 0.01, Q=np.zeros((2, 2)), R=1e-16 * np.eye(1))
     for k, y in enumerate(system.output(x)):
         found = ours.step(y) if k else ours.reset(y)
         assert np.isfinite(ours.nis).all()
@@ -225,6 +236,40 @@ def test_innovations_are_as_large_as_expected_where_the_model_holds(filters):
     ours.advance(y, rows=rows)
     np.testing.assert_array_equal(ours.nis[~rows], before[~rows])
     assert ours.nis[7] != before[7]
+
+
+@dataclass(frozen=True)
+class Level(Autonomous):
+    """The oscillator, whose first state is seen through a root, which is undefined below -1.2."""
+
+    name: ClassVar[str] = "level"
+
+    def h(self, x):
+        return (sqrt(x[0] + 1.2),)
+
+
+def test_samples_count_where_h_is_undefined_at_some_sigma_points(filters):
+    """Motions stay where h is defined; a start so wide that its points do not is no reason to leave a sample out."""
+    system, dt, rng = Level(), 0.02, np.random.default_rng(0)
+    x = simulate(system, rng.uniform(-0.7, 0.7, (20, 2)), 500, dt)
+    y = system.output(x) + 0.01 * rng.normal(size=(501, 20, 1))
+    wide = np.zeros(2), np.eye(2)
+    ours = filters(system, dt, Q=1e-6 * np.eye(2), R=1e-4 * np.eye(1), start=wide)
+    for k, sample in enumerate(y):
+        x_hat = ours.step(sample) if k else ours.reset(sample)
+        assert (ours.nis > 0.0).all()
+    assert np.abs(x_hat - x[-1]).max() < 0.05
+
+
+def test_where_h_is_undefined_all_over_nothing_is_learned_and_that_is_said(filters):
+    system = Level()
+    start = np.array([-3.0, 0.0]), 1e-4 * np.eye(2)
+    ours = filters(system, 0.02, Q=1e-6 * np.eye(2), R=1e-4 * np.eye(1), start=start)
+    found = ours.reset(np.array([[1.0]]))
+    np.testing.assert_allclose(found, [[-3.0, 0.0]])
+    assert np.isinf(ours.nis)
+    found = run(ours, np.ones((20, 1, 1)))
+    assert np.isfinite(found).all()
 
 
 def test_missing_outputs_correct_nothing(filters):

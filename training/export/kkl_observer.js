@@ -304,14 +304,11 @@ class Tracker {
   /** The covariance of the estimate's error; the map is that of free motion until an input acts. */
   covariance(map, z, age, free) {
     const { ages, logs, doubts } = this.calibrated[Number(free)];
-    const within = this.seen < this.window;
-    const at = (values) => { // and soon after a start the larger one of that after so many samples
-      const own = interpolate(age * this.dt, ages, values);
-      return within ? Math.max(own, interpolate(this.seen * this.dt, ages, values)) : own;
-    };
+    const at = (values) => // the larger one of that after so many samples, where some were missing
+      Math.max(...[age, this.seen].map((count) => interpolate(count * this.dt, ages, values)));
     const factor = Math.exp(at(logs)), doubt = at(doubts);
     const P = scaled(this.P, this.x_scale, 1);
-    if (!within) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
+    if (this.seen >= this.window) return P.map((row, i) => row.map((value, j) => factor * (i === j ? 1 : 1 - doubt) * value));
     const said = map.covariance(z, this.seen * this.dt), estimate = this.estimate;
     const apart = map.mean(z, age * this.dt).map((value, i) => value - estimate[i]);
     return P.map((row, i) => row.map((value, j) => factor * (value + doubt * (said[i][j] + apart[i] * apart[j] - value))));
@@ -363,6 +360,13 @@ class Monitor {
   }
 }
 
+/** Whether there are so many finite numbers, or else entries that are missing where these may be. */
+const holds = (values, count, gaps = false) =>
+  values?.length === count && Array.from(values).every((value) => Number.isFinite(value) || (gaps && Number.isNaN(value ?? NaN)));
+
+/** What was given in place of numbers: a text in which nothing is left out. */
+const shown = (values) => (values?.length === undefined || typeof values === "string" ? String(values) : `[${Array.from(values, String).join(", ")}]`);
+
 export class Observer {
   /**
    * @param {ArrayBuffer} buffer what `kkl-gym export MAP --format js` wrote
@@ -403,7 +407,7 @@ export class Observer {
 
   /** Forget the past and take in the first sample; returns the estimate. */
   reset(y0) {
-    if (y0?.length !== this.ny || !Array.from(y0).every(Number.isFinite)) throw new Error(`the first sample has ${this.ny} finite outputs, got ${y0}`);
+    if (!holds(y0, this.ny)) throw new Error(`the first sample has ${this.ny} finite outputs, got ${shown(y0)}`);
     const { equilibrium } = this.tensors;
     this.z = new Float64Array(this.nz * (1 + this.nu));
     for (let i = 0; i < this.nz; i++) this.z[i] = this.#dot(equilibrium.data, i, y0);
@@ -420,7 +424,9 @@ export class Observer {
    * Outputs that are missing, NaN among several, are predicted, which needs a map with a linear output.
    */
   step(y, u = new Array(this.nu).fill(0)) {
-    if (y !== null && y?.length !== this.ny) throw new Error(`a sample has ${this.ny} outputs, or is null, got ${y}`);
+    if (!this.y) throw new Error("call reset(y0) before step");
+    if (y !== null && !holds(y, this.ny, true)) throw new Error(`a sample has ${this.ny} outputs, NaN where one is missing, or is null, got ${shown(y)}`);
+    if (!holds(u, this.nu)) throw new Error(`an input has ${this.nu} finite entries, got ${shown(u)}`);
     const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
     let now = y;
     if (this.tracker) {
