@@ -255,6 +255,34 @@ def test_a_covariance_in_doubt_says_less_of_what_goes_together():
     np.testing.assert_array_equal(doubts.decode(), plain.decode())
 
 
+def test_covariances_are_calibrated_as_those_of_the_samples_that_were_there():
+    ages, values, (_, y) = np.array([0.0, 2.0, 4.0]), np.array([9.0, 3.0, 1.0]), runs(steps=150)
+    artifact = tracking_observer(factors=Factors(np.zeros(1), ages, values[None]))
+    batch, sure, single = (KKLObserver(each, LEVEL) for each in (artifact, tracking_observer(), artifact))
+    y[3:60, :2] = np.nan  # of two rows in three
+    seen = np.zeros(3)
+    for k, samples in enumerate(y):
+        for observer in (batch, sure):
+            observer.step(samples) if k else observer.reset(samples)
+        missing = np.isnan(samples[:, 0])
+        single.step(None if missing[1] else samples[1]) if k else single.reset(samples[1])
+        seen += bool(k) & ~missing
+        factors = np.exp(np.interp(seen * DT, ages, np.log(values)))
+        np.testing.assert_allclose(batch.covariance, factors[:, None, None] * sure.covariance, rtol=1e-9)
+        np.testing.assert_allclose(single.covariance, batch.covariance[1], **CLOSE)
+
+
+def test_what_single_covariances_are_multiplied_with_is_not_kept_for_ever(monkeypatch):
+    monkeypatch.setattr("observers.tracker.KEPT", 10)
+    factors = Factors(np.zeros(1), np.array([0.0, 1e3]), np.array([[9.0, 1.0]]))
+    (_, y), observer = runs(steps=60), KKLObserver(tracking_observer(factors=factors), LEVEL)
+    whole = observer.estimate_covariance(y[:, 0])
+    for k in range(60):
+        observer.step(y[k, 0]) if k else observer.reset(y[k, 0])
+        np.testing.assert_array_equal(observer.covariance, whole[k])
+        assert len(observer._tracker._free_calibrated._scales) <= 10
+
+
 @pytest.mark.parametrize("doubt", [0.1, 1.0])
 def test_soon_after_a_start_t_inv_is_asked_what_errors_there_may_be(doubt):
     (_, y), artifact = runs(), tracking_observer(factors=doubting(doubt))

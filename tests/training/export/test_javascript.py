@@ -123,8 +123,11 @@ def test_error_bars(process, options, make_artifact, tmp_path):
     assert np.allclose(found, covariances, rtol=1e-3, atol=1e-5 * np.abs(covariances).max())
 
 
-@pytest.mark.parametrize("sample", ["0.5", "[]", "undefined", "[1, 2]"])
-def test_what_is_no_sample_is_refused(sample, make_artifact, tmp_path):
+NO_INPUTS = ["[]", "[NaN]", "[null]", "0.5", "null"]
+
+
+@pytest.mark.parametrize("sample", ["0.5", "[]", "undefined", "[1, 2]", "[Infinity]", '["abc"]', '"a"'])
+def test_what_is_no_sample_or_input_is_refused(sample, make_artifact, tmp_path):
     write_step(tmp_path / "step.safetensors", exported_of(make_artifact(), tmp_path))
     (tmp_path / "kkl_observer.mjs").write_text(javascript(), encoding="utf-8")
     program = f"""
@@ -134,14 +137,24 @@ def test_what_is_no_sample_is_refused(sample, make_artifact, tmp_path):
         for (const first of [[null], [NaN], {sample}]) {{
           try {{ observer.reset(first); }} catch (error) {{ console.log(error.message); }}
         }}
+        const steps = [[[1]], [{sample}], ...[{", ".join(NO_INPUTS)}].map((u) => [[1], u])];
+        for (const step of steps) {{
+          try {{ observer.step(...step); }} catch (error) {{ console.log(error.message); }}
+          if (step === steps[0]) observer.reset([1]);
+        }}
+        const z = [...observer.z];
         observer.reset([1]);
-        observer.step({sample});
+        if (z.some((value, i) => value !== observer.z[i])) throw new Error("the filter has moved");
     """
     done = subprocess.run(["node", "--input-type=module", "-e", program], cwd=tmp_path, capture_output=True, text=True)
-    got = sample.strip("[]").replace(" ", "")
-    expected = [f"the first sample has 1 finite outputs, got {each}" for each in ("", "NaN", got)]
-    assert done.stdout.splitlines() == expected
-    assert f"a sample has 1 outputs, or is null, got {got}" in done.stderr
+    got = sample.replace('"', "")
+    assert done.stdout.splitlines() == [
+        *(f"the first sample has 1 finite outputs, got {each}" for each in ("[null]", "[NaN]", got)),
+        "call reset(y0) before step",
+        f"a sample has 1 outputs, NaN where one is missing, or is null, got {got}",
+        *(f"an input has 1 finite entries, got {each}" for each in NO_INPUTS),
+    ]
+    assert not done.stderr
 
 
 @pytest.mark.parametrize("options", KINDS)
@@ -165,6 +178,7 @@ def test_error_bars_of_maps_that_track(tmp_path):
         replace(artifact, flow=replace(artifact.flow, factors=doubtful, free_factors=free)), tmp_path
     )
     y, u = signals(artifact, 200)
+    y[3:9] = np.nan  # which the calibration knows of later too
     u[7:] += 0.1  # from within the window on
     found = np.array(replayed(exported, tmp_path, y, u, told=(0.7, 0.05))["covariance"])
     told = replace(exported, measurement_noise=0.7, process_noise=0.05)
