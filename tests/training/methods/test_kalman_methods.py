@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from kkl_gym import get_system
+from training.kalman import IteratedKalmanFilter, measurement_covariance
 from training.methods import get_method
-from training.methods.kalman import DIFFUSION, WRONG_DIFFUSION
+from training.methods.kalman import DIFFUSION, WRONG_DIFFUSION, diffusion_intensity
 
 
 def test_wrong_models_are_ten_percent_off():
@@ -46,7 +47,8 @@ def test_the_guided_filter_takes_the_shipped_map_and_is_told_the_noise():
     y = np.array([[3.0], [-1.0]])
     for noise in (1.0, 50.0):  # which is beyond what the map was trained for
         ours = method.observer({"diffusion": np.array([0.01])}, system, 0.01, noise)
-        alone = get_method("ukf").observer({"diffusion": np.array([0.01])}, system, 0.01, noise)
+        Q = diffusion_intensity({"diffusion": np.array([0.01])}, system)
+        alone = IteratedKalmanFilter(system, 0.01, Q=Q, R=measurement_covariance(system, noise))
         np.testing.assert_allclose(ours.reset(y), alone.reset(y), rtol=1e-12)
         np.testing.assert_allclose(ours.step(y), alone.step(y), rtol=1e-12)
     with pytest.raises(ValueError, match=r"sampling interval dt = 0\.01"):
