@@ -205,6 +205,8 @@ class KKLObserver:
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 
+        A map that tracks, in place of one that does not, takes all samples since the reset for such as were there.
+
         Parameters
         ----------
         artifact : Artifact
