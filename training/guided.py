@@ -13,18 +13,14 @@ from kkl_gym.systems import get_system
 from observers import Artifact, KKLObserver
 from observers.checks import bool_array, check_dt, noise_level, noise_levels, real_array, shown
 from observers.names import resolve
-from training.kalman import (
-    FLOOR_WHERE_WATCHED,
-    LEAST_VARIANCE,
-    LEAST_WHERE_WATCHED,
-    IteratedKalmanFilter,
-    measurement_covariance,
-    process_intensity,
-)
+from training.kalman import LEAST_VARIANCE, IteratedKalmanFilter, measurement_covariance, process_intensity
 from training.seeds import Stream, generator
 from training.trajectories.noise import draw_process_noise, noisy_output
 from training.trajectories.signals import random_inputs
 
+# The least noise that is assumed, in the units of training.kalman: a filter that is taken back where it is lost may
+# trust its samples and its model more.
+NOISE_FLOOR, LEAST_PROCESS_NOISE = 0.001, 0.0005
 RUNS = 200  # that say how far the observer's estimates are off
 FACTOR = 2.0  # of X, from which they start: states beyond X are to be found too
 SETTLED = 5.0  # s at the pace of the shipped systems, after which errors count as those of any later age
@@ -99,14 +95,12 @@ class GuidedKalmanFilter:
         level = artifact.measurement_noise if measurement_noise is None else measurement_noise
         level = noise_levels("measurement_noise", level, system.ny)
         disturbed = system.process_noise if process_noise is None else noise_level("process_noise", process_noise)
-        Q = process_intensity(system, disturbed, dt, least=LEAST_WHERE_WATCHED) if Q is None else _checked(Q, system.nx)
+        Q = process_intensity(system, disturbed, dt, least=LEAST_PROCESS_NOISE) if Q is None else _checked(Q, system.nx)
         self.system = system
         self._batch: tuple[int, ...] | None = None
         artifact = dataclasses.replace(artifact, flow=None)  # which would be a second filter of the kind
         self._observer = KKLObserver(artifact, artifact.inverse.within(level), process_noise=disturbed)
-        self._filter = IteratedKalmanFilter(
-            system, dt, Q=Q, R=measurement_covariance(system, level, floor=FLOOR_WHERE_WATCHED)
-        )
+        self._filter = IteratedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, level, floor=NOISE_FLOOR))
         self._ages, self._covariances = _errors_by_age(self._observer, system, level)
         self._log_volumes = np.linalg.slogdet(self._covariances)[1]
         self._window, self._share = round(WINDOW * system.pace / dt), -np.expm1(-dt / (WINDOW * system.pace))

@@ -15,8 +15,6 @@ NOISE_FLOOR = 0.002  # the least measurement noise that a filter assumes, in mul
 STARTS = 10_000  # of which mean and covariance are taken where a system draws its own
 LEAST_VARIANCE = 1e-6  # added to that of each state, over X's width squared, so that the covariance stays positive
 LEAST_PROCESS_NOISE = 0.005  # that a filter assumes, at the system's pace: a tenth of the environments' default
-# The same of filters that are taken back where they are lost, and so may trust their samples and their model more.
-FLOOR_WHERE_WATCHED, LEAST_WHERE_WATCHED = 0.001, 0.0005
 
 Corrected = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Means, covariances and normalised innovations squared (n,) of a batch."""

@@ -11,7 +11,6 @@ from rich.console import Console
 from kkl_gym.system import System
 from observers import Artifact, Factors, Flow
 from training.config import settings_of
-from training.kalman import LEAST_WHERE_WATCHED
 from training.maps.ahead import draw_courses, learn_ahead
 from training.maps.flow import Increments, draw_increments, fit_flow, possible_degrees, usual_bend, usual_error
 from training.maps.regions import LEVELS, Errors, Regions, errors_along, level_of
@@ -23,6 +22,7 @@ from training.trajectories.expression import output_expression
 from training.trajectories.signals import DRIVEN
 
 LEAST_NOISE = 0.02  # the least measurement noise that is assumed, in multiples of what is usual for the map
+LEAST_PROCESS_NOISE = 0.002  # the same of process noise, at the pace of the shipped systems
 OF_OUTPUT = 1e-4  # of each output's standard deviation: less noise is not assumed, as covariances would be rounding
 AHEAD = 0.125  # of the batches that learn single samples, so many learn many samples in a row
 UNSURE = 1.5  # times what was added to covariances at each sample before: a flow that asks for more is not taken
@@ -195,7 +195,7 @@ def _learned(
         low=low,
         high=high,
         process_noise=np.array(system.scale) / increments.x_scale * dt / np.sqrt(3),
-        least_process_noise=LEAST_WHERE_WATCHED / system.pace,
+        least_process_noise=LEAST_PROCESS_NOISE / system.pace,
         least_measurement_noise=np.where(least > 0, least, 1.0),
         window=WINDOW * system.pace,
     )
