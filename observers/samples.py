@@ -89,8 +89,7 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
         return np.zeros((*batch, 0))
     if u.shape != (*batch, nu):
         raise ValueError(f"u must have shape {(*batch, nu)}, got {u.shape}")
-    if not all_finite(u):
-        raise ValueError(f"u holds NaN, infinity or values beyond 1e15: {_first_of('u', u)}")
+    _check_finite("u", u)
     return u
 
 
@@ -124,9 +123,7 @@ def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tu
     x0, shape = real_array("x0", x0), (*y0.shape[:-1], artifact.nx)
     if x0.shape != shape:
         raise ValueError(f"x0 must have shape {shape}, got {x0.shape}")
-    if not all_finite(x0):
-        found = _first_of("x0", x0)
-        raise ValueError(f"x0 holds NaN, infinity or values beyond 1e15: {found}; leave x0 out where it is unknown")
+    _check_finite("x0", x0, hint="; leave x0 out where it is unknown")
     if artifact.forward is None:  # where the tracker begins
         return artifact.filter.start(y0), 0
     z0 = np.zeros((*shape[:-1], artifact.filter.size))
@@ -167,16 +164,24 @@ def checked_record(
         raise ValueError(f"y must be a record of shape (steps, ..., {artifact.ny}), got {y.shape}")
     gaps = check_output(artifact, y, y.shape[:-1])
     if gaps is not None:
-        check_output(artifact, y[0], y.shape[1:-1], first=True)
+        check_output(artifact, y[:1], y[:1].shape[:-1], first=True)
         y = y.copy()  # in which they are filled
     if u is not None:
         u = real_array("u", u)
         if u.ndim < 1 or len(u) not in (len(y) - 1, len(y)):
             raise ValueError(f"u must have {len(y) - 1} or {len(y)} rows for {len(y)} rows of y, got shape {u.shape}")
+        if artifact.nu:
+            _check_finite("u", u[: len(y) - 1])
     return y, u, gaps
 
 
+def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
+    """ValueError that names the first entry that is no number, or beyond what is taken for one."""
+    if not all_finite(values):
+        raise ValueError(f"{name} holds NaN, infinity or values beyond 1e15: {_first_of(name, values)}{hint}")
+
+
 def _first_of(name: str, values: np.ndarray) -> str:
-    """Name the first entry that is no number, or beyond what is taken for one."""
+    """Its name and value."""
     at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
     return f"{name}[{', '.join(map(str, at))}] = {values[at]}"

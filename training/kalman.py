@@ -105,7 +105,7 @@ class KalmanFilter(ABC):
         Their covariances.
     nis : ndarray, shape (n,)
         Normalised innovations squared of the last samples, per output: 1 on average where all is as assumed, 0 where
-        no output was measured, and infinite in rows that have started anew.
+        no output was measured, and infinite in rows that have started anew, or in which h is undefined.
     """
 
     def __init__(

@@ -394,13 +394,14 @@ class KKLVectorObservation(VectorEstimate):
             As there.
         """
         asked = self._estimator.asked(observer)
-        _check_process_noise(self.env, asked)
+        if self.observer.artifact.environment is None:  # the vector is of environments of ours
+            _check_process_noise(self.env, asked)
         self._estimator.replace(asked)
 
 
 def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
     """ValueError if the rows differ in a level of noise that the observer assumes for all of them."""
-    if artifact.environment is None and (artifact.process_noise_max is not None or artifact.flow is not None):
+    if artifact.process_noise_max is not None or artifact.flow is not None:
         plant_of(env, "process_noise")
 
 

@@ -273,6 +273,9 @@ def test_observers_that_do_not_replace(saved):
     ):
         with pytest.raises(ArtifactError, match=told):
             env.replace_observer(other)
+    envs = KKLVectorObservation(gym.make_vec("CartPole-v1", 2, vectorization_mode="sync"), saved(CART_POLE()))
+    with pytest.raises(ArtifactError, match="has environment"):
+        envs.replace_observer("van_der_pol")  # whose plants are not asked for
     spinn = KKLObservation(gym.make("KKLVanDerPol-v0"), "van_der_pol-spinn", known_start=True)
     with pytest.raises(ArtifactError, match="holds no forward map"):
         spinn.replace_observer(replace(spinn.observer.artifact, forward=None))

@@ -157,6 +157,21 @@ def test_what_is_neither_there_nor_missing(wrong):
     assert np.array_equal(observer.z, z)
 
 
+def test_what_is_wrong_in_a_record_is_named_by_its_place():
+    single, several = load("van_der_pol"), KKLObserver(exact())
+    y, u, rows = np.zeros((10, 1)), np.zeros((10, 1)), np.zeros((10, 4, 2))
+    u[9] = math.nan  # after the last sample, which is ignored
+    single.estimate(y, u)
+    u[7], rows[0, 2, 1] = math.nan, math.nan
+    with pytest.raises(ValueError, match=r"u\[7, 0\] = nan"):
+        single.estimate(y, u)
+    with pytest.raises(ValueError, match=r"y\[0, 2, 1\] = nan"):
+        several.estimate(rows)
+    rows[3, 1, 0] = math.inf
+    with pytest.raises(ValueError, match=r"y\[3, 1, 0\] = inf"):
+        several.estimate(rows)
+
+
 def test_a_prediction_that_is_no_number_is_not_taken():
     undefined = Expression([["sqrt", ["+", ["x", 0], -1e3]], ["x", 1]])
     observer, holding = KKLObserver(exact(C=None, h=undefined)), KKLObserver(exact(C=None))

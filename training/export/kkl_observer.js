@@ -364,8 +364,13 @@ class Monitor {
 const holds = (values, count, gaps = false) =>
   values?.length === count && Array.from(values).every((value) => Number.isFinite(value) || (gaps && Number.isNaN(value ?? NaN)));
 
-/** What was given in place of numbers: a text in which nothing is left out. */
-const shown = (values) => (values?.length === undefined || typeof values === "string" ? String(values) : `[${Array.from(values, String).join(", ")}]`);
+/** What was given in place of numbers, so that a text, a list and a big integer are told from a number. */
+const shown = (value) => {
+  if (typeof value === "string") return JSON.stringify(value);
+  if (typeof value === "bigint") return `${value}n`;
+  if (value === null || typeof value !== "object") return String(value);
+  return value.length === undefined ? Object.prototype.toString.call(value) : `[${Array.from(value, shown).join(", ")}]`;
+};
 
 export class Observer {
   /**
@@ -428,7 +433,7 @@ export class Observer {
     if (y !== null && !holds(y, this.ny, true)) throw new Error(`a sample has ${this.ny} outputs, NaN where one is missing, or is null, got ${shown(y)}`);
     if (!holds(u, this.nu)) throw new Error(`an input has ${this.nu} finite entries, got ${shown(u)}`);
     const missing = this.y.map((_, i) => Number.isNaN(y?.[i] ?? NaN));
-    let now = y;
+    let now = y && Array.from(y);
     if (this.tracker) {
       now = this.tracker.advance(missing.map((gap, i) => (gap ? NaN : y[i])), u, this.y);
     } else if (missing.includes(true)) {
