@@ -182,6 +182,6 @@ def _check_finite(name: str, values: np.ndarray, *, hint: str = "") -> None:
 
 
 def _first_of(name: str, values: np.ndarray) -> str:
-    """Its name and value."""
+    """Index and value of the first entry that is no number, or beyond what is taken for one."""
     at = tuple(np.argwhere(~(np.abs(values) <= LARGEST))[0].tolist())
     return f"{name}[{', '.join(map(str, at))}] = {values[at]}"

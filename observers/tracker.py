@@ -464,9 +464,7 @@ class Tracker:
 
     def _output(self, s: np.ndarray) -> np.ndarray:
         y = self._artifact.output(self._flow.x_offset + self._flow.x_scale * s)
-        if (
-            not np.isfinite(y).all() and s.ndim == 3
-        ):  # beyond the motion, where sigma points may be, h need not be defined
+        if s.ndim == 3 and not np.isfinite(y).all():  # sigma points may lie beyond the motion, where h is undefined
             for nearer in (self._within(s), s.mean(0, keepdims=True)):
                 there = self._artifact.output(self._flow.x_offset + self._flow.x_scale * nearer)
                 y = np.where(np.isfinite(y), y, there)

@@ -1,7 +1,7 @@
 """Kalman filters that know the equations of motion: what a control engineer would try first."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -267,18 +267,18 @@ class UnscentedKalmanFilter(KalmanFilter):
 
     @np.errstate(over="ignore", invalid="ignore")
     def _predicted(self, u: np.ndarray) -> Gaussian:
-        x, P, _ = self._carried(self.x, self.P, u)
-        return x, P + self._Q * self._dt
+        move = self._motion(u)
+        return unscented.predicted(self.x, self.P, move=move, Q=self._Q * self._dt, points=self._points)
 
-    def _carried(self, x: np.ndarray, P: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the equations make of Gaussians in one sample, as :func:`observers.unscented.transformed` has it."""
+    def _motion(self, u: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """What takes sigma points, (points, n, nx), to where they are one sample later."""
 
         def move(points: np.ndarray) -> np.ndarray:
             flat = np.ascontiguousarray(points.reshape(-1, points.shape[-1]).T)
             moved = advance_batch(self._system, flat, np.tile(u, len(points)), np.zeros_like(flat), self._dt)
             return moved.T.reshape(points.shape)
 
-        return unscented.transformed(x, P, function=move, points=self._points)
+        return move
 
     @np.errstate(over="ignore", invalid="ignore")
     def _corrected(self, x: np.ndarray, P: np.ndarray, y: np.ndarray) -> Corrected:
@@ -318,15 +318,15 @@ class IteratedKalmanFilter(UnscentedKalmanFilter):
 
     @np.errstate(over="ignore", invalid="ignore")  # of rows that are lost, which start anew
     def _moved(self, u: np.ndarray, y: np.ndarray) -> Corrected:
-        Q = self._Q * self._dt
-        x, P, across = self._carried(self.x, self.P, u)
+        Q, move, points = self._Q * self._dt, self._motion(u), self._points
+        x, P, across = unscented.transformed(self.x, self.P, function=move, points=points)
         P = P + Q
         known, left, _ = self._updated(x, P, y)
         back = _solved(P, across.mT).mT  # the gain of a smoother (Rauch, Tung and Striebel, 1965)
         before = self.x + (back @ (known - x)[..., None])[..., 0]
         spread = self.P + back @ (left - P) @ back.mT
         spread = (spread + spread.mT) / 2
-        around, curved, across = self._carried(before, spread, u)
+        around, curved, across = unscented.transformed(before, spread, function=move, points=points)
         A = _solved(spread, across).mT
         curved = curved - A @ across  # what is not linear, as noise
         again = around + (A @ (self.x - before)[..., None])[..., 0]

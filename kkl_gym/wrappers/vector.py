@@ -396,7 +396,7 @@ class KKLVectorObservation(VectorEstimate):
         asked = self._estimator.asked(observer)
         if self.observer.artifact.environment is None:  # the vector is of environments of ours
             _check_process_noise(self.env, asked)
-        self._estimator.replace(asked)
+        self.observer.replace(asked)
 
 
 def _check_process_noise(env: gym.vector.VectorEnv, artifact: Artifact) -> None:
