@@ -17,18 +17,6 @@ def complete(cls: Any, base: Any) -> None:
     """Check the class variables of a system, and fill in those that follow from others.
 
     Numbers may be of any real type and be held by lists or arrays; they become tuples of Python's numbers.
-
-    Parameters
-    ----------
-    cls : type of System
-        The class.
-    base : type
-        ``System``, which has the defaults.
-
-    Raises
-    ------
-    TypeError
-        If one is missing, is of the wrong kind or does not fit the others.
     """
     _check_names(cls, base)
     _read_box(cls)

@@ -39,22 +39,7 @@ class EquationError(ValueError):
 
 
 def failed(error: Exception, equations: Equations, *args: Any) -> EquationError:
-    """Say that equations raised an exception.
-
-    Parameters
-    ----------
-    error : Exception
-        What they raised.
-    equations : callable
-        Which they are.
-    *args
-        What they were given: the components of the state first.
-
-    Returns
-    -------
-    EquationError
-        To be raised from the exception.
-    """
+    """Say that equations raised an exception."""
     what, x = f"{type(error).__name__}: {error}", args[0]
     steps = steps_within(error, code_of(equations))
     if not steps:

@@ -32,23 +32,7 @@ _POWERS = "take fractional powers of negative numbers by kkl_gym.elementary.sqrt
 def components(equations: Equations, *args: Any) -> Any:
     """Call a system's f, h or step, and check what comes back.
 
-    Parameters
-    ----------
-    equations : callable
-        A system's ``f``, ``h`` or ``step``, or another function of the state's components.
-    *args : sequence of length nx, and for ``step`` one of length nu
-        Components of the state, and of the input: floats, arrays, tensors or symbols.
-
-    Returns
-    -------
-    sequence
-        The components, untouched.
-
-    Raises
-    ------
-    EquationError
-        If it fails, or if what it returns is no sequence of numbers of the kind that the state holds, nx of them from f
-        and step.
+    Shapes: ``*args`` of length nx, and for ``step`` one of length nu.
     """
     values, x = _called(equations, *args), args[0]
     if name_of(equations) in ("f", "step"):
@@ -62,22 +46,7 @@ def components(equations: Equations, *args: Any) -> Any:
 def input_matrix(system: Any, x: Any) -> Any:
     """Call a system's g, and check what comes back.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : sequence of length nx
-        As for :func:`components`.
-
-    Returns
-    -------
-    sequence of sequences, shape (nx, nu)
-        Its rows, untouched.
-
-    Raises
-    ------
-    EquationError
-        As :func:`components`, and if the shape is wrong.
+    Shapes: ``x`` of length nx; returns (nx, nu).
     """
     rows, nx, nu = _called(system.g, x), len(x), system.nu
     wanted = f"{nx} rows, one for each state, of {nu} components, one for each input"
@@ -91,22 +60,7 @@ def input_matrix(system: Any, x: Any) -> Any:
 def rate_at(system: Any, x: Any) -> Any:
     """Call a system's rate, and check what comes back.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : sequence of length nx
-        As for :func:`components`.
-
-    Returns
-    -------
-    float, array, tensor or symbol
-        The rate in 1/s, untouched.
-
-    Raises
-    ------
-    EquationError
-        As :func:`components`.
+    Shapes: ``x`` of length nx.
     """
     value = _called(system.rate, x)
     if not _fits(value, x[0]):
@@ -115,18 +69,7 @@ def rate_at(system: Any, x: Any) -> Any:
 
 
 def check_equations(system: Any) -> None:
-    """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays.
-
-    Parameters
-    ----------
-    system : System
-        A user's system.
-
-    Raises
-    ------
-    EquationError
-        If f or h is missing, an equation fails, returns something wrong or not finite, or mixes the states of a batch.
-    """
+    """Check what a system's equations return at a few starts, one by one on floats and all at once on arrays."""
     names = ("step", "h", "rate") if system.discrete else ("f", "h", "g", "rate")
     for name in names[:2]:
         if _is_default(getattr(system, name)):
@@ -192,20 +135,7 @@ def _checked_starts(system: Any) -> np.ndarray:
 def target_of(system: Any) -> Any:
     """A system's target, checked.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-
-    Returns
-    -------
-    sequence of float, length nx
-        The target, untouched.
-
-    Raises
-    ------
-    EquationError
-        If it fails, as where there is no equilibrium, or is something else than a state.
+    Shapes: returns of length nx.
     """
     found, nx = f"target of {system.name!r}", system.nx
     try:
@@ -227,19 +157,7 @@ def _unfinished(what: str, error: Exception) -> EquationError:
 def blame(error: Exception, system: Any, *args: Any) -> None:
     """Raise an EquationError if an exception comes from a system's equations of motion, and return otherwise.
 
-    Parameters
-    ----------
-    error : Exception
-        What was raised where they are evaluated in a loop.
-    system : System
-        The system.
-    *args : sequences of length nx and nu
-        Components of a state and of an input, of the kind that the loop evaluates them on.
-
-    Raises
-    ------
-    EquationError
-        From the exception, or because the equations do not return what they must.
+    Shapes: ``*args`` of length nx and nu.
     """
     if isinstance(error, EquationError | NotImplementedError):
         return
@@ -260,17 +178,7 @@ def blame(error: Exception, system: Any, *args: Any) -> None:
 def complex_motion(system: Any, x: Any) -> EquationError:
     """Say that a motion left the real numbers, as ``x ** 0.5`` does for floats below zero.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : sequence of float, length nx
-        The state from which the step was taken.
-
-    Returns
-    -------
-    EquationError
-        To be raised.
+    Shapes: ``x`` of length nx.
     """
     found = f"complex ones on the way from {held(x)}: {_POWERS}"
     return returned(system.step if system.discrete else system.f, "real numbers", found)

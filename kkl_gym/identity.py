@@ -21,23 +21,7 @@ def source_of(env: Any) -> str:
 
 
 def identity(env: Env) -> dict[str, Any]:
-    """Id and arguments of an environment.
-
-    Parameters
-    ----------
-    env : gymnasium.Env or gymnasium.vector.VectorEnv
-        Made by ``gym.make`` or ``gym.make_vec``, or a vector of such.
-
-    Returns
-    -------
-    dict of str to object
-        ``id``, and ``kwargs`` as JSON holds them, without those that change nothing but what is drawn.
-
-    Raises
-    ------
-    ValueError
-        If it has no specification, or an argument that JSON cannot hold, or the environments of a vector differ.
-    """
+    """Id and arguments of an environment."""
     base: Any = env.unwrapped
     specs = base.get_attr("spec") if _of_rows(base) else [env.spec]
     found = [_identity(spec, env) for spec in specs]
@@ -78,22 +62,7 @@ def _of_rows(base: Any) -> bool:
 
 
 def check_identity(artifact: Artifact, env: Env) -> None:
-    """See that an observer was made for an environment.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer from rollouts of an environment.
-    env : gymnasium.Env or gymnasium.vector.VectorEnv
-        The environment.
-
-    Raises
-    ------
-    ArtifactError
-        If id, arguments or sampling interval differ; the message names both values.
-    ValueError
-        As :func:`identity`.
-    """
+    """See that an observer was made for an environment."""
     made: Mapping[str, Any] = artifact.environment or {}
     found = identity(env)
 

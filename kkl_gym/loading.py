@@ -16,25 +16,7 @@ Class = TypeVar("Class")
 
 
 def load_class(name: str, base: type[Class]) -> type[Class]:
-    """Find a subclass by where it is written.
-
-    Parameters
-    ----------
-    name : str
-        ``"package.module:Class"`` or ``"path/to/script.py:Class"``.
-    base : type
-        What it must be a subclass of.
-
-    Returns
-    -------
-    type
-        The class.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be found or is not a subclass of ``base``.
-    """
+    """Find a subclass by where it is written."""
     where, _, class_name = name.rpartition(":")
     failure = f"cannot load the {base.__name__.lower()} {name!r}"
     module = _imported(where, failure)
@@ -49,23 +31,7 @@ def load_class(name: str, base: type[Class]) -> type[Class]:
 
 
 def load_function(name: str) -> Callable[..., Any]:
-    """Find a function by where it is written.
-
-    Parameters
-    ----------
-    name : str
-        ``"package.module:function"`` or ``"path/to/script.py:function"``.
-
-    Returns
-    -------
-    callable
-        The function.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be found or called.
-    """
+    """Find a function by where it is written."""
     where, _, function_name = name.rpartition(":")
     failure = f"cannot load the function {name!r}"
     found = getattr(_imported(where, failure), function_name, None)

@@ -37,30 +37,8 @@ class Memory:
     amplified at most threefold in the end. It is amplified more at first, where there is little to tell a rate from:
     by the default time constants 22-fold in the first step, and fourfold in the fifth.
 
-    Parameters
-    ----------
-    ny, nu : int
-        Numbers of outputs and inputs.
-    time_constants : sequence of float, length m
-        Of outputs, in steps, each at least 1.5 times the one before.
-    input_time_constants : sequence of float, length k
-        Of inputs, in steps, likewise; there may be none.
-
-    Attributes
-    ----------
-    time_constants, input_time_constants : tuple of float
-        As given.
-    decay, rise : ndarray, shape (m,)
-        What w keeps of itself in a step, and what it takes of y's change.
-    mixing : ndarray, shape (m, m)
-        What makes coordinates, slowest first, of w, fastest first.
-    input_decay : ndarray, shape (k,)
-        What v keeps of itself in a step; the rest is the input's.
-
-    Raises
-    ------
-    ValueError
-        If time constants are no numbers, from 0.5 to 10,000 steps, or too close to each other.
+    Shapes: ``time_constants`` of length m, ``input_time_constants`` of length k, ``decay``, ``rise`` (m,), ``mixing``
+    (m, m), ``input_decay`` (k,).
     """
 
     def __init__(
@@ -113,19 +91,7 @@ class Memory:
     ) -> np.ndarray:
         """The least and the largest that can be shown, at any age; the worst signals come within 1 % of them.
 
-        Parameters
-        ----------
-        low, high : ndarray, shape (ny,)
-            Bounds of the outputs, which may be infinite.
-        u_low, u_high : ndarray, shape (nu,)
-            Bounds of the inputs.
-        change : ndarray, shape (ny,), or float
-            What outputs change by in a step, at most; may be infinite.
-
-        Returns
-        -------
-        ndarray, shape (2, size)
-            Lower and upper bounds, infinite where a signal's are.
+        Shapes: ``low``, ``high`` (ny,), ``u_low``, ``u_high`` (nu,), ``change`` (ny,), or float; returns (2, size).
         """
         ages = {*range(1, min(64, self._filled)), *np.geomspace(64, max(64, self._filled), 64).astype(int).tolist()}
         with np.errstate(under="ignore"):
@@ -147,15 +113,7 @@ class Memory:
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget all, as if the outputs had rested at ``y0`` and no input had acted.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (ny,) or (n, ny)
-            First outputs, of a single row or of a batch.
-
-        Returns
-        -------
-        ndarray of float32, shape (size,) or (n, size)
-            As :meth:`advance`.
+        Shapes: ``y0`` (ny,) or (n, ny); returns (size,) or (n, size).
         """
         if y0.ndim == 1:
             if self._matrices is None:
@@ -172,17 +130,7 @@ class Memory:
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Forget the past in some rows of a batch.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (number of True in rows, ny)
-            Their first outputs.
-        rows : ndarray of bool, shape (n,)
-            Which rows begin anew.
-
-        Returns
-        -------
-        ndarray of float32, shape (number of True in rows, size)
-            What is shown of them.
+        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,); returns (number of True in rows, size).
         """
         if self._y is None:
             raise RuntimeError("reset all environments before some of them")
@@ -193,25 +141,7 @@ class Memory:
     def advance(self, y: np.ndarray, u: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Take in the next outputs, and the inputs that led to them.
 
-        Parameters
-        ----------
-        y : ndarray, shape (ny,) or (n, ny)
-            Outputs.
-        u : ndarray, shape (nu,) or (n, nu)
-            Inputs, held since the outputs before.
-        rows : ndarray of bool, shape (n,), optional
-            Which rows of a batch take them in; None is all.
-
-        Returns
-        -------
-        ndarray of float32, shape (size,) or (n, size)
-            y, then the slowest coordinate of each output, and so on to the fastest; then the inputs, filtered by each
-            time constant.
-
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`.
+        Shapes: ``y`` (ny,) or (n, ny), ``u`` (nu,) or (n, nu), ``rows`` (n,); returns (size,) or (n, size).
         """
         if y.ndim == 1:
             if self._row is None:
@@ -243,15 +173,7 @@ class Memory:
     def shown(self, rows: np.ndarray | None = None) -> np.ndarray:
         """What is shown of a batch as things stand.
 
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (n,), optional
-            Of which rows; None is all.
-
-        Returns
-        -------
-        ndarray of float32, shape (n, size) or (number of True in rows, size)
-            As :meth:`advance`.
+        Shapes: ``rows`` (n,); returns (n, size) or (number of True in rows, size).
         """
         w, coordinates = self._w, self._spare
         if (self._ages < self._filled).any():

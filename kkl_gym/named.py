@@ -20,19 +20,7 @@ _INFO = re.compile(r"info\[([^\[\]]+)\](?:\[(\d+)\])?")
 
 
 def observed(space: Space) -> tuple[str, ...]:
-    """Names of the entries of a flattened observation.
-
-    Parameters
-    ----------
-    space : gymnasium.Space
-        Of one observation.
-
-    Returns
-    -------
-    tuple of str
-        ``obs[0]``, ``obs[1]``, ...; of a Dict ``key[0]``, ``key[1]``, ..., or ``key`` where it holds one number. What
-        has no numbers is left out.
-    """
+    """Names of the entries of a flattened observation."""
     if not isinstance(space, spaces.Dict):
         return tuple(f"obs[{i}]" for i in range(_size(space)))
     sizes = {key: _size(part) for key, part in space.items()}
@@ -52,31 +40,7 @@ def _size(space: Space) -> int:
 
 
 def resolved(names: Sequence[str | int], space: Space, *, role: str, source: str) -> tuple[str, ...]:
-    """Full names of signals.
-
-    Parameters
-    ----------
-    names : sequence of str or int
-        Each an index in the flattened observation (``0`` or ``obs[0]``), a key of a Dict, which stands for all of its
-        entries, one of those (``key[0]``), what ``info`` holds (``info[key]``, ``info[key][0]``), or ``cos(...)`` or
-        ``sin(...)`` of one of these.
-    space : gymnasium.Space
-        Of one observation.
-    role : str
-        What the signals are, for messages.
-    source : str
-        The environment, for messages.
-
-    Returns
-    -------
-    tuple of str
-        As :func:`observed` names entries.
-
-    Raises
-    ------
-    ValueError
-        If there is no such entry; the message says which there are.
-    """
+    """Full names of signals."""
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ValueError(f"{role} must be a sequence of names or indices, such as [0, 1], got {shown(names)}")
     there, found = observed(space), list[str]()
@@ -109,26 +73,7 @@ def _entries(name: str, space: Space, there: tuple[str, ...]) -> tuple[str, ...]
 class Reader:
     """Reads named signals from observations and from what ``info`` holds.
 
-    Parameters
-    ----------
-    space : gymnasium.Space
-        Of one observation.
-    names : sequence of str
-        As :func:`resolved` returns them.
-    source : str
-        The environment, for messages.
-
-    Attributes
-    ----------
-    low, high : ndarray, shape (n,)
-        Bounds of the signals, which may be infinite.
-    keys : tuple of str
-        What is asked of ``info``.
-
-    Raises
-    ------
-    ValueError
-        If a signal is of an image, or of what has no numbers.
+    Shapes: ``low``, ``high`` (n,).
     """
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
@@ -163,24 +108,7 @@ class Reader:
     def __call__(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> np.ndarray:
         """The signals.
 
-        Parameters
-        ----------
-        observation : object
-            A value of the space, or as many as ``batch`` says.
-        info : mapping
-            What came with it.
-        batch : tuple of int
-            Leading shape of both.
-
-        Returns
-        -------
-        ndarray, shape (*batch, n)
-            Values.
-
-        Raises
-        ------
-        ValueError
-            If the observation is not of the space, holds NaN among what is read, or ``info`` lacks a number.
+        Shapes: returns (*batch, n).
         """
         parts = [] if self._outputs is None else [self._outputs(observation, batch)]
         parts += [self._of_info(info, entry, batch) for entry in self._infos]
@@ -215,24 +143,7 @@ def _info(entry: str) -> tuple[str, int | None]:
 class InputReader:
     """Reads named inputs from actions.
 
-    Parameters
-    ----------
-    space : gymnasium.Space
-        Of one action.
-    names : sequence of str
-        Some of those of :func:`acting`.
-    source : str
-        The environment, for messages.
-
-    Attributes
-    ----------
-    largest : ndarray, shape (n,)
-        Bounds of their sizes.
-
-    Raises
-    ------
-    ValueError
-        If actions have no numbers, or there is no such input.
+    Shapes: ``largest`` (n,).
     """
 
     def __init__(self, space: Space, names: Sequence[str], *, source: str) -> None:
@@ -246,22 +157,7 @@ class InputReader:
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
         """The inputs: bounded boxes scaled to [-1, 1] and cut there, discrete actions one-hot.
 
-        Parameters
-        ----------
-        action : object
-            A value of the space, or as many as ``batch`` says.
-        batch : tuple of int
-            Leading shape.
-
-        Returns
-        -------
-        ndarray, shape (*batch, n)
-            Values.
-
-        Raises
-        ------
-        ValueError
-            If the action is not of the space.
+        Shapes: returns (*batch, n).
         """
         return self._inputs(action, batch)[..., self._take]
 

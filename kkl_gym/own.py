@@ -9,44 +9,12 @@ OWN_ID = "kkl_gym/Own-v0"
 
 
 def single(**options: Any) -> KKLEnv:
-    """Make the environment of a system of the user's.
-
-    Parameters
-    ----------
-    **options
-        ``system``, and whatever else :class:`kkl_gym.KKLEnv` takes.
-
-    Returns
-    -------
-    KKLEnv
-        The environment.
-
-    Raises
-    ------
-    ValueError
-        Without a system, and as :class:`kkl_gym.KKLEnv`.
-    """
+    """Make the environment of a system of the user's."""
     return KKLEnv(**_named(options))
 
 
 def vector(**options: Any) -> KKLVectorEnv:
-    """Make many environments of a system of the user's, as one batch.
-
-    Parameters
-    ----------
-    **options
-        ``system``, and whatever else :class:`kkl_gym.KKLVectorEnv` takes.
-
-    Returns
-    -------
-    KKLVectorEnv
-        The environments.
-
-    Raises
-    ------
-    ValueError
-        Without a system, and as :class:`kkl_gym.KKLVectorEnv`.
-    """
+    """Make many environments of a system of the user's, as one batch."""
     return KKLVectorEnv(**_named(options))
 
 

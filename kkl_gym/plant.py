@@ -19,55 +19,8 @@ NOISE_BLOCK = 256  # noise is drawn for so many samples at once, because single 
 class Plant:
     """A system, its sampling interval, its noise and the spaces that follow.
 
-    Parameters
-    ----------
-    system : str or System
-        A name, ``"module:Class"``, ``"script.py:Class"``, or a system.
-    dt : float or None
-        Sampling interval in seconds; None takes the system's own.
-    process_noise : float or None
-        Bound of the uniform process noise as a multiple of the system's ``scale`` per second; None takes the system's
-        own default.
-    measurement_noise : float, sequence of float or None
-        Standard deviation of the Gaussian noise on each sample, of all outputs or one of each; None takes the system's
-        own default.
-    observe : {"state", "output"}
-        What the observation space is of.
-    parameters : mapping of str to float or None
-        Physical parameters of the system, by name, where they differ from its defaults.
-    start_box : tuple of (float, float), length nx, or None
-        (low, high) of each state, where episodes start; None is the system's training box, or where the system draws
-        its starts.
-
-    Attributes
-    ----------
-    system : System
-        The system, with its parameters.
-    dt, process_noise : float
-        As given, with defaults filled in.
-    measurement_noise : float or tuple of float, length ny
-        As given, with defaults filled in.
-    observe : str
-        As given.
-    start_box : (ndarray, ndarray), shape (nx,) each
-        Low and high corner of where episodes start.
-    state_space : gymnasium.spaces.Box, shape (nx,)
-        States within the declared bounds.
-    output_space : gymnasium.spaces.Box, shape (ny,)
-        Outputs that those bounds allow, widened by six standard deviations of the noise.
-    observation_space : gymnasium.spaces.Box
-        Which of the two ``observe`` names.
-    action_space : gymnasium.spaces.Box, shape (nu,)
-        ``Box(-1, 1)``.
-    weights : ndarray, shape (nx,)
-        Weights of the squared deviations from the target in the reward's cost.
-
-    Raises
-    ------
-    ValueError
-        On an unknown system or parameter, dt <= 0, a noise level that is negative or beyond 1e12, an unknown
-        ``observe``, and a ``start_box`` that does not lie within the declared bounds.
-        SubstepsError, a ValueError, if dt is too long for the system.
+    Shapes: ``start_box`` of length nx, or None, ``measurement_noise`` of length ny, ``start_box`` (nx,) each,
+    ``state_space`` (nx,), ``output_space`` (ny,), ``action_space`` (nu,), ``weights`` (nx,).
     """
 
     def __init__(
@@ -109,21 +62,8 @@ class Plant:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Draw ``NOISE_BLOCK`` samples, which :meth:`noise` scales.
 
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-            Draws them.
-        w : ndarray, shape (NOISE_BLOCK, nx), optional
-            Takes the samples of the process noise.
-        v : ndarray, shape (NOISE_BLOCK, ny), optional
-            Takes the samples of the measurement noise.
-
-        Returns
-        -------
-        w : ndarray, shape (NOISE_BLOCK, nx)
-            Uniform in [0, 1).
-        v : ndarray, shape (NOISE_BLOCK, ny)
-            Standard normal.
+        Shapes: ``w`` (NOISE_BLOCK, nx), ``v`` (NOISE_BLOCK, ny); returns ``w`` (NOISE_BLOCK, nx), ``v`` (NOISE_BLOCK,
+        ny).
         """
         n, nx, ny = NOISE_BLOCK, len(self._w_range), self._ny
         return rng.random((n, nx), out=w), rng.standard_normal((n, ny), out=v)
@@ -131,19 +71,7 @@ class Plant:
     def noise(self, drawn_w: np.ndarray, drawn_v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scale what was drawn.
 
-        Parameters
-        ----------
-        drawn_w : ndarray, shape (..., nx)
-            Uniform in [0, 1).
-        drawn_v : ndarray, shape (..., ny)
-            Standard normal.
-
-        Returns
-        -------
-        w : ndarray, shape (..., nx)
-            Process noise, in units of the state per second.
-        v : ndarray, shape (..., ny)
-            Measurement noise, in units of the output.
+        Shapes: ``drawn_w`` (..., nx), ``drawn_v`` (..., ny); returns ``w`` (..., nx), ``v`` (..., ny).
         """
         return (drawn_w - 0.5) * self._w_range, drawn_v * self._v_scale
 
@@ -157,20 +85,7 @@ class Plant:
     def start(self, x0: Any) -> np.ndarray:
         """The start that a user asks for.
 
-        Parameters
-        ----------
-        x0 : array_like, shape (nx,)
-            What the user passed.
-
-        Returns
-        -------
-        ndarray, shape (nx,)
-            The start.
-
-        Raises
-        ------
-        ValueError
-            If it is no state within the declared bounds.
+        Shapes: ``x0`` (nx,); returns (nx,).
         """
         start = real_array("x0", x0)
         low, high = np.array(self.system.bounds).T
@@ -240,22 +155,7 @@ def output_bounds(system: System, margin: float | np.ndarray) -> tuple[np.ndarra
     six states these are not all, but for each output the two corners to which it rises and falls from the centre. They
     are exact for outputs that are monotone in each state.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    margin : float or ndarray, shape (ny,)
-        How much wider the bounds shall be on either side.
-
-    Returns
-    -------
-    low, high : ndarray, shape (ny,)
-        The bounds.
-
-    Raises
-    ------
-    EquationError
-        If an output is no number somewhere there.
+    Shapes: ``margin`` (ny,); returns ``low, high`` (ny,).
     """
     low, high = np.array(system.bounds, dtype=float).T
     rng, nx = np.random.default_rng(0), system.nx

@@ -18,55 +18,18 @@ ARRAYS, ARRAYS_AND_WINDOWS = ("rgb_array",), ("rgb_array", "human")
 
 
 def render_metadata(dt: float, modes: Collection[str]) -> dict[str, Any]:
-    """What environments say of their rendering: the modes, and the frames a second that show a motion as it is.
-
-    Parameters
-    ----------
-    dt : float
-        Seconds between two frames.
-    modes : collection of str
-        The modes.
-
-    Returns
-    -------
-    dict
-        ``render_modes`` and ``render_fps``. Motions sampled faster than ``FRAMES`` times a second are shown slower.
-    """
+    """What environments say of their rendering: the modes, and the frames a second that show a motion as it is."""
     return {"render_modes": [*modes], "render_fps": max(1, round(min(1.0 / dt, FRAMES)))}
 
 
 def check_render_mode(render_mode: str | None, modes: Collection[str]) -> None:
-    """Raise an error unless ``render_mode`` is one that environments offer.
-
-    Parameters
-    ----------
-    render_mode : str, optional
-        The mode, or None.
-    modes : collection of str
-        Those that there are.
-
-    Raises
-    ------
-    ValueError
-        If the mode is unknown.
-    """
+    """Raise an error unless ``render_mode`` is one that environments offer."""
     if render_mode is not None and (not isinstance(render_mode, str) or render_mode not in modes):
         raise ValueError(f"render_mode must be None or one of {[*modes]}, got {shown(render_mode)}")
 
 
 class Trails:
-    """The last ``TRAIL`` states of each row of a vector environment, since its episode began.
-
-    Parameters
-    ----------
-    num_envs : int
-        How many rows there are.
-
-    Attributes
-    ----------
-    rows : list of deque
-        For each row its states, a list of nx numbers each, the latest last.
-    """
+    """The last ``TRAIL`` states of each row of a vector environment, since its episode began."""
 
     def __init__(self, num_envs: int) -> None:
         self.rows: list[deque[list[float]]] = [deque(maxlen=TRAIL) for _ in range(num_envs)]
@@ -74,12 +37,7 @@ class Trails:
     def add(self, states: np.ndarray, samples: np.ndarray) -> None:
         """Take in one state of each row; sample 0 begins a trail.
 
-        Parameters
-        ----------
-        states : ndarray, shape (num_envs, nx)
-            States, or estimates of them.
-        samples : ndarray of int, shape (num_envs,)
-            Samples since the episode began.
+        Shapes: ``states`` (num_envs, nx), ``samples`` (num_envs,).
         """
         for trail, state, sample in zip(self.rows, states.tolist(), samples.tolist(), strict=True):
             if sample == 0:
@@ -92,21 +50,7 @@ class Canvas:
 
     What does not move is drawn once and kept as an image, so that a frame takes milliseconds.
 
-    Parameters
-    ----------
-    system : System
-        Whose states are shown.
-    estimates : bool
-        Whether there are estimates to show.
-    box : tuple of (float, float), length nx, optional
-        (low, high) of each state to show, with a margin; None is the training box.
-    title : str, optional
-        What stands above it; by default the system's name.
-
-    Raises
-    ------
-    ImportError
-        If matplotlib (the extra ``plots``) is not installed.
+    Shapes: ``box`` of length nx.
     """
 
     def __init__(
@@ -152,19 +96,7 @@ class Canvas:
     ) -> np.ndarray:
         """Draw one frame.
 
-        Parameters
-        ----------
-        trail : iterable of sequences of float, length nx
-            True states so far, the latest last.
-        estimates : iterable of sequences of float, length nx
-            Estimated states so far, the latest last.
-        u : sequence of float, length nu, optional
-            The input that acts; None is zero.
-
-        Returns
-        -------
-        ndarray of uint8, shape (height, width, 3)
-            The portrait as an RGB image.
+        Shapes: ``trail`` of length nx, ``estimates`` of length nx, ``u`` of length nu; returns (height, width, 3).
         """
         self._canvas.restore_region(self._still)
         for states, artists in zip((trail, estimates), self._lines, strict=True):
@@ -180,20 +112,7 @@ class Canvas:
 
 
 class Window:
-    """A window on the screen that shows a motion as fast as it is: frames that a screen could not show are left out.
-
-    Parameters
-    ----------
-    title : str
-        Its title.
-    dt : float
-        Sampling interval of the motion in seconds.
-
-    Raises
-    ------
-    ImportError
-        If pygame (the extra ``human``) is not installed.
-    """
+    """A window on the screen that shows a motion as fast as it is: frames that a screen could not show are left out."""
 
     def __init__(self, title: str, dt: float) -> None:
         try:
@@ -208,10 +127,7 @@ class Window:
     def show(self, frame: np.ndarray) -> None:
         """Show a frame, as soon as it is due; opens the window if there is none yet.
 
-        Parameters
-        ----------
-        frame : ndarray of uint8, shape (height, width, 3)
-            An RGB image.
+        Shapes: ``frame`` (height, width, 3).
         """
         pygame = self._pygame
         if not self._open():

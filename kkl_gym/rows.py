@@ -15,17 +15,7 @@ from observers.thresholds import MANY_ROWS
 def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Values as float32 within bounds.
 
-    Parameters
-    ----------
-    values : ndarray, shape (..., width)
-        What is to be shown.
-    low, high : ndarray of float32, shape (width,)
-        The bounds.
-
-    Returns
-    -------
-    ndarray of float32, shape (..., width)
-        A copy.
+    Shapes: ``values`` (..., width), ``low``, ``high`` (width,); returns (..., width).
     """
     many = values.ndim == 2 and len(values) >= MANY_ROWS and low.shape == high.shape == values.shape[1:]
     kernels = _kernels() if many else None
@@ -43,17 +33,7 @@ def clipped(values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray
 def held(actions: np.ndarray, u_max: np.ndarray) -> np.ndarray:
     """The inputs that actions hold: cut at -1 and 1, and multiplied with the input bounds.
 
-    Parameters
-    ----------
-    actions : ndarray, shape (n, nu)
-        Inputs over their bounds.
-    u_max : ndarray, shape (nu,)
-        The bounds.
-
-    Returns
-    -------
-    ndarray, shape (nu, n)
-        Inputs, component first; NaN where an action is.
+    Shapes: ``actions`` (n, nu), ``u_max`` (nu,); returns (nu, n).
     """
     kernels = _kernels() if len(actions) >= MANY_ROWS else None
     if kernels is None:
@@ -71,23 +51,8 @@ def judged(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which states are within their bounds, and what reward they earn.
 
-    Parameters
-    ----------
-    x : ndarray, shape (nx, n)
-        States, component first.
-    bounds : (ndarray, ndarray), shape (nx,) each
-        Low and high bounds.
-    target : ndarray, shape (nx,)
-        Where they should be.
-    weights : ndarray, shape (nx,)
-        Of the squared deviations from it in the cost.
-
-    Returns
-    -------
-    inside : ndarray of bool, shape (n,)
-        False for NaN too.
-    reward : ndarray, shape (n,)
-        1 / (1 + 4 cost).
+    Shapes: ``x`` (nx, n), ``bounds`` (nx,) each, ``target`` (nx,), ``weights`` (nx,); returns ``inside`` (n,),
+    ``reward`` (n,).
     """
     kernels = _kernels() if x.shape[1] >= MANY_ROWS else None
     if kernels is None:

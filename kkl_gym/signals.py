@@ -24,31 +24,7 @@ class Outputs:
     Observations are read as :func:`gymnasium.spaces.flatten` writes them: boxes row by row, the parts of a Dict or
     Tuple one after the other, Discrete ones one-hot. Of a Dict, keys that are not measured are not looked at.
 
-    Parameters
-    ----------
-    space : gymnasium.Space
-        Of one observation.
-    measured : sequence of int or of str, optional
-        Indices in the flattened observation, or keys of a Dict, which stay in the order of the space; None is all.
-    angles : sequence of int or of str, or of pairs of these
-        Which of these are angles in rad; each becomes a cosine and a sine. A pair names the cosine and the sine of an
-        angle that is measured by these.
-    source : str
-        Where observations come from, for messages.
-
-    Attributes
-    ----------
-    measured, angles : tuple of int or of str, or None
-        As given.
-    low, high : ndarray, shape (ny,)
-        Bounds, which may be infinite.
-    turning : list of tuple of int
-        Where the cosine and the sine of each angle are among the outputs.
-
-    Raises
-    ------
-    ValueError
-        If images or what has no numbers are to be measured, or an index or a key is unknown or comes twice.
+    Shapes: ``low``, ``high`` (ny,).
     """
 
     def __init__(self, space: Space, measured: Entries | None, angles: Angles, *, source: str) -> None:
@@ -102,22 +78,7 @@ class Outputs:
     def __call__(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
         """The outputs in an observation.
 
-        Parameters
-        ----------
-        observation : object
-            A value of the space, or of what :func:`gymnasium.vector.utils.batch_space` makes of it.
-        batch : tuple of int
-            Its leading shape: nothing, or the number of environments.
-
-        Returns
-        -------
-        ndarray, shape (*batch, ny)
-            The outputs.
-
-        Raises
-        ------
-        ValueError
-            If the observation is not of the space, or what is measured holds NaN, infinity or values beyond 1e15.
+        Shapes: returns (*batch, ny).
         """
         parts = [
             _signals(self._source, part, observation if key is None else observation[key], batch)
@@ -142,22 +103,7 @@ class Outputs:
 class Inputs:
     """What of an environment's actions acts, at equal size: bounded boxes in [-1, 1], one-hot where Discrete.
 
-    Parameters
-    ----------
-    space : gymnasium.Space
-        Of one action.
-    source : str
-        What acts, for messages.
-
-    Attributes
-    ----------
-    low, high : ndarray, shape (nu,)
-        Bounds, infinite where the space is not bounded.
-
-    Raises
-    ------
-    ValueError
-        If actions have no numbers.
+    Shapes: ``low``, ``high`` (nu,).
     """
 
     def __init__(self, space: Space, *, source: str) -> None:
@@ -175,23 +121,7 @@ class Inputs:
     def __call__(self, action: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
         """The inputs in an action.
 
-        Parameters
-        ----------
-        action : object
-            A value of the space, or of what :func:`gymnasium.vector.utils.batch_space` makes of it. One beyond the
-            bounds counts as the bound.
-        batch : tuple of int
-            Its leading shape: nothing, or the number of environments.
-
-        Returns
-        -------
-        ndarray, shape (*batch, nu)
-            The inputs.
-
-        Raises
-        ------
-        ValueError
-            If the action is not of the space's shape, or holds NaN, infinity or values beyond 1e15.
+        Shapes: returns (*batch, nu).
         """
         u = _signals(self._source, self._space, action, batch)
         if not all_finite(u):

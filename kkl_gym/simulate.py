@@ -57,17 +57,6 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
 
     Written out (as :mod:`dataclasses` writes ``__init__``) it is several times as fast as loops over stages and
     components.
-
-    Parameters
-    ----------
-    nx : int
-        Number of components.
-
-    Returns
-    -------
-    callable
-        ``integrate(f, x, d, h, n)`` makes ``n`` steps of length ``h`` of x' = f(x) + d with d constant. All components
-        are Python floats.
     """
     components = range(nx)
 
@@ -95,21 +84,7 @@ def runge_kutta(nx: int) -> Callable[[VectorField, Components, Components, Any, 
 def forced(system: System, u: Components, w: Components) -> tuple[VectorField, Components]:
     """Split x' = f(x) + g(x) u + w, with u and w held, into a vector field and a constant part.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    u : sequence of length nu
-        Input.
-    w : sequence of length nx
-        Process noise.
-
-    Returns
-    -------
-    field : callable
-        From components of the state to components of a derivative.
-    constant : sequence of length nx
-        What is added to it: g u + w where g is constant, else w.
+    Shapes: ``u`` of length nu, ``w`` of length nx; returns ``constant`` of length nx.
     """
     if type(system).g is System.g:
         if len(u) == 0:
@@ -128,30 +103,7 @@ def forced(system: System, u: Components, w: Components) -> tuple[VectorField, C
 def advance(system: System, x: Components, u: Components, w: Components, dt: float) -> Components:
     """One sampling interval from a single state, on Python floats.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : sequence of float, length nx
-        State at the start of the interval.
-    u : sequence of float, length nu
-        Input, held over the interval.
-    w : sequence of float, length nx
-        Process noise, held over the interval.
-    dt : float
-        Length of the interval in seconds.
-
-    Returns
-    -------
-    sequence of float, length nx
-        State at the end. It may be infinite or NaN if the motion escapes.
-
-    Raises
-    ------
-    EquationError
-        If the equations fail, or return something else than components.
-    SubstepsError
-        If the system moves too fast, within its bounds, to be followed over this interval.
+    Shapes: ``x`` of length nx, ``u`` of length nu, ``w`` of length nx; returns of length nx.
     """
     end: Components = (math.nan,) * len(x)
     try:
@@ -198,30 +150,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
     For motions that change faster and faster within the interval, as when something ignites, and to make sure of an
     escape: steps that were too long at the end may have led out of the bounds by themselves.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : sequence of float, length nx
-        State at the start of the interval.
-    u : sequence of float, length nu
-        Input, held over the interval.
-    w : sequence of float, length nx
-        Process noise, held over the interval.
-    dt : float
-        Length of the interval in seconds.
-    end : sequence of float, length nx
-        What equal substeps have made of it.
-
-    Returns
-    -------
-    sequence of float, length nx
-        State at the end; ``end`` if the motion leaves the bounds on the way.
-
-    Raises
-    ------
-    SubstepsError
-        If MAX_SUBSTEPS are not enough.
+    Shapes: ``x`` of length nx, ``u`` of length nu, ``w`` of length nx, ``end`` of length nx; returns of length nx.
     """
     if system.discrete:
         return end
@@ -253,30 +182,7 @@ def followed(system: System, x: Components, u: Components, w: Components, *, dt:
 def advance_batch(system: System, x: np.ndarray, u: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
     """One sampling interval from a batch of states, each row with the substeps that :func:`advance` would take.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : ndarray, shape (nx, n)
-        States at the start of the interval, component first.
-    u : ndarray, shape (nu, n)
-        Inputs, held over the interval.
-    w : ndarray, shape (nx, n)
-        Process noise, held over the interval.
-    dt : float
-        Length of the interval in seconds.
-
-    Returns
-    -------
-    ndarray, shape (nx, n)
-        States at the end; columns that escape are NaN.
-
-    Raises
-    ------
-    EquationError
-        If the equations fail, or return something else than components.
-    SubstepsError
-        If the system moves too fast, within its bounds, to be followed over this interval.
+    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n); returns (nx, n).
     """
     try:
         return _advance_batch(system, x, u, w, dt)
@@ -301,25 +207,7 @@ def equal_substeps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One sampling interval in substeps of one length for each row.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : ndarray, shape (nx, n)
-        States at the start of the interval, component first.
-    u : ndarray, shape (nu, n)
-        Inputs, held over the interval.
-    w : ndarray, shape (nx, n)
-        Process noise, held over the interval.
-    dt : float
-        Length of the interval in seconds.
-
-    Returns
-    -------
-    end : ndarray, shape (nx, n)
-        States at the end; NaN where MOST_EQUAL substeps are not enough.
-    again : ndarray of bool, shape (n,)
-        Rows for which one length does not do: the rate grew too much, or is too high.
+    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n); returns ``end`` (nx, n), ``again`` (n,).
     """
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         need = np.broadcast_to(system.rate_under(x, u) * dt * PER_RATE, x.shape[1:])
@@ -344,32 +232,7 @@ def followed_rows(
 ) -> np.ndarray:
     """What :func:`followed` makes of some rows of a batch that are within bounds.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x : ndarray, shape (nx, n)
-        States at the start of the interval, component first.
-    u : ndarray, shape (nu, n)
-        Inputs, held over the interval.
-    w : ndarray, shape (nx, n)
-        Process noise, held over the interval.
-    dt : float
-        Length of the interval in seconds.
-    end : ndarray, shape (nx, n)
-        What equal substeps have made of it; it is changed in place.
-    rows : ndarray of int, shape (m,)
-        Which rows.
-
-    Returns
-    -------
-    ndarray, shape (nx, n)
-        ``end``.
-
-    Raises
-    ------
-    SubstepsError
-        If MAX_SUBSTEPS are not enough for one of them.
+    Shapes: ``x`` (nx, n), ``u`` (nu, n), ``w`` (nx, n), ``end`` (nx, n), ``rows`` (m,); returns (nx, n).
     """
     if len(rows):
         low, high = np.array(system.bounds, dtype=float).T[..., None]
@@ -413,36 +276,7 @@ def simulate(
 ) -> np.ndarray:
     """Trajectories of a batch of starts.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    x0 : ndarray, shape (n, nx)
-        Starts.
-    steps : int
-        Number of sampling intervals.
-    dt : float
-        Length of an interval in seconds.
-    u : ndarray, shape (steps, n, nu), or callable, optional
-        Inputs, held over each interval; None is zero. A callable gives those of interval k, of shape (n, nu), from
-        (k, x) with the states x at its start, of shape (n, nx), NaN where they have left the bounds.
-    w : ndarray, shape (steps, n, nx), optional
-        Process noise, held over each interval; None is zero.
-    step : callable, optional
-        Takes the steps, such as :func:`kkl_gym.compiled.batch_step`; :func:`advance_batch` if it is left out.
-    report : callable, optional
-        Told now and then the number of intervals that are done.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, n, nx)
-        States at t = 0, dt, ..., steps * dt. A trajectory that leaves the declared bounds of its system is NaN from
-        there on.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, dt is not positive, or a start is not finite.
+    Shapes: ``x0`` (n, nx), ``u`` (steps, n, nu), or callable, ``w`` (steps, n, nx); returns (steps + 1, n, nx).
     """
     x0 = np.asarray(x0, dtype=float)
     if x0.ndim != 2 or x0.shape[1] != system.nx or not np.isfinite(x0).all():
@@ -483,20 +317,7 @@ def check_duration(duration: float, dt: float) -> None:
 
 
 def check_interval(system: System, dt: float) -> None:
-    """Raise an error if a sampling interval does not suit a system at all.
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    dt : float
-        Sampling interval in seconds.
-
-    Raises
-    ------
-    ValueError
-        If the system is in discrete time and has another one; SubstepsError, if it is too long at the middle of X.
-    """
+    """Raise an error if a sampling interval does not suit a system at all."""
     if not system.discrete:
         rate = float(system.rate_under(tuple(np.mean(system.X, axis=1).tolist()), system.u_max))
         if rate * dt * PER_RATE > MAX_SUBSTEPS:

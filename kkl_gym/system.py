@@ -415,22 +415,7 @@ class System:
 def on_states(equations: Callable[[Components], Components], x: np.ndarray) -> np.ndarray:
     """Evaluate a system's f or h, which take and give components, on an array of states.
 
-    Parameters
-    ----------
-    equations : callable
-        From a sequence of nx components to a sequence of m components.
-    x : ndarray, shape (..., nx)
-        States.
-
-    Returns
-    -------
-    ndarray, shape (..., m)
-        The values. Components that do not depend on the state are repeated.
-
-    Raises
-    ------
-    EquationError
-        If they fail, or return something else.
+    Shapes: ``x`` (..., nx); returns (..., m).
     """
     values = components(equations, np.moveaxis(x, -1, 0))
     return np.stack([np.broadcast_to(value, x.shape[:-1]) for value in values], axis=-1)
@@ -449,17 +434,7 @@ def _starts(system: System) -> np.ndarray:
 def dot(row: Iterable[Any], u: Components) -> Any:
     """A row of the input matrix times u.
 
-    Parameters
-    ----------
-    row : iterable of length nu
-        Of g(x).
-    u : sequence of length nu
-        Input.
-
-    Returns
-    -------
-    float, or of the kind that the components are
-        Their product, added up from the left.
+    Shapes: ``row`` of length nu, ``u`` of length nu.
     """
     total = 0.0  # and not sum(), which from Python 3.12 on rounds in another way
     for gij, uj in zip(row, u, strict=True):
@@ -479,21 +454,7 @@ def difference_steps(X: Box) -> list[tuple[float, float]]:
 def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int = 1) -> Any:
     """A norm of a vector field's derivative, differentiated numerically, with each state in units of X's half-width.
 
-    Parameters
-    ----------
-    field : callable
-        From nx components of the state to as many.
-    x : sequence of length nx
-        Components of the state.
-    X : tuple of (float, float), length nx
-        The box.
-    side : {1, -1}
-        To which states are moved.
-
-    Returns
-    -------
-    float, or of the kind that the components of ``x`` are
-        The norm.
+    Shapes: ``x`` of length nx, ``X`` of length nx.
     """
     steps = difference_steps(X)
     fx = field(x)
@@ -507,22 +468,7 @@ def slope(field: Callable[[Any], Components], x: Components, X: Box, side: int =
 def typical_rate(system: System, starts: np.ndarray) -> float:
     """Median over some starts of how fast f changes.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    starts : ndarray, shape (n, nx)
-        States at which ``system.rate_under`` is asked, with the largest input.
-
-    Returns
-    -------
-    float
-        The rate in 1/s.
-
-    Raises
-    ------
-    ValueError
-        If the rate is zero or not finite.
+    Shapes: ``starts`` (n, nx).
     """
     rate_at(system, starts.T)  # or say what is wrong with it
     rate = float(np.median(np.broadcast_to(system.rate_under(starts.T, system.u_max), len(starts))))

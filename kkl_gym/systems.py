@@ -258,27 +258,7 @@ def _find(name: str) -> type[System]:
 
 
 def system_of(artifact: Artifact, given: str | None) -> System:
-    """The system that an artifact was made for, checked against it.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        What was learned.
-    given : str, optional
-        Where the system is to be found, as for :func:`get_system`; None stands for a shipped system.
-
-    Returns
-    -------
-    System
-        An instance with the artifact's parameters.
-
-    Raises
-    ------
-    ValueError
-        If ``given`` is None and the system is not a shipped one, or if ``given`` cannot be found.
-    observers.ArtifactError
-        If the artifact was made for another system, or for none.
-    """
+    """The system that an artifact was made for, checked against it."""
     artifact.require_system()
     if given is None and artifact.system not in SYSTEMS:
         raise ValueError(f"{artifact.system!r} is no shipped system: name its class with --system script.py:Class")

@@ -11,20 +11,7 @@ TURN = 2 * math.pi
 
 
 def turned(cosines: np.ndarray, sines: np.ndarray, before: np.ndarray | float) -> np.ndarray:
-    """Angles in rad that have turned by less than half a turn since before, and have not where nothing is known.
-
-    Parameters
-    ----------
-    cosines, sines : ndarray
-        Of the angles; both 0, or NaN, where nothing is known.
-    before : ndarray or float
-        What the angles were, in rad, which may be more than a turn.
-
-    Returns
-    -------
-    ndarray
-        What they are.
-    """
+    """Angles in rad that have turned by less than half a turn since before, and have not where nothing is known."""
     angles = np.arctan2(sines, cosines)
     nearest = angles - TURN * np.rint((angles - before) / TURN)
     if np.count_nonzero(cosines) == np.count_nonzero(np.isfinite(nearest)) == nearest.size:
@@ -38,20 +25,6 @@ class TurningMemory:
     Filters of a cosine and a sine hold the rate of an angle only as a product with where it is. What is remembered
     here is the angle itself, unwrapped. It is taken to turn by less than half a turn from one sample to the next; one
     that is faster is remembered as turning the other way. Where cosine and sine are both 0, it is taken to rest.
-
-    Parameters
-    ----------
-    ny, nu : int
-        Numbers of outputs and inputs.
-    angles : sequence of pairs of int
-        Which outputs are the cosine and the sine of an angle, each output once.
-    time_constants, input_time_constants : sequence of float
-        As :class:`Memory` takes them.
-
-    Raises
-    ------
-    ValueError
-        As :class:`Memory`.
     """
 
     def __init__(

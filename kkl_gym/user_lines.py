@@ -15,37 +15,13 @@ _LIBRARIES |= {"mpmath", "numba", "numpy", "sympy", "torch"}
 
 
 def user_line(error: BaseException) -> str | None:
-    """The last line outside of libraries that an exception went through.
-
-    Parameters
-    ----------
-    error : BaseException
-        Any.
-
-    Returns
-    -------
-    str or None
-        Its file, number and text; None if there is no such line.
-    """
+    """The last line outside of libraries that an exception went through."""
     outside = [step for step in _steps(error) if not _of_library(step)]
     return line_of(outside[-1]) if outside else None
 
 
 def steps_within(error: BaseException, code: CodeType | None) -> list[TracebackType]:
-    """The steps of an exception's way through a function and what a user's code called there.
-
-    Parameters
-    ----------
-    error : BaseException
-        Any.
-    code : code or None
-        The function's.
-
-    Returns
-    -------
-    list of traceback
-        That of the function itself first; none if the exception was raised elsewhere.
-    """
+    """The steps of an exception's way through a function and what a user's code called there."""
     steps = _steps(error)
     at = [i for i, step in enumerate(steps) if step.tb_frame.f_code is code]
     return [steps[at[-1]], *(step for step in steps[at[-1] + 1 :] if not _of_library(step))] if at else []

@@ -450,24 +450,7 @@ class KKLVectorEnv(OfPlant, gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndar
 def with_mask(options: Mapping[str, Any] | None, n: int) -> tuple[dict[str, Any] | None, np.ndarray]:
     """A copy of reset options, out of which some environments take the mask, and the mask.
 
-    Parameters
-    ----------
-    options : mapping, optional
-        As a user passes them to ``reset``.
-    n : int
-        Number of rows.
-
-    Returns
-    -------
-    options : dict or None
-        The copy.
-    mask : ndarray of bool, shape (n,)
-        The rows to reset.
-
-    Raises
-    ------
-    ValueError
-        If ``options`` is no mapping, or ``options["reset_mask"]`` no such array or without a True.
+    Shapes: returns ``mask`` (n,).
     """
     given = dict(mapping("options", options))
     if given.get("reset_mask") is None:
@@ -488,19 +471,7 @@ def autoreset_mode_of(mode: str | AutoresetMode) -> AutoresetMode:
 def last_of_episodes(obs: np.ndarray, info: Infos, ended: np.ndarray) -> Infos:
     """``final_obs`` and ``final_info`` with their masks, as Gymnasium's vector environments report them.
 
-    Parameters
-    ----------
-    obs : ndarray, shape (n, width)
-        The last observations.
-    info : dict
-        Of the same step.
-    ended : ndarray of bool, shape (n,)
-        The rows whose episodes ended.
-
-    Returns
-    -------
-    dict
-        What ``info`` gains.
+    Shapes: ``obs`` (n, width), ``ended`` (n,).
     """
     final_obs = np.full(len(ended), None, dtype=object)
     for row in np.flatnonzero(ended):

@@ -16,18 +16,7 @@ _LARGEST_LEVEL = 1e12  # of noise; outputs under it stay far within what observe
 
 
 def shown(value: object) -> str:
-    """A value as error messages show it: on one line, and cut where it is long.
-
-    Parameters
-    ----------
-    value : object
-        What somebody passed.
-
-    Returns
-    -------
-    str
-        Its representation, or its type if it has none.
-    """
+    """A value as error messages show it: on one line, and cut where it is long."""
     try:
         text = " ".join(repr(value).split())
     except Exception:  # such as of integers of more than 4,300 digits
@@ -56,25 +45,7 @@ def all_finite(values: np.ndarray) -> bool:
 
 
 def noise_level(name: str, level: Any) -> float:
-    """Return a level of noise as a float.
-
-    Parameters
-    ----------
-    name : str
-        What it is the level of, for the message.
-    level : float
-        The level.
-
-    Returns
-    -------
-    float
-        The level.
-
-    Raises
-    ------
-    ValueError
-        If the level is no real number, not finite, negative or beyond 1e12.
-    """
+    """Return a level of noise as a float."""
     if not is_finite(level) or level < 0:
         raise ValueError(f"{name} must be a finite number, not negative, got {shown(level)}")
     level = float(level)
@@ -86,24 +57,7 @@ def noise_level(name: str, level: Any) -> float:
 def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
     """Return levels of noise as one float for all outputs, or a tuple of one for each.
 
-    Parameters
-    ----------
-    name : str
-        What they are the levels of, for the message.
-    levels : float or sequence of float, length ny
-        The levels.
-    ny : int
-        Number of outputs.
-
-    Returns
-    -------
-    float or tuple of float, length ny
-        The levels; a float if all are the same.
-
-    Raises
-    ------
-    ValueError
-        If there are not ny levels, or one is refused by :func:`noise_level`.
+    Shapes: ``levels`` of length ny; returns of length ny.
     """
     if not isinstance(levels, list | tuple | np.ndarray) or (isinstance(levels, np.ndarray) and levels.ndim == 0):
         return noise_level(name, levels)
@@ -114,52 +68,14 @@ def noise_levels(name: str, levels: Any, ny: int) -> float | tuple[float, ...]:
 
 
 def check_dt(dt: Any) -> float:
-    """Return a sampling interval as a float.
-
-    Parameters
-    ----------
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If it is not a positive, finite number.
-    """
+    """Return a sampling interval as a float."""
     if not is_finite(dt) or not float(dt) > 0:
         raise ValueError(f"dt must be a positive, finite number of seconds, got {shown(dt)}")
     return float(dt)
 
 
 def integer(name: str, value: Any, least: int, most: int | None = None) -> int:
-    """Return a whole number as an int.
-
-    Parameters
-    ----------
-    name : str
-        What it is, for the message.
-    value : int
-        The number.
-    least : {0, 1}
-        The least that it may be.
-    most : int, optional
-        The most that it may be.
-
-    Returns
-    -------
-    int
-        The number.
-
-    Raises
-    ------
-    ValueError
-        If it is no integer, or out of range.
-    """
+    """Return a whole number as an int."""
     whole = isinstance(value, int | np.integer) and not isinstance(value, _NO_NUMBERS)
     if not whole or value < least or (most is not None and value > most):
         wanted = "a positive integer" if least == 1 else "an integer, not negative"
@@ -193,25 +109,7 @@ def mapping(name: str, value: Any) -> Mapping[Any, Any]:
 
 
 def real_array(name: str, values: Any) -> np.ndarray:
-    """Return numbers as an array of float64.
-
-    Parameters
-    ----------
-    name : str
-        What the numbers are, for the message.
-    values : array_like
-        The numbers, of any shape.
-
-    Returns
-    -------
-    ndarray
-        The numbers; ``values`` itself if it is such an array already.
-
-    Raises
-    ------
-    ValueError
-        If there is anything but real numbers, such as bools or text, or a masked entry.
-    """
+    """Return numbers as an array of float64."""
     if type(values) is np.ndarray:
         if values.dtype is _FLOAT:
             return values
@@ -255,24 +153,7 @@ def _of_numbers(values: Any) -> bool:
 def bool_array(name: str, values: Any, shape: tuple[int, ...]) -> np.ndarray:
     """Return an array of bools.
 
-    Parameters
-    ----------
-    name : str
-        What it is, for the message.
-    values : array_like of bool
-        The bools.
-    shape : tuple of int
-        The shape that they must have.
-
-    Returns
-    -------
-    ndarray of bool
-        The bools; ``values`` itself if it is such an array already.
-
-    Raises
-    ------
-    ValueError
-        If there is anything but bools, a masked entry or another shape.
+    Shapes: ``shape`` : tuple of int.
     """
     try:
         array = values if type(values) is np.ndarray else np.asarray(values)

@@ -25,32 +25,7 @@ Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 class CompiledNetwork:
     """A multilayer perceptron.
 
-    Parameters
-    ----------
-    layers : sequence of (ndarray, ndarray)
-        Weights (inputs, outputs) and biases (outputs,) in float32.
-    activation : {"tanh", "silu", "relu"}
-        After every layer but the last.
-
-    Attributes
-    ----------
-    activation : str
-        As given.
-    outputs : int
-        Number of outputs.
-    bias : ndarray of float32, shape (outputs,)
-        Of the last layer.
-    packed : ndarray of float32
-        Biases and weights, layer by layer.
-    widths : ndarray of int
-        Of the inputs and of each layer.
-    between : ndarray of float32
-        Memory for a single sample.
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
+    Shapes: ``bias`` (outputs,).
     """
 
     def __init__(self, layers: Layers, activation: str) -> None:
@@ -69,15 +44,7 @@ class CompiledNetwork:
     def single(self, x: np.ndarray) -> np.ndarray:
         """Evaluate for one sample.
 
-        Parameters
-        ----------
-        x : ndarray of float32, shape (inputs,)
-            Inputs.
-
-        Returns
-        -------
-        ndarray of float32, shape (outputs,)
-            Outputs.
+        Shapes: ``x`` (inputs,); returns (outputs,).
         """
         out = np.empty(self.outputs, np.float32)
         network_kernels(self.activation).single(x, self.packed, self.widths, self.between, out)
@@ -86,15 +53,7 @@ class CompiledNetwork:
     def batch(self, x: np.ndarray) -> np.ndarray:
         """Evaluate for many samples.
 
-        Parameters
-        ----------
-        x : ndarray of float32, shape (n, inputs)
-            Inputs.
-
-        Returns
-        -------
-        ndarray of float32, shape (n, outputs)
-            Outputs.
+        Shapes: ``x`` (n, inputs); returns (n, outputs).
         """
         out = np.empty((len(x), self.outputs), np.float32)
         with self.memory() as memory:
@@ -111,14 +70,7 @@ class CompiledNetwork:
     def piece(self, h: np.ndarray, memory: np.ndarray, out: np.ndarray) -> None:
         """Evaluate for the rows of a piece, all but the last biases.
 
-        Parameters
-        ----------
-        h : ndarray of float32, shape (rows, inputs)
-            Inputs.
-        memory : ndarray of float32
-            What :meth:`memory` lends.
-        out : ndarray of float32, shape (rows, outputs)
-            Takes what the last weights make.
+        Shapes: ``h`` (rows, inputs), ``out`` (rows, outputs).
         """
         *hidden, (last, _) = self._layers
         activate, rows = network_kernels(self.activation).activate, len(h)
@@ -149,27 +101,7 @@ class CompiledDecoder:
     The coordinates in which the network sees z are a matrix product, as its first layer is: they are one, in float64.
     (The coordinates are differences of filter states that are much alike, of which float32 would leave little.)
 
-    Parameters
-    ----------
-    layers : sequence of (ndarray, ndarray)
-        Weights (inputs, outputs) and biases (outputs,) in float32, of two layers at least.
-    activation : {"tanh", "silu", "relu"}
-        After every layer but the last.
-    whiten : ndarray, shape (size, modes)
-        From z to the network's coordinates.
-    offset : ndarray, shape (modes,)
-        Added to them.
-    conditions : sequence of float
-        What the network is given behind them.
-    age : (float, float), optional
-        Unit and end of the age in seconds, where the network is told that too.
-    x_offset, x_scale : ndarray, shape (nx,)
-        Of the states.
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
+    Shapes: ``whiten`` (size, modes), ``offset`` (modes,), ``x_offset``, ``x_scale`` (nx,).
     """
 
     def __init__(
@@ -205,17 +137,7 @@ class CompiledDecoder:
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
         """Estimate for one sample.
 
-        Parameters
-        ----------
-        z : ndarray, shape (size,)
-            The filter's state.
-        age : float
-            Seconds since reset.
-
-        Returns
-        -------
-        ndarray, shape (nx,)
-            The estimate.
+        Shapes: ``z`` (size,); returns (nx,).
         """
         x_hat = np.empty(self._network.outputs)
         self._one(z, age, x_hat)
@@ -224,17 +146,7 @@ class CompiledDecoder:
     def batch(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
         """Estimate for many samples.
 
-        Parameters
-        ----------
-        z : ndarray, shape (n, size)
-            The filter's states.
-        age : float or ndarray, shape (n,)
-            Seconds since reset.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            The estimates.
+        Shapes: ``z`` (n, size), ``age`` (n,); returns (n, nx).
         """
         network, n, width = self._network, len(z), len(self._sums)
         kernels = batch_kernels(network.activation)
@@ -274,18 +186,7 @@ def first_layer(
 ) -> np.ndarray:
     """A network's first layer on the filter's state, in float64.
 
-    Parameters
-    ----------
-    layer : (ndarray, ndarray)
-        Weights (inputs, outputs) and biases (outputs,).
-    whiten, offset, conditions, age
-        As for :class:`CompiledDecoder`.
-
-    Returns
-    -------
-    ndarray, shape (2 + size, outputs)
-        Biases, the weights of the age and those of z: one array, for each that is handed over to machine code takes as
-        long as a hundred multiplications.
+    Shapes: returns (2 + size, outputs).
     """
     weight, bias = (part.astype(float) for part in layer)
     modes, given = len(offset), len(offset) + len(conditions)

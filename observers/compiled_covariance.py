@@ -12,30 +12,7 @@ from observers.compiled import FAST, Layers, active_kernel, batch_kernels, enter
 class CompiledCovariance:
     """From the filter's state to the covariance of the estimate's error, by one call for a single sample.
 
-    Parameters
-    ----------
-    layers : sequence of (ndarray, ndarray)
-        Weights (inputs, outputs) and biases (outputs,) of two layers; the outputs are those of
-        :class:`observers.spread.Spread`, in units of the states.
-    activation : {"tanh", "silu", "relu"}
-        After the first layer.
-    whiten, offset, conditions, age
-        As for :class:`observers.compiled.CompiledDecoder`.
-    nx : int
-        Number of states.
-    ages : sequence of float
-        Seconds since reset, rising from 0.
-    log_factors : sequence of float
-        Added to the logarithms of the standard deviations at each of them, and interpolated between.
-    largest_log : float
-        To which those logarithms are cut before.
-    largest : ndarray, shape (nx,)
-        To which variances are cut.
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
+    Shapes: ``largest`` (nx,).
     """
 
     def __init__(
@@ -64,17 +41,7 @@ class CompiledCovariance:
     def single(self, z: np.ndarray, age: float) -> np.ndarray:
         """Evaluate for one sample.
 
-        Parameters
-        ----------
-        z : ndarray, shape (size,)
-            The filter's state.
-        age : float
-            Seconds since reset.
-
-        Returns
-        -------
-        ndarray, shape (nx, nx)
-            The covariance.
+        Shapes: ``z`` (size,); returns (nx, nx).
         """
         covariance = np.empty(self._shape)
         self._one(z, age, covariance)
@@ -83,17 +50,7 @@ class CompiledCovariance:
     def hidden(self, z: np.ndarray, age: float | np.ndarray) -> np.ndarray:
         """Evaluate the first layer for many samples.
 
-        Parameters
-        ----------
-        z : ndarray, shape (n, size)
-            The filter's states.
-        age : float or ndarray, shape (n,)
-            Seconds since reset.
-
-        Returns
-        -------
-        ndarray of float32, shape (n, width)
-            What the second layer is given.
+        Shapes: ``z`` (n, size), ``age`` (n,); returns (n, width).
         """
         sums, (unit, end) = z @ self._first[2:], self._age
         h = np.empty(sums.shape, np.float32)

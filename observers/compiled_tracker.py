@@ -27,23 +27,7 @@ class CompiledTracker:
     the estimate (nx), its covariance (nx^2), the running mean square of the innovations, that of their trend, the
     number of samples of which anything was there, and the trend itself (ny). A single sample has a state of one row.
 
-    Parameters
-    ----------
-    flow : Flow
-        The motion over a sample.
-    linear : LinearFilter
-        What makes z of the outputs.
-    C : ndarray, shape (ny, nx)
-        Of the outputs y = C x.
-    watch : Supervision
-        How innovations are watched.
-    variances : (ndarray, ndarray)
-        Of what is added to scaled states at each sample, (nx,), and of the noise on each output, (ny,).
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
+    Shapes: ``C`` (ny, nx).
     """
 
     def __init__(
@@ -81,23 +65,8 @@ class CompiledTracker:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Predict a sample, and take it in.
 
-        Parameters
-        ----------
-        state : ndarray, shape (n, width)
-            The state.
-        u : ndarray, shape (n, nu)
-            Inputs.
-        y : ndarray, shape (n, ny)
-            Samples; NaN where they are missing.
-        rows : ndarray of bool, shape (n,), optional
-            The rows that take them in, by default all.
-
-        Returns
-        -------
-        x : ndarray, shape (n, nx)
-            The estimates in units of the states.
-        expected : ndarray, shape (n, ny)
-            The outputs that were predicted; NaN where a covariance was none.
+        Shapes: ``state`` (n, width), ``u`` (n, nu), ``y`` (n, ny), ``rows`` (n,); returns ``x`` (n, nx), ``expected``
+        (n, ny).
         """
         x, expected = np.empty((len(y), self._nx)), np.empty((len(y), self._ny))
         self._many(u, y, np.ones(len(y), dtype=bool) if rows is None else rows, state, x, expected)
@@ -108,27 +77,8 @@ class CompiledTracker:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Predict a single sample, take it in, and take the filter along.
 
-        Parameters
-        ----------
-        state : ndarray, shape (1, width)
-            The state.
-        z : ndarray, shape (size,)
-            That of the filter.
-        y : ndarray, shape (ny,)
-            The sample before.
-        u : ndarray, shape (nu,)
-            Inputs.
-        y_next : ndarray, shape (ny,)
-            The sample; NaN where it is missing.
-
-        Returns
-        -------
-        x : ndarray, shape (nx,)
-            The estimate in units of the states.
-        y_next : ndarray, shape (ny,)
-            The sample; where it is missing the output that was predicted, or y where there is no such number.
-        z_next : ndarray, shape (size,)
-            The filter's next state.
+        Shapes: ``state`` (1, width), ``z`` (size,), ``y`` (ny,), ``u`` (nu,), ``y_next`` (ny,); returns ``x`` (nx,),
+        ``y_next`` (ny,), ``z_next`` (size,).
         """
         told, nx, ny = np.empty(self._told), self._nx, self._ny
         self._one(z, y, u, y_next, state, told)
@@ -139,18 +89,7 @@ class CompiledTracker:
     ) -> None:
         """Take what T_inv says, where it is surer by the traces of both covariances or the tracker is lost.
 
-        Parameters
-        ----------
-        said : tuple of ndarray
-            Estimates (k, nx) and covariances (k, nx, nx), in units of the states.
-        lost : ndarray of bool, shape (k,)
-            Where the tracker is lost.
-        where : ndarray of int, shape (k,)
-            The rows that these are.
-        state : ndarray, shape (n, width)
-            The state.
-        x : ndarray, shape (n, nx), optional
-            The estimates in units of the states, which are written over as the state is.
+        Shapes: ``lost`` (k,), ``where`` (k,), ``state`` (n, width), ``x`` (n, nx).
         """
         self._take(*said, lost, where, state, _NONE if x is None else x)
 

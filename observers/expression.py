@@ -78,20 +78,7 @@ class Expression:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate it.
 
-        Parameters
-        ----------
-        x : array_like, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., number of components)
-            The values, NaN or infinite where they are not defined.
-
-        Raises
-        ------
-        IndexError
-            If it is of more states than there are, see :attr:`states`.
+        Shapes: ``x`` (..., nx); returns (..., number of components).
         """
         rows = np.moveaxis(np.asarray(x, dtype=float), -1, 0)
         with np.errstate(all="ignore"):

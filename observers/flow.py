@@ -134,17 +134,7 @@ class Flow:
     def __call__(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Evaluate.
 
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            States.
-        u : ndarray, shape (..., nu)
-            Inputs that are held over the sample.
-
-        Returns
-        -------
-        ndarray, shape (..., nx)
-            States a sample later.
+        Shapes: ``x`` (..., nx), ``u`` (..., nu); returns (..., nx).
         """
         return self.x_offset + self.x_scale * self.scaled((x - self.x_offset) / self.x_scale, u / self.u_scale)
 

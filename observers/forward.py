@@ -40,15 +40,7 @@ class ForwardMap:
     def __call__(self, x: np.ndarray) -> np.ndarray:
         """Evaluate T.
 
-        Parameters
-        ----------
-        x : array_like, shape (..., nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (..., nz)
-            Filter states.
+        Shapes: ``x`` (..., nx); returns (..., nz).
         """
         z = self.mlp((np.asarray(x, dtype=float) - self.x_offset) / self.x_scale)
         return self.z_offset + self.z_scale * z

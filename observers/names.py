@@ -31,23 +31,7 @@ def shipped() -> dict[str, str]:
 
 
 def resolve(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the file behind a name.
-
-    Parameters
-    ----------
-    name_or_path : str or PathLike
-        A shipped name, or a path that ends in ``.safetensors``, whether there is such a file or not.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    ArtifactError
-        If it is neither, or no map of this name ships.
-    """
+    """Return the file behind a name."""
     text = os.fspath(name_or_path) if isinstance(name_or_path, str | os.PathLike) else None
     if not isinstance(text, str):
         raise ArtifactError(f"an observer is a shipped name or a path, got {shown(name_or_path)}")

@@ -104,15 +104,7 @@ class MLP:
         A batch of many rows goes through :mod:`observers.compiled` where Numba is installed, which rounds a little
         differently.
 
-        Parameters
-        ----------
-        x : ndarray, shape (..., inputs)
-            Inputs, any type of float.
-
-        Returns
-        -------
-        ndarray of float32, shape (..., outputs)
-            Outputs.
+        Shapes: ``x`` (..., inputs); returns (..., outputs).
         """
         activation = ACTIVATIONS[self.activation]
         *hidden, (weight, bias) = self.layers

@@ -24,17 +24,7 @@ def degree_of(terms: int, variables: int) -> int | None:
 def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """What monomials are made of, in the order of their degrees.
 
-    Parameters
-    ----------
-    variables : int
-        How many.
-    degree : int
-        Of the last monomials.
-
-    Returns
-    -------
-    earlier, by : ndarray of int, shape (terms,)
-        Each is an earlier one times a variable. (The first is 1, for which both are 0.)
+    Shapes: returns ``earlier, by`` (terms,).
     """
     earlier, by, newest = [0], [0], [0]
     for _ in range(degree):
@@ -51,18 +41,7 @@ def table(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
 def monomials(q: np.ndarray, degree: int) -> np.ndarray:
     """Evaluate them, of degree 1 at least.
 
-    Parameters
-    ----------
-    q : ndarray, shape (..., variables)
-        Of the variables.
-    degree : int
-        Of the last monomials.
-
-    Returns
-    -------
-    ndarray, shape (..., terms)
-        1, the variables, their products of two, and so on; of each degree in the order of
-        :func:`itertools.combinations_with_replacement`.
+    Shapes: ``q`` (..., variables); returns (..., terms).
     """
     variables = q.shape[-1]
     terms = np.empty((*q.shape[:-1], count(variables, degree)))

@@ -10,20 +10,7 @@ from observers.errors import ArtifactError
 
 
 def check_replacement(artifact: Artifact, other: Artifact) -> None:
-    """See that an artifact can take the place of another while the filter runs.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        In use.
-    other : Artifact
-        Of the same signals and the same filter: what may differ are the maps.
-
-    Raises
-    ------
-    ArtifactError
-        If anything else differs, or ``other`` is no artifact; the message says what to do.
-    """
+    """See that an artifact can take the place of another while the filter runs."""
     if not isinstance(other, Artifact):
         raise ArtifactError(f"an observer is replaced by an observers.Artifact, got {shown(other)}")
     there = _serves(other)

@@ -13,26 +13,7 @@ def check_output(
 ) -> np.ndarray | None:
     """Find what is missing of samples.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    y : ndarray of float
-        The samples.
-    batch : tuple of int
-        Shape of the batch.
-    first : bool
-        Whether they are the first ones, which must be whole.
-
-    Returns
-    -------
-    ndarray of bool, shape (..., ny), or None
-        Where entries are missing; None if none are.
-
-    Raises
-    ------
-    ValueError
-        If they have another shape than (..., ny), or there is anything but finite numbers, and NaN where it may be.
+    Shapes: returns (..., ny), or None.
     """
     if y.shape != (*batch, artifact.ny):
         raise ValueError(f"y must have shape {(*batch, artifact.ny)}, got {y.shape}")
@@ -55,24 +36,7 @@ def check_output(
 def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...]) -> np.ndarray:
     """Return inputs as floats, zeros where there are none.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    u : array_like, shape (..., nu), or None
-        The inputs.
-    batch : tuple of int
-        Shape of the batch.
-
-    Returns
-    -------
-    ndarray, shape (..., nu)
-        The inputs.
-
-    Raises
-    ------
-    ValueError
-        If they have another shape, are no finite numbers, or are not zero where the observer knows of none.
+    Shapes: ``u`` (..., nu), or None; returns (..., nu).
     """
     nu = artifact.nu
     if u is None:
@@ -96,26 +60,7 @@ def held_input(artifact: Artifact, u: np.ndarray | None, batch: tuple[int, ...])
 def first_state(artifact: Artifact, y0: np.ndarray, x0: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Return the filter's state at the first sample.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    y0 : ndarray, shape (..., ny)
-        The sample.
-    x0 : array_like, shape (..., nx), or None
-        The state, if it is known.
-
-    Returns
-    -------
-    z0 : ndarray, shape (..., size)
-        The filter's state.
-    age : float
-        How many samples old it is.
-
-    Raises
-    ------
-    ValueError
-        If x0 has another shape or is not finite, or the artifact holds neither T nor a flow.
+    Shapes: ``y0`` (..., ny), ``x0`` (..., nx), or None; returns ``z0`` (..., size).
     """
     if x0 is None:
         return artifact.filter.start(y0), 0
@@ -136,28 +81,8 @@ def checked_record(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """Return a record as floats, and what is missing of it.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    y : array_like, shape (steps, ..., ny)
-        Outputs.
-    u : array_like, shape (steps - 1, ..., nu) or (steps, ..., nu), or None
-        Inputs.
-
-    Returns
-    -------
-    y : ndarray, shape (steps, ..., ny)
-        Outputs, a copy where some are missing.
-    u : ndarray or None
-        Inputs.
-    gaps : ndarray of bool, shape (steps, ..., ny), or None
-        Where outputs are missing; None if none are.
-
-    Raises
-    ------
-    ValueError
-        If it is none.
+    Shapes: ``y`` (steps, ..., ny), ``u`` (steps - 1, ..., nu) or (steps, ..., nu), or None; returns ``y`` (steps, ...,
+    ny), ``gaps`` (steps, ..., ny), or None.
     """
     y = real_array("y", y)
     if y.ndim < 2 or not len(y):

@@ -15,19 +15,7 @@ import numpy as np
 class SparseUpdate:
     """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal.
 
-    Parameters
-    ----------
-    transition : ndarray, shape (size, size)
-        At most ``size`` entries off its diagonal may differ from zero.
-    drive : ndarray, shape (m, size)
-        What each column of the terms adds.
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
-    ValueError
-        If the transition has too many entries for this to gain anything.
+    Shapes: ``transition`` (size, size), ``drive`` (m, size).
     """
 
     def __init__(self, transition: np.ndarray, drive: np.ndarray) -> None:
@@ -40,22 +28,7 @@ class SparseUpdate:
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
         """Return the next z.
 
-        Parameters
-        ----------
-        z : ndarray, shape (n, size)
-            The filter's state.
-        *terms : ndarray, shape (n, ...)
-            What drives it, m columns together.
-
-        Returns
-        -------
-        ndarray, shape (n, size)
-            The state one sample later.
-
-        Raises
-        ------
-        ValueError
-            If a shape is wrong.
+        Shapes: ``z`` (n, size), ``*terms`` (n, ...); returns (n, size).
         """
         rows, size = self._shape
         if z.shape[1:] != (size,):
@@ -70,17 +43,7 @@ class SparseUpdate:
     def single(self, z: np.ndarray, y: np.ndarray, u: np.ndarray, y_next: np.ndarray) -> np.ndarray:
         """Return the next z of one sample.
 
-        Parameters
-        ----------
-        z : ndarray, shape (size,)
-            The filter's state.
-        y, u, y_next : ndarray, shape (ny,), (nu,), (ny,)
-            What drives it, m values together.
-
-        Returns
-        -------
-        ndarray, shape (size,)
-            The state one sample later.
+        Shapes: ``z`` (size,), ``y``, ``u``, ``y_next`` (ny,), (nu,), (ny,); returns (size,).
         """
         z_next = np.empty(len(z))
         u = u.copy()  # the user's own: to Numba, an array that is read-only or has strides is of another type
@@ -91,21 +54,8 @@ class SparseUpdate:
 def without_zeros(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What the kernels take of a filter.
 
-    Parameters
-    ----------
-    transition : ndarray, shape (size, size)
-        From z to the next.
-    drive : ndarray, shape (m, size)
-        What each column of the terms adds.
-
-    Returns
-    -------
-    gains : ndarray, shape (1 + m or a few more, size)
-        The diagonal, and what the terms add; rows of zeros, for batches take three at once.
-    places : ndarray of int, shape (2, k)
-        Rows and columns of the entries off the diagonal that are not zero.
-    mixing : ndarray, shape (k,)
-        These entries.
+    Shapes: ``transition`` (size, size), ``drive`` (m, size); returns ``gains`` (1 + m or a few more, size), ``places``
+    (2, k), ``mixing`` (k,).
     """
     diagonal, spare = transition.diagonal(), np.zeros((-len(drive) % 3, len(transition)))
     places = np.array(np.nonzero(transition - np.diag(diagonal)))

@@ -72,14 +72,7 @@ class Spread:
 class Covariance:
     """A spread at given levels of noise: what T_inv's network is given, and the age, to covariances.
 
-    Parameters
-    ----------
-    spread : Spread
-        What was learned.
-    levels : tuple of float
-        Of measurement noise and process noise, in multiples of the highest that the map is told.
-    scale : ndarray, shape (nx,)
-        Of the states.
+    Shapes: ``scale`` (nx,).
     """
 
     def __init__(self, spread: Spread, levels: tuple[float, float], scale: np.ndarray) -> None:
@@ -91,17 +84,7 @@ class Covariance:
     def __call__(self, inputs: np.ndarray, age: Any) -> np.ndarray:
         """Evaluate.
 
-        Parameters
-        ----------
-        inputs : ndarray, shape (..., inputs)
-            Of T_inv's network.
-        age : float or ndarray
-            Seconds since reset, of a shape that goes with (...,).
-
-        Returns
-        -------
-        ndarray, shape (..., nx, nx)
-            In units of the states.
+        Shapes: ``inputs`` (..., inputs); returns (..., nx, nx).
         """
         nx, out = self._nx, self._mlp(inputs)
         if out.ndim == 1:  # a single sample: every call would be felt

@@ -36,20 +36,7 @@ _TYPES: dict[str, np.dtype[Any]] = {"F32": np.dtype(np.float32), "F64": np.dtype
 
 @contextmanager
 def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Put the name of what is written into errors that name no file, as that of a full disk.
-
-    Parameters
-    ----------
-    path : Path
-        What is written.
-    temporary : Path, optional
-        What is written in its place; errors that name it will name ``path``.
-
-    Raises
-    ------
-    OSError
-        If the body raises one.
-    """
+    """Put the name of what is written into errors that name no file, as that of a full disk."""
     try:
         yield
     except OSError as problem:
@@ -65,21 +52,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     The temporary file lies in the same folder, which is made. It keeps the ending of the name, by which some writers
     choose a format, and has the rights that the umask gives. After an exception it is gone, and ``path`` is as it was.
     After the end of the process it stays, see :func:`clear_unfinished`.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file to write.
-
-    Yields
-    ------
-    Path
-        The temporary file, empty.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written or put in its place; it names ``path``.
     """
     target = Path(path)
     temporary = target.with_name(f"{UNFINISHED}{secrets.token_hex(4)}-{target.stem}{target.suffix}")
@@ -104,19 +76,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Find out before long work whether its results can be written; nothing is left behind.
-
-    Parameters
-    ----------
-    folder : str or PathLike
-        Where they are to lie. It need not be there.
-
-    Raises
-    ------
-    OSError
-        If no file can be made there, or, as long as the folder is missing, in the one that it will be made in. It names
-        the folder.
-    """
+    """Find out before long work whether its results can be written; nothing is left behind."""
     path = Path(folder)
     there = next((one for one in (path, *path.parents) if one.exists()), path)
     try:
@@ -132,13 +92,7 @@ def write(path: str | os.PathLike[str], text: str) -> None:
 
 
 def clear_unfinished(folder: str | os.PathLike[str]) -> None:
-    """Remove temporary files and folders that nobody has written to for an hour: processes that were killed left them.
-
-    Parameters
-    ----------
-    folder : str or PathLike
-        Where they lie.
-    """
+    """Remove temporary files and folders, left by killed processes, that were last written to an hour ago or more."""
     for left in Path(folder).glob(f"{UNFINISHED}*"):
         with suppress(OSError):  # another process may clear away, too, and some are not ours to remove
             written = [left, *left.rglob("*")]  # a folder's own time says nothing of what is in its files
@@ -152,28 +106,7 @@ def clear_unfinished(folder: str | os.PathLike[str]) -> None:
 def save(
     path: str | os.PathLike[str], tensors: Mapping[str, np.ndarray], *, key: str, described: Mapping[str, Any]
 ) -> None:
-    """Write arrays and what describes them to one file, whole or not at all; makes its folder.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file to write.
-    tensors : mapping of str to ndarray
-        Arrays of float32 or float64, of any shapes.
-    key : str
-        Names the kind of file; :func:`read` asks for it.
-    described : mapping
-        What JSON can hold, numbers finite.
-
-    Raises
-    ------
-    TypeError
-        If an array is not of float32 or float64, or ``described`` is nothing that JSON can hold.
-    ValueError
-        If a number in ``described`` is not finite, or the file would be beyond the limits of :func:`read`.
-    OSError
-        If the file cannot be written.
-    """
+    """Write arrays and what describes them to one file, whole or not at all; makes its folder."""
     arrays = {name: np.asarray(tensor, order="C") for name, tensor in tensors.items()}
     for name, array in arrays.items():
         if array.dtype not in _TYPES.values():
@@ -194,33 +127,7 @@ def save(
 def read(
     path: str | os.PathLike[str], *, key: str, error: type[Exception], what: str
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read what :func:`save` wrote.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file to read.
-    key : str
-        The kind of file, as it was saved.
-    error : type of Exception
-        Raised, with a message that names the file, if it cannot be read.
-    what : str
-        The kind of file for the message, "an observer".
-
-    Returns
-    -------
-    tensors : dict of str to ndarray
-        The arrays, float32 or float64.
-    described : dict
-        What describes them; nobody has checked it.
-
-    Raises
-    ------
-    error
-        If the file is missing, not readable, damaged or of another kind, or an array is not of float32 or float64. Also
-        if it has more than 256 MiB, more than 1 MiB of them in its header, or more than 32 objects and lists within one
-        another; that is noticed before memory is taken.
-    """
+    """Read what :func:`save` wrote."""
     content = _content(path, error)
     try:
         views: list[tuple[str, dict[str, Any]]] = deserialize(content)  # type: ignore[no-untyped-call]
@@ -255,20 +162,7 @@ def read(
 
 
 def is_kind(path: str | os.PathLike[str], key: str) -> bool:
-    """Whether a file is of a kind, by what its header says; not whether it is whole.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file.
-    key : str
-        The kind of file, as :func:`save` was told.
-
-    Returns
-    -------
-    bool
-        False also where there is no such file, or it is none of ours.
-    """
+    """Whether a file is of a kind, by what its header says; not whether it is whole."""
     try:
         header, _ = _parts(_content(path, ValueError))
     except (ValueError, RecursionError):
@@ -278,25 +172,7 @@ def is_kind(path: str | os.PathLike[str], key: str) -> bool:
 
 
 def checksum(path: str | os.PathLike[str], error: type[Exception]) -> str:
-    """Compute the checksum of what a file of arrays holds, which stays the same when the file gets one.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        A file in the safetensors format.
-    error : type of Exception
-        Raised, with a message that names the file, if it cannot be read.
-
-    Returns
-    -------
-    str
-        The SHA-256, in hexadecimal, of the file as it is without its own checksum.
-
-    Raises
-    ------
-    error
-        If the file is missing, not readable, too large or no safetensors file.
-    """
+    """Compute the checksum of what a file of arrays holds, which stays the same when the file gets one."""
     content = _content(path, error)
     try:
         header, data = _parts(content)
@@ -350,20 +226,7 @@ def _is_deeper(value: Any, levels: int) -> bool:
 
 @contextmanager
 def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator[None]:
-    """Turn whatever goes wrong while something is made of a file's contents into an error that names the file.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file.
-    error : type of ValueError
-        What to raise instead.
-
-    Raises
-    ------
-    error
-        If the body raises what contents that are missing, of a wrong type or out of range lead to.
-    """
+    """Turn whatever goes wrong while something is made of a file's contents into an error that names the file."""
     try:
         yield
     except KeyError as problem:
@@ -375,46 +238,14 @@ def explained(path: str | os.PathLike[str], error: type[ValueError]) -> Iterator
 
 
 def put_mlp(tensors: MutableMapping[str, np.ndarray], prefix: str, mlp: MLP) -> None:
-    """Add a network's weights and biases to the arrays of a file, as float32.
-
-    Parameters
-    ----------
-    tensors : mutable mapping of str to ndarray
-        Gains ``{prefix}0.weight``, ``{prefix}0.bias``, ``{prefix}1.weight``, ...
-    prefix : str
-        Of the names, a dot at its end included; may be empty.
-    mlp : MLP
-        The network. Its activation is for the file's description.
-    """
+    """Add a network's weights and biases to the arrays of a file, as float32."""
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
         tensors[f"{prefix}{i}.weight"] = np.asarray(weight, dtype=np.float32)
         tensors[f"{prefix}{i}.bias"] = np.asarray(bias, dtype=np.float32)
 
 
 def get_mlp(tensors: Mapping[str, np.ndarray], prefix: str, activation: str) -> MLP:
-    """Return the network that :func:`put_mlp` added.
-
-    Parameters
-    ----------
-    tensors : mapping of str to ndarray
-        The arrays of a file, others among them.
-    prefix : str
-        As it was put.
-    activation : str
-        As the file's description has it.
-
-    Returns
-    -------
-    MLP
-        The network.
-
-    Raises
-    ------
-    KeyError
-        If a weight or a bias of a layer is missing.
-    ValueError
-        If there is none, or the layers make no network.
-    """
+    """Return the network that :func:`put_mlp` added."""
     found = (re.fullmatch(rf"{re.escape(prefix)}(\d+)\.(weight|bias)", name) for name in tensors)
     layers = range(len({match[1] for match in found if match}))
     return MLP(

@@ -23,24 +23,7 @@ INFLATION = 10.0  # what a covariance is multiplied with where innovations agree
 
 @dataclass(frozen=True)
 class Supervision:
-    """Of a tracker, for all levels of noise.
-
-    Parameters
-    ----------
-    window : int
-        Samples over which squares of innovations are averaged, and within which T_inv may say again where to begin.
-    share : float
-        Of the newest square in that running mean.
-    limit : float
-        Of the mean square of innovations, beyond which the tracker is lost.
-    trend_share : float
-        Of the newest innovation in their running mean, the trend.
-    trend_square_share : float
-        Of the trend's newest square in the running mean of these, which goes farther back than a window.
-    trend_limit : float
-        Of the mean square of the trend, in multiples of what it is where innovations are independent. Beyond it the
-        covariance is inflated.
-    """
+    """Of a tracker, for all levels of noise."""
 
     window: int
     share: float

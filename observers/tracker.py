@@ -87,19 +87,7 @@ class Tracker:
     estimates differ by. Later T_inv is not asked, and M is the diagonal of P: a filter on a motion that contracts is
     too sure of what it takes to go together. A factor then makes regions hold what they should.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        With a flow, error bars and the output h(x).
-    decoders : Decoders
-        T_inv at the levels of noise.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviations of the noise on the samples, of all outputs or each.
-    process_noise : float
-        Level in multiples of the system's scale per second.
-    compiled : bool, default False
-        Whether single samples go through machine code, as :class:`observers.KKLObserver` has it. Batches of many rows
-        do so wherever Numba is installed. Outputs that are not linear stay with NumPy in any case.
+    Shapes: ``measurement_noise`` of length ny.
     """
 
     def __init__(

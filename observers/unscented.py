@@ -20,13 +20,6 @@ class Points:
     """How sigma points are chosen; by default as in the cubature Kalman filter (Arasaratnam and Haykin, 2009).
 
     That has no point in the middle, and all weigh the same.
-
-    Parameters
-    ----------
-    kappa : float
-        How much farther out than sqrt(nx) they are, as above. It is also what the mean weighs, in points.
-    beta : float
-        What the mean weighs more in covariances, in multiples of all points together.
     """
 
     kappa: float = 0.0
@@ -71,21 +64,7 @@ def predicted(
 ) -> Gaussian:
     """Move a batch of Gaussians.
 
-    Parameters
-    ----------
-    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
-        Means and covariances.
-    move : callable
-        Takes sigma points (points, n, nx) to where they are later.
-    Q : ndarray, shape (nx, nx)
-        Covariance of what is added on the way.
-    points : Points
-        How they are chosen.
-
-    Returns
-    -------
-    tuple of ndarray
-        Means and covariances later; NaN where a covariance was none.
+    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``Q`` (nx, nx).
     """
     nx = x.shape[-1]
     mean, spread = points.moments(move(points.of(x, P)), nx)
@@ -103,25 +82,7 @@ def corrected(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Condition a batch of Gaussians on samples.
 
-    Parameters
-    ----------
-    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
-        Means and covariances.
-    y : ndarray, shape (n, ny)
-        Samples; NaN where they are missing, which corrects nothing.
-    output : callable
-        h: sigma points (points, n, nx) to outputs (points, n, ny).
-    R : ndarray, shape (ny, ny)
-        Covariance of the noise on the samples.
-    points : Points
-        How they are chosen.
-
-    Returns
-    -------
-    x, P : ndarray
-        Means and covariances given the samples; NaN where a covariance was none, or h is undefined at a sigma point.
-    nis : ndarray, shape (n,)
-        Normalised innovations squared, per output that was measured: 1 on average where all is as assumed.
+    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``y`` (n, ny), ``R`` (ny, ny); returns ``nis`` (n,).
     """
     expected, S, across = transformed(x, P, function=output, points=points)
     x, P, white = conditioned(x, P, y - expected, S + R, across, np.isnan(y))
@@ -133,19 +94,7 @@ def transformed(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a function makes of a batch of Gaussians.
 
-    Parameters
-    ----------
-    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
-        Means and covariances.
-    function : callable
-        Takes sigma points (points, n, nx) to (points, n, k).
-    points : Points
-        How they are chosen.
-
-    Returns
-    -------
-    tuple of ndarray, shapes (n, k), (n, k, k) and (n, nx, k)
-        Means, covariances, and covariances of the states with them; NaN where a covariance was none.
+    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx); returns (n, k), (n, k, k) and (n, nx, k).
     """
     nx, at = x.shape[-1], points.of(x, P)
     mean, spread = points.moments(function(at), nx)
@@ -162,24 +111,8 @@ def conditioned(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Condition a batch of Gaussians on what samples differ by from what was expected.
 
-    Parameters
-    ----------
-    x, P : ndarray, shapes (n, nx) and (n, nx, nx)
-        Means and covariances.
-    innovation : ndarray, shape (n, ny)
-        Samples less what was expected.
-    S, across : ndarray, shapes (n, ny, ny) and (n, nx, ny)
-        Covariances of the innovations, and of the states with them.
-    missing : ndarray of bool, shape (n, ny), optional
-        The samples that are missing, which correct nothing; by default where the innovation is NaN.
-
-    Returns
-    -------
-    x, P : ndarray
-        As :func:`corrected` has them.
-    white : ndarray, shape (n, ny)
-        Innovations less what those of the outputs before say of them, in units of their standard deviation: where all
-        is as assumed, they are independent and of variance 1. 0 where samples are missing.
+    Shapes: ``x``, ``P`` (n, nx) and (n, nx, nx), ``innovation`` (n, ny), ``S``, ``across`` (n, ny, ny) and (n, nx, ny),
+    ``missing`` (n, ny); returns ``white`` (n, ny).
     """
     missing = np.isnan(innovation) if missing is None else missing
     if missing.any():

@@ -17,22 +17,7 @@ SUFFIX = ".checkpoint.pt"
 
 
 def save(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
-    """Write a checkpoint, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        The file; its name ends in ``SUFFIX``.
-    state : mapping of str to object
-        Tensors, plain values, and lists and dictionaries of them.
-    fingerprint : str
-        What identifies the training that it belongs to.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
-    """
+    """Write a checkpoint, whole or not at all."""
     content = io.BytesIO()  # torch itself says of a full disk that it is "unexpected pos"
     torch.save({**state, "fingerprint": fingerprint}, content)
     with replacing(path) as temporary:
@@ -40,25 +25,7 @@ def save(path: Path, state: Mapping[str, Any], *, fingerprint: str) -> None:
 
 
 def load(path: Path, *, fingerprint: str | None = None) -> dict[str, Any]:
-    """Read a checkpoint.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    fingerprint : str, optional
-        What identifies the training that is to go on; by default any will do.
-
-    Returns
-    -------
-    dict
-        The state that was saved, its tensors on the CPU.
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, is damaged, or belongs to another training.
-    """
+    """Read a checkpoint."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -79,18 +46,7 @@ def load(path: Path, *, fingerprint: str | None = None) -> dict[str, Any]:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Turn what goes wrong while a checkpoint's state is taken up into an error that names the file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    ValueError
-        If the body raises what contents that are missing or of a wrong type lead to.
-    """
+    """Turn what goes wrong while a checkpoint's state is taken up into an error that names the file."""
     try:
         yield
     except (ValueError, KeyError, RuntimeError, TypeError, IndexError, AttributeError) as error:

@@ -79,18 +79,7 @@ EXTRAS = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point of the ``kkl-gym`` command.
-
-    Parameters
-    ----------
-    arguments : list of str, optional
-        What follows ``kkl-gym``; by default what the process was called with.
-
-    Raises
-    ------
-    SystemExit
-        After help, with one line that says what is wrong where something is, and with 130 after an interruption.
-    """
+    """Entry point of the ``kkl-gym`` command."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with _noticing_interruptions() as interrupted:
         try:
@@ -141,23 +130,7 @@ def _noticing_interruptions() -> Iterator[list[int]]:
 
 
 def read(arguments: list[str]) -> Any:
-    """Read a command line, and run nothing.
-
-    Parameters
-    ----------
-    arguments : list of str
-        What follows ``kkl-gym``.
-
-    Returns
-    -------
-    object
-        The command with its options; ``run(console)`` runs it.
-
-    Raises
-    ------
-    SystemExit
-        After help, and with one line that says what is wrong where the command or an option is unknown.
-    """
+    """Read a command line, and run nothing."""
     import tyro
 
     called = arguments[:1]
@@ -199,20 +172,7 @@ def _without_box(text: str) -> str:
 
 
 def load(module: str, name: str) -> Callable[..., Any]:
-    """Import what is behind a command.
-
-    Parameters
-    ----------
-    module : str
-        Under ``training.commands``.
-    name : str
-        Of the class in it.
-
-    Returns
-    -------
-    type
-        The class, whose fields are the options.
-    """
+    """Import what is behind a command."""
     found: Callable[..., Any] = getattr(import_module(f"training.commands.{module}"), name)
     return found
 

@@ -24,15 +24,7 @@ Cluster = tuple[int, "Futures", Around]  # its cores, what gives it jobs, and th
 
 
 class Futures(ParallelBackendBase):  # type: ignore[misc]
-    """Jobs as futures of whatever runs them.
-
-    Parameters
-    ----------
-    begin : callable
-        Takes a call that can be pickled, has it made somewhere, and returns its future.
-    cancel : callable
-        Takes such a future, and ends what has begun, too.
-    """
+    """Jobs as futures of whatever runs them."""
 
     supports_retrieve_callback = True
 
@@ -66,29 +58,7 @@ class Futures(ParallelBackendBase):  # type: ignore[misc]
 
 @contextmanager
 def dask(address: str) -> Iterator[Cluster]:
-    """Connect to a cluster of Dask's.
-
-    Parameters
-    ----------
-    address : str
-        Of the scheduler.
-
-    Yields
-    ------
-    int
-        Number of workers.
-    Futures
-        What gives them jobs.
-    callable
-        Makes the context of a job in a folder.
-
-    Raises
-    ------
-    ValueError
-        If there are no workers, or some have several threads.
-    OSError
-        If nobody answers.
-    """
+    """Connect to a cluster of Dask's."""
     from distributed import Client
 
     with Client(address) as client:
@@ -109,13 +79,7 @@ def dask(address: str) -> Iterator[Cluster]:
 
 @contextmanager
 def on_dask(folder: Path) -> Iterator[None]:
-    """Work in a folder, and end the worker when nobody wants the job any more: threads cannot be interrupted.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the command was begun.
-    """
+    """Work in a folder, and end the worker when nobody wants the job any more: threads cannot be interrupted."""
     from distributed import get_worker
 
     worker, ended = get_worker(), threading.Event()
@@ -137,27 +101,7 @@ def on_dask(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def ray(address: str) -> Iterator[Cluster]:
-    """Connect to a cluster of Ray's.
-
-    Parameters
-    ----------
-    address : str
-        Of its head; auto for the one of this machine. A caller who is connected already stays so.
-
-    Yields
-    ------
-    int
-        Number of cores.
-    Futures
-        What gives them jobs.
-    callable
-        Makes the context of a job in a folder.
-
-    Raises
-    ------
-    OSError
-        If nobody answers.
-    """
+    """Connect to a cluster of Ray's."""
     import ray
 
     tasks: dict[Future[Any], Any] = {}

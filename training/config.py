@@ -202,23 +202,7 @@ def setting_types() -> dict[str, Any]:
 
 
 def current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings under the names that they have now.
-
-    Parameters
-    ----------
-    settings : mapping of str to object
-        By names of now or of before.
-
-    Returns
-    -------
-    dict of str to object
-        The same values.
-
-    Raises
-    ------
-    ValueError
-        If a setting is there under both of its names.
-    """
+    """Settings under the names that they have now."""
     found = {FORMER_NAMES.get(name, name): value for name, value in settings.items()}
     if len(found) < len(settings):
         twice = [f"{old} and {new}" for old, new in FORMER_NAMES.items() if old in settings and new in settings]
@@ -227,25 +211,7 @@ def current_names(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_changes(path: Path) -> dict[str, Any]:
-    """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`.
-
-    Parameters
-    ----------
-    path : Path
-        The file; an object of settings, by names of now or of before.
-
-    Returns
-    -------
-    dict of str to object
-        The settings, by names of now, each of its type and within its limits.
-
-    Raises
-    ------
-    ValueError
-        If it is no JSON, no object of a configuration's settings, or a value makes no sense.
-    OSError
-        If it cannot be read.
-    """
+    """Settings from a JSON file, as ``kkl-gym tune`` writes it, for :func:`override`."""
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:  # that of JSON, or of a text in another encoding
@@ -261,23 +227,7 @@ def read_changes(path: Path) -> dict[str, Any]:
 
 
 def settings_of(training: Mapping[str, Any]) -> Config:
-    """The configuration behind what an artifact says of its training.
-
-    Parameters
-    ----------
-    training : mapping of str to object
-        By names of now or of before, with other things beside.
-
-    Returns
-    -------
-    Config
-        What it says; settings that are not in it have their defaults.
-
-    Raises
-    ------
-    ValueError
-        If it says nothing of the filter, or a value makes no sense.
-    """
+    """The configuration behind what an artifact says of its training."""
     known = setting_types()
     found = {name: value for name, value in current_names(training).items() if name in known and value is not None}
     if not {"pipeline", "eigenvalues"} <= set(found):
@@ -297,23 +247,5 @@ def _validated(settings: Mapping[str, Any], where: str) -> dict[str, Any]:
 
 
 def override(config: Config, changes: Mapping[str, Any]) -> Config:
-    """The configuration with some settings changed.
-
-    Parameters
-    ----------
-    config : Config
-        What is to be changed; it stays as it is.
-    changes : mapping of str to object
-        Settings by name; those that are None are left out.
-
-    Returns
-    -------
-    Config
-        The changed configuration.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        A ValueError, if the settings make no sense together.
-    """
+    """The configuration with some settings changed."""
     return replace(config, **{name: value for name, value in changes.items() if value is not None})

@@ -25,19 +25,7 @@ PROGRAM = 0.5e9  # bytes of Python, torch and one chunk of trajectories
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a run will take.
-
-    Parameters
-    ----------
-    pairs : int
-        States that are recorded, each with the filter's beside it.
-    parameters : int
-        Weights of all networks.
-    bytes : float
-        Memory, roughly.
-    seconds : dict of str to float
-        Of each stage, at the speed that short runs had on this machine; at most its part of the limit of CPU time.
-    """
+    """What a run will take."""
 
     pairs: int
     parameters: int
@@ -52,29 +40,7 @@ def estimate(
     device: torch.device | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Estimate:
-    """Estimate a run by short ones of the same sizes: a few trajectories and batches.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    config : Config
-        Of the run.
-    device : torch.device, optional
-        As for :func:`training.train`.
-    report : callable, optional
-        Told how many of the ``RUNS`` are done.
-
-    Returns
-    -------
-    Estimate
-        Monitor and report aside.
-
-    Raises
-    ------
-    ValueError
-        As :func:`training.train`.
-    """
+    """Estimate a run by short ones of the same sizes: a few trajectories and batches."""
     brief = replace(
         config,
         cpu_seconds=None,

@@ -54,23 +54,7 @@ _around: ContextVar[Theme] = ContextVar("theme", default="light")
 
 @contextmanager
 def style(theme: Theme | None = None) -> Iterator[None]:
-    """Draw in the style of this package until the end of a block.
-
-    Parameters
-    ----------
-    theme : "light" or "dark", optional
-        None takes that of the block around this one; there is none around what commands draw, which is light.
-
-    Yields
-    ------
-    None
-        Figures must be made, drawn and saved inside.
-
-    Raises
-    ------
-    ValueError
-        If there is no such theme.
-    """
+    """Draw in the style of this package until the end of a block."""
     import matplotlib
 
     chosen = _around.get() if theme is None else theme
@@ -84,23 +68,7 @@ def style(theme: Theme | None = None) -> Iterator[None]:
 
 
 def looks(theme: Theme = "light") -> dict[Any, Any]:
-    """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``.
-
-    Parameters
-    ----------
-    theme : "light" or "dark"
-        The ground.
-
-    Returns
-    -------
-    dict
-        Values by the names that ``matplotlib.rcParams`` has for them.
-
-    Raises
-    ------
-    ValueError
-        If there is no such theme.
-    """
+    """Settings of matplotlib that make this style: for notebooks, as in ``plt.rcParams |= looks()``."""
     from cycler import cycler
 
     if theme not in get_args(Theme):
@@ -114,20 +82,7 @@ def looks(theme: Theme = "light") -> dict[Any, Any]:
 
 @contextmanager
 def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
-    """Make a figure in this style, which is written at the end of the block.
-
-    Parameters
-    ----------
-    path : Path
-        Of the picture, whose ending says the format; its folder is made.
-    width, height : float
-        In inches. On pages there is room for ten of them in the width.
-
-    Yields
-    ------
-    matplotlib.figure.Figure
-        To be drawn on. No window and no global state of matplotlib know of it.
-    """
+    """Make a figure in this style, which is written at the end of the block."""
     from matplotlib.figure import Figure
 
     with style():
@@ -137,15 +92,7 @@ def drawing(path: Path, width: float, height: float) -> Iterator["Figure"]:
 
 
 def save(path: Path, figure: "Figure") -> None:
-    """Write a figure, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        Of the picture, whose ending says the format; its folder is made.
-    figure : matplotlib.figure.Figure
-        What is written.
-    """
+    """Write a figure, whole or not at all."""
     with style(), replacing(path) as temporary:
         figure.savefig(temporary)
 
@@ -155,15 +102,6 @@ def save_moving(path: Path, frames: "Sequence[Image]", *, seconds: float) -> Non
 
     All frames have the same few colours, for which the first, the middle and the last are looked at: what does not move
     then costs nothing. Those of the style stay as they are, and so does the ground.
-
-    Parameters
-    ----------
-    path : Path
-        Of the GIF; its folder is made.
-    frames : sequence of PIL.Image.Image
-        In RGB.
-    seconds : float
-        That it lasts.
     """
     from matplotlib.colors import to_rgb
     from PIL import Image

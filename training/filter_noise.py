@@ -11,25 +11,7 @@ from observers import LinearFilter
 def noise_covariance(linear: LinearFilter, ages: np.ndarray) -> np.ndarray:
     """Covariances of the filter's error due to unit white noise on each output, by the number of samples since reset.
 
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    ages : ndarray of int, shape (n,)
-        Samples since reset, sorted.
-
-    Returns
-    -------
-    ndarray, shape (n, ny, size, size)
-        For a standard deviation of 1 on one output alone; a covariance is proportional to its square, and those of
-        several outputs add up.
-
-    Notes
-    -----
-    With e_k the part of z_k that the noise v_0, ..., v_k causes, e_0 = E v_0 and
-    e_k+1 = Phi e_k + early v_k + late v_k+1: neighbouring increments share a sample of noise. What is uncorrelated
-    with v_k is s_k = e_k - late v_k, for which s_k+1 = Phi s_k + (Phi late + early) v_k; that recursion is summed
-    exactly. Many samples after reset the covariance is the solution of its discrete Lyapunov equation.
+    Shapes: ``ages`` (n,); returns (n, ny, size, size).
     """
     phi = linear.transition
     out = np.empty((len(ages), linear.B.shape[1], linear.size, linear.size))

@@ -16,18 +16,7 @@ from observers.storage import clear_unfinished, write
 
 
 def describe(system: System) -> dict[str, Any]:
-    """What identifies a system, its equations included: they are sampled at points of the training box.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-
-    Returns
-    -------
-    dict
-        To be compared with another after a way through JSON, which makes lists of tuples.
-    """
+    """What identifies a system, its equations included: they are sampled at points of the training box."""
     rng = np.random.default_rng(0)
     x = system.draw_starts(rng, 20)
     if system.discrete:
@@ -48,22 +37,7 @@ def describe(system: System) -> dict[str, Any]:
 
 
 def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
-    """Refuse to work in a folder that holds something else.
-
-    Parameters
-    ----------
-    path : Path
-        JSON file that says what its folder holds; without it, anything may be written there.
-    described : mapping
-        What the folder is wanted for; anything that JSON can hold.
-    what : str
-        It holds otherwise, for the message, such as "results of another benchmark".
-
-    Raises
-    ------
-    ValueError
-        If the file is damaged or says something else; every difference is named.
-    """
+    """Refuse to work in a folder that holds something else."""
     if not path.exists():
         return
     here = _as_json(described)
@@ -79,20 +53,7 @@ def check_identity(path: Path, described: Mapping[str, Any], what: str) -> None:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other processes from working in a folder, and clear away what killed ones have left half-written.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if missing.
-
-    Raises
-    ------
-    ValueError
-        If another process is at work there already.
-    OSError
-        If the folder cannot be made or written to.
-    """
+    """Keep other processes from working in a folder, and clear away what killed ones have left half-written."""
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / ".lock", timeout=0)
     try:
@@ -108,22 +69,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def claimed_job(folder: Path, described: Mapping[str, Any], what: str) -> Iterator[None]:
-    """Lock a job's folder and write what identifies the job in job.json.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if missing.
-    described : mapping
-        What makes the job's results what they are; anything that JSON can hold.
-    what : str
-        The folder holds otherwise, for the message, such as "results of another benchmark".
-
-    Raises
-    ------
-    ValueError
-        If the folder holds another job, or another process is at work there.
-    """
+    """Lock a job's folder and write what identifies the job in job.json."""
     path = folder / "job.json"
     with locked(folder):
         check_identity(path, described, what)
@@ -136,20 +82,6 @@ def claimed_run(folder: Path, described: Mapping[str, Any], resume: bool) -> Ite
     """Lock a training run's folder and write what identifies the run in config.json.
 
     A folder without checkpoints is free for any run.
-
-    Parameters
-    ----------
-    folder : Path
-        Made if missing.
-    described : mapping
-        The run; anything that JSON can hold.
-    resume : bool
-        Go on with the run whose checkpoints lie there.
-
-    Raises
-    ------
-    ValueError
-        If checkpoints would be spoiled, or another process is at work there.
     """
     with locked(folder):
         if not resume:

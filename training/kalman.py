@@ -34,19 +34,7 @@ def measurement_covariance(
 ) -> np.ndarray:
     """Covariance of the measurement noise that a filter assumes: no less than a part of the system's default.
 
-    Parameters
-    ----------
-    system : System
-        What is measured.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample, of all outputs or each.
-    floor : float
-        The least that is assumed, in multiples of the system's default.
-
-    Returns
-    -------
-    ndarray, shape (ny, ny)
-        R.
+    Shapes: ``measurement_noise`` of length ny; returns (ny, ny).
     """
     least = floor * np.asarray(system.measurement_noise, dtype=float)
     levels = np.maximum(np.asarray(measurement_noise, dtype=float), least)
@@ -58,21 +46,7 @@ def process_intensity(
 ) -> np.ndarray:
     """Intensity of the white noise that a filter assumes in place of the environments' process noise, never quite 0.
 
-    Parameters
-    ----------
-    system : System
-        What moves.
-    process_noise : float
-        Level of a noise that is uniform and held over each sample, in multiples of the system's scale per second.
-    dt : float
-        Sampling interval in seconds.
-    least : float
-        The least level that is assumed, at the pace of the shipped systems.
-
-    Returns
-    -------
-    ndarray, shape (nx, nx)
-        Q, per second.
+    Shapes: returns (nx, nx).
     """
     assumed = max(process_noise, least / system.pace)
     return np.diag((assumed * np.array(system.scale)) ** 2 / 3 * dt)
@@ -84,28 +58,8 @@ class KalmanFilter(ABC):
     A filter that loses its way, out of the system's declared bounds or to a covariance that is none, starts anew.
     Entries of samples that are NaN are missing, and correct nothing.
 
-    Parameters
-    ----------
-    system : System
-        The model.
-    dt : float
-        Sampling interval in seconds.
-    Q : ndarray, shape (nx, nx)
-        Intensity of the process noise, per second.
-    R : ndarray, shape (ny, ny)
-        Covariance of the measurement noise on each sample.
-    start : tuple of ndarray, shapes (nx,) and (nx, nx), optional
-        Mean and covariance of the start; by default what :func:`unknown_start` returns.
-
-    Attributes
-    ----------
-    x : ndarray, shape (n, nx)
-        Estimates.
-    P : ndarray, shape (n, nx, nx)
-        Their covariances.
-    nis : ndarray, shape (n,)
-        Normalised innovations squared of the last samples, per output: 1 on average where all is as assumed, 0 where
-        no output was measured, and infinite in rows that have started anew, or in which h is undefined.
+    Shapes: ``Q`` (nx, nx), ``R`` (ny, ny), ``start`` (nx,) and (nx, nx), ``x`` (n, nx), ``P`` (n, nx, nx), ``nis``
+    (n,).
     """
 
     def __init__(
@@ -118,15 +72,7 @@ class KalmanFilter(ABC):
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Begin with the start, corrected by the first sample.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (n, ny)
-            First samples, which also say how many filters there are.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            Estimates.
+        Shapes: ``y0`` (n, ny); returns (n, nx).
         """
         self.x, self.P, self.nis = self._corrected(*self._starts(len(y0)), y0)
         return self.decode()
@@ -134,12 +80,7 @@ class KalmanFilter(ABC):
     def restart(self, y0: np.ndarray, rows: np.ndarray) -> None:
         """Begin anew in some rows.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (number of rows, ny)
-            Their first samples.
-        rows : ndarray of bool, shape (n,)
-            Which rows.
+        Shapes: ``y0`` (number of rows, ny), ``rows`` (n,).
         """
         self.x, self.P, self.nis = self.x.copy(), self.P.copy(), self.nis.copy()
         self.x[rows], self.P[rows], self.nis[rows] = self._corrected(*self._starts(len(y0)), y0)
@@ -147,17 +88,7 @@ class KalmanFilter(ABC):
     def step(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
         """Predict over one sample and correct.
 
-        Parameters
-        ----------
-        y : ndarray, shape (n, ny)
-            The next samples.
-        u : ndarray, shape (n, nu), optional
-            Inputs held since the samples before; zero by default.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            Estimates.
+        Shapes: ``y`` (n, ny), ``u`` (n, nu); returns (n, nx).
         """
         self.advance(y, u)
         return self.decode()
@@ -165,14 +96,7 @@ class KalmanFilter(ABC):
     def advance(self, y: np.ndarray, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
         """Do what :meth:`step` does without the estimate, in some rows only if ``rows`` are given.
 
-        Parameters
-        ----------
-        y : ndarray, shape (n, ny)
-            The next samples.
-        u : ndarray, shape (n, nu), optional
-            Inputs held since the samples before; zero by default.
-        rows : ndarray of bool, shape (n,), optional
-            Which rows move; by default all of them.
+        Shapes: ``y`` (n, ny), ``u`` (n, nu), ``rows`` (n,).
         """
         held = np.zeros((self._system.nu, len(y))) if u is None else np.ascontiguousarray(u.T, dtype=float)
         x, P, nis = self._moved(held, y)

@@ -4,25 +4,7 @@ from collections.abc import Iterable, Sequence
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    r"""Lay out a table.
-
-    Parameters
-    ----------
-    header : sequence of str
-        Titles of the columns; empty ones may be.
-    rows : iterable of sequences of str
-        Cells, as many in each row as there are titles. A vertical bar in a cell must be written ``\|``.
-
-    Returns
-    -------
-    list of str
-        Lines.
-
-    Raises
-    ------
-    ValueError
-        If a row is longer or shorter than the header.
-    """
+    r"""Lay out a table."""
     lines = [_line(header), "|---" * len(header) + "|"]
     for row in rows:
         if len(row) != len(header):

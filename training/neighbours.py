@@ -21,13 +21,7 @@ ROUNDING = 1e-9  # of z, in a linear regression
 class Told:
     """What z tells of x.
 
-    Parameters
-    ----------
-    left : ndarray, shape (nx,)
-        Root mean square of what z leaves of x unknown, in standard deviations of x: 1 if all of it, 0 if nothing. NaN
-        of what never moves.
-    linear : ndarray, shape (nx,)
-        What a linear regression on z leaves.
+    Shapes: ``left`` (nx,), ``linear`` (nx,).
     """
 
     left: np.ndarray
@@ -37,19 +31,7 @@ class Told:
 def told(z: np.ndarray, x: np.ndarray, *, others_z: np.ndarray, others_x: np.ndarray) -> Told:
     """Find what z tells of x.
 
-    Parameters
-    ----------
-    z : ndarray, shape (n, modes)
-        Of the samples that ask, as large as what counts in it: about 1, and less of what is mostly noise.
-    x : ndarray, shape (n, nx)
-        Of the same.
-    others_z, others_x : ndarray, shape (m, ...)
-        Of others that have nothing to do with them, more than twice as many as modes.
-
-    Returns
-    -------
-    Told
-        Neither is above 1 by more than chance.
+    Shapes: ``z`` (n, modes), ``x`` (n, nx), ``others_z``, ``others_x`` (m, ...).
     """
     deviation = np.where(np.ptp(x, 0) > 0, x.std(0), np.nan)
     design = np.column_stack([np.ones(len(others_z)), others_z])

@@ -39,17 +39,7 @@ Job = TypeVar("Job", bound=Named)
 
 @dataclass(frozen=True)
 class Engine:
-    """What runs jobs.
-
-    Parameters
-    ----------
-    workers : int
-        How many run at a time.
-    settings : mapping of str to object
-        For :func:`joblib.parallel_config`.
-    around : callable
-        Makes the context of a job, where it runs.
-    """
+    """What runs jobs."""
 
     workers: int
     settings: Mapping[str, Any]
@@ -60,22 +50,6 @@ class Engine:
 
         Where a worker dies, what it and those beside it were at is run again, ``TRIES`` times in all. An interruption
         ends the workers, and so does the end of this process, even if it is killed.
-
-        Parameters
-        ----------
-        run : callable
-            What to do with a job; a function of a module, so that other processes find it.
-        jobs : sequence of jobs
-            They are begun in this order, each in one process.
-
-        Yields
-        ------
-        job
-            One that has ended.
-        str or None
-            What went wrong in it.
-        list of str
-            Names of the jobs that run now.
         """
         todo, lost = dict(enumerate(jobs)), Counter[int]()
         workers = min(self.workers, len(todo))
@@ -131,30 +105,7 @@ def _text(error: BaseException) -> str:
 
 @contextmanager
 def engine(workers: int | None = None, *, backend: Backend = "loky", address: str | None = None) -> Iterator[Engine]:
-    """Find workers for jobs, for as long as the context lasts.
-
-    Parameters
-    ----------
-    workers : int, optional
-        Jobs at a time; by default two on this machine, and as many as a cluster has cores. With one on this machine,
-        they run in this process.
-    backend : {"loky", "dask", "ray"}
-        Worker processes of this machine, or a cluster.
-    address : str, optional
-        Of the cluster: of Dask's scheduler, or of Ray's head.
-
-    Yields
-    ------
-    Engine
-        What runs jobs.
-
-    Raises
-    ------
-    ValueError
-        If an option makes no sense, or the cluster's workers are not such as jobs want.
-    OSError
-        If there is no cluster at that address.
-    """
+    """Find workers for jobs, for as long as the context lasts."""
     if workers is not None and workers < 1:
         raise ValueError(f"jobs = {workers} at a time: give at least one worker process")
     if backend == "loky":

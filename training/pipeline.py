@@ -407,20 +407,7 @@ class _Run:
 
 
 def shares(config: Config, nu: int) -> dict[str, float]:
-    """Stages of a run that train networks, with their parts in the CPU time.
-
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    nu : int
-        Number of inputs that the filter takes in.
-
-    Returns
-    -------
-    dict of str to float
-        By the stage's name.
-    """
+    """Stages of a run that train networks, with their parts in the CPU time."""
     if config.pipeline == "spinn":
         return SOLVED_SHARES if config.random_features else SPINN_SHARES
     closed_loop = ["closed-loop"] if config.closed_loop_trajectories else []

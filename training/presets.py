@@ -114,23 +114,6 @@ def eigenvalues(system: System, dt: float) -> tuple[float, ...]:
     """Real eigenvalues of A for an input-aware map.
 
     The system's profile says them, or they follow from how fast f changes in X and from how often y is sampled.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    tuple of float
-        In 1/s, from the slowest to the fastest.
-
-    Raises
-    ------
-    ValueError
-        If there is no profile and the system does not say how fast f changes.
     """
     chosen = profile(system).eigenvalues
     if chosen is not None:

@@ -37,15 +37,6 @@ class ProgressBars(Progress):
     """Bars with counts, the time that passed and the time that is left; on what is no terminal, a line now and then.
 
     ``add_task``, ``update``, ``advance`` and ``track`` are those of :class:`rich.progress.Progress`.
-
-    Parameters
-    ----------
-    console : rich.console.Console or None
-        Where bars are drawn, or lines are written if it is no terminal. None is silent.
-    log : Path, optional
-        A file to which lines are appended in any case, with the time of day.
-    **options
-        For :class:`rich.progress.Progress`.
     """
 
     def __init__(self, console: Console | None, log: Path | None = None, **options: Any) -> None:
@@ -66,39 +57,13 @@ class ProgressBars(Progress):
         self._ended = threading.Event()
 
     def bar(self, description: str, total: float | None = None) -> Callable[[float], None]:
-        """Begin a phase.
-
-        Parameters
-        ----------
-        description : str
-            What is being done.
-        total : float, optional
-            Of how many parts; None if nobody knows.
-
-        Returns
-        -------
-        callable
-            Told how many parts are done.
-        """
+        """Begin a phase."""
         task = self.add_task(description, total=total)
         return lambda done: self.update(task, completed=done)
 
     @contextmanager
     def phase(self, description: str, total: float = 1) -> Iterator[Callable[[float], None]]:
-        """Show a phase for as long as the context lasts.
-
-        Parameters
-        ----------
-        description : str
-            What is being done.
-        total : float, default 1
-            Of how many parts.
-
-        Yields
-        ------
-        callable
-            Told how many parts are done.
-        """
+        """Show a phase for as long as the context lasts."""
         task = self.add_task(description, total=total)
         try:
             yield lambda done: self.update(task, completed=done)
@@ -108,13 +73,7 @@ class ProgressBars(Progress):
         self.update(task, completed=total)
 
     def say(self, text: str) -> None:
-        """Print a line above the bars, and to the log.
-
-        Parameters
-        ----------
-        text : str
-            For people, without markup.
-        """
+        """Print a line above the bars, and to the log."""
         self.console.print(text, markup=False, highlight=False, soft_wrap=True)
         self._append(text)
 
@@ -198,21 +157,7 @@ class ProgressBars(Progress):
 
 @contextmanager
 def progress_bars(console: Console | ProgressBars | None, log: Path | None = None) -> Iterator[ProgressBars]:
-    """Make bars, unless there are some already.
-
-    Parameters
-    ----------
-    console : rich.console.Console, ProgressBars or None
-        Where they are drawn; on one that is no terminal, lines are written. None is silent. Bars of a caller's are
-        taken as they are, log included.
-    log : Path, optional
-        A file to which lines are appended.
-
-    Yields
-    ------
-    ProgressBars
-        Drawn until the context ends.
-    """
+    """Make bars, unless there are some already."""
     if isinstance(console, ProgressBars):
         yield console
     else:

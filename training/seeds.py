@@ -24,27 +24,7 @@ AGENT_EVALUATION_EPISODES = 10_000  # at most
 
 
 def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
-    """Seed of the first episode on which an agent learns; those that begin beside it follow one by one.
-
-    Parameters
-    ----------
-    seed : int
-        The agent's own.
-    resumed : int, default 0
-        How many times the training has gone on from a checkpoint. It then begins other episodes.
-    rows : int, default 1
-        Number of episodes that begin at a time, fewer than 10,000.
-
-    Returns
-    -------
-    int
-        Far below those of evaluation.
-
-    Raises
-    ------
-    ValueError
-        If the seed is negative, or so large that episodes of evaluation would be learned from.
-    """
+    """Seed of the first episode on which an agent learns; those that begin beside it follow one by one."""
     most = AGENT_EVALUATION_SEED // AGENT_TRAINING_SEED - 2
     if not 0 <= seed <= most:
         raise ValueError(f"an agent's seed must lie between 0 and {most}, got {seed}")
@@ -52,25 +32,7 @@ def agent_training_seed(seed: int, resumed: int = 0, rows: int = 1) -> int:
 
 
 def agent_evaluation_seed(seed: int, episodes: int) -> int:
-    """Seed of the first episode on which agents are evaluated; no two seeds share an episode.
-
-    Parameters
-    ----------
-    seed : int
-        What a user asks for.
-    episodes : int
-        Number of episodes to play.
-
-    Returns
-    -------
-    int
-        Beyond those of training.
-
-    Raises
-    ------
-    ValueError
-        If the seed is negative, or there are no episodes or more than 10,000.
-    """
+    """Seed of the first episode on which agents are evaluated; no two seeds share an episode."""
     if seed < 0 or not 1 <= episodes <= AGENT_EVALUATION_EPISODES:
         raise ValueError(
             f"seed must not be negative, and episodes from 1 to {AGENT_EVALUATION_EPISODES}; got {seed} and {episodes}"
@@ -79,26 +41,7 @@ def agent_evaluation_seed(seed: int, episodes: int) -> int:
 
 
 def generator(stream: Stream, *seed: int) -> np.random.Generator:
-    """Make the generator of a stream for a seed, and for a part of what is drawn with it.
-
-    Parameters
-    ----------
-    stream : Stream
-        Who draws.
-    *seed : int
-        The seed, then the part if there is one, each in [0, 2**32). Parts count from 1, because NumPy does not tell a
-        seed from the same with zeros behind it.
-
-    Returns
-    -------
-    numpy.random.Generator
-        At its beginning.
-
-    Raises
-    ------
-    ValueError
-        If an entry is out of range. NumPy would make two of a larger one, and so the seed of another part.
-    """
+    """Make the generator of a stream for a seed, and for a part of what is drawn with it."""
     for entry in seed:
         if not 0 <= entry < 2**32:
             raise ValueError(f"seed = {entry} must be a whole number from 0 to 2**32 - 1")

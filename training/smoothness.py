@@ -34,19 +34,7 @@ FASTEST_MODE = 0.5  # bound of |fast end| * dt
 class Smoothness:
     """What the z of neighbouring states say of T.
 
-    Parameters
-    ----------
-    spectrum : Spectrum
-        Modes for each output.
-    distance : float
-        Root mean square distance between nearest neighbours from different motions, per component, in standard
-        deviations of x. NaN, as all else, where too few states are known or all are at rest.
-    roughness : ndarray, shape (ny * modes,)
-        Root mean square difference between their z, in standard deviations of z: about the least error of a map that
-        cannot tell such neighbours apart.
-    exponent : ndarray, shape (ny * modes,)
-        With which differences in z fall where neighbours come closer, as distance^exponent: 1 where T is smooth,
-        0 where z does not follow from x.
+    Shapes: ``roughness`` (ny * modes,), ``exponent`` (ny * modes,).
     """
 
     spectrum: Spectrum
@@ -76,30 +64,6 @@ def smoothness(
 
     Motions without input are simulated once, half of them from X and half from a larger box, and the filters run beside
     them. Those states count at which a filter has forgotten its start to one part in a million.
-
-    Parameters
-    ----------
-    system : System
-        What moves.
-    spectra : iterable of Spectrum
-        The spectra, each with its modes for each output.
-    dt : float
-        Sampling interval in seconds. One below FINEST / rate is replaced by that.
-    box_factor : float, default 1.5
-        The larger box is this multiple of X.
-    seed : int, default 0
-        Of the starts.
-
-    Yields
-    ------
-    Smoothness
-        Of each spectrum in turn.
-
-    Raises
-    ------
-    ValueError
-        If the system is in discrete time or does not say how fast f changes, or motions leave its bounds before any of
-        the filters has forgotten its start.
     """
     check_continuous(system)
     spectra, rate = list(spectra), system.typical_rate
@@ -147,27 +111,7 @@ def _compared(system: System, spectrum: Spectrum, *, x: np.ndarray, z: np.ndarra
 
 
 def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spectrum]:
-    """Spectra to choose from, slow ones first: 2 nx + 1 real eigenvalues for each output, even in the logarithm.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float
-        Sampling interval in seconds, which bounds the fast ones.
-    duration : float, default infinity
-        Length of trajectories in seconds, which bounds the slow ones: filters are to forget their starts on them.
-
-    Returns
-    -------
-    list of Spectrum
-        At least one.
-
-    Raises
-    ------
-    ValueError
-        If the system does not say how fast f changes.
-    """
+    """Spectra to choose from, slow ones first: 2 nx + 1 real eigenvalues for each output, even in the logarithm."""
     rate = system.typical_rate
     fastest = min(FASTEST, FASTEST_MODE / (SPREAD * dt * rate))
     slowest = min(SLOWEST, fastest)
@@ -178,28 +122,7 @@ def intervals(system: System, dt: float, duration: float = np.inf) -> list[Spect
 
 @functools.cache
 def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spectrum:
-    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float
-        Sampling interval in seconds.
-    duration : float, default infinity
-        Length of trajectories in seconds, on which its filter is to forget its start.
-
-    Returns
-    -------
-    Spectrum
-        Always the same for the same arguments. If no interval makes T smooth, the one that comes closest to it; if
-        all motions are at rest before, the fastest.
-
-    Raises
-    ------
-    ValueError
-        If the system does not say how fast f changes, or motions leave its bounds too soon.
-    """
+    """Choose the slowest of the :func:`intervals` for which T is smooth, as slow modes average noise best."""
     found = []
     for one in smoothness(system, intervals(system, dt, duration), dt):
         if one.smooth:
@@ -209,17 +132,6 @@ def smooth_spectrum(system: System, dt: float, duration: float = np.inf) -> Spec
 
 
 def smoothest(found: Sequence[Smoothness]) -> int:
-    """Find the spectrum that comes closest to a smooth T.
-
-    Parameters
-    ----------
-    found : sequence of Smoothness
-        At least one, slow spectra first.
-
-    Returns
-    -------
-    int
-        Its index; the last one's where nothing is known of any, as motions have come to rest before.
-    """
+    """Find the spectrum that comes closest to a smooth T."""
     least = [float(np.nan_to_num(one.exponent, nan=-np.inf).min()) for one in found]
     return max(range(len(found)), key=lambda i: (least[i], i))

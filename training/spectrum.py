@@ -12,15 +12,7 @@ from observers import LinearFilter
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigenvalues of A for each output.
-
-    Parameters
-    ----------
-    eigenvalues : tuple of float
-        Real ones, in 1/s.
-    pairs : tuple of tuple of float
-        Complex pairs a +- iw as (a, w), in 1/s and rad/s.
-    """
+    """Eigenvalues of A for each output."""
 
     eigenvalues: tuple[float, ...] = ()
     pairs: tuple[tuple[float, float], ...] = ()
@@ -45,41 +37,13 @@ class Spectrum:
         return np.asarray(scipy.linalg.block_diag(*self.eigenvalues, *([[a, w], [-w, a]] for a, w in self.pairs)))
 
     def filter(self, ny: int, dt: float, nu: int = 0) -> LinearFilter:
-        """The filter with these modes for each output, driven by B = 1.
-
-        Parameters
-        ----------
-        ny : int
-            Number of outputs.
-        dt : float
-            Sampling interval in seconds.
-        nu : int, default 0
-            Number of inputs that it takes in.
-
-        Returns
-        -------
-        LinearFilter
-            One whose A has ny blocks.
-        """
+        """The filter with these modes for each output, driven by B = 1."""
         A = self.A
         return LinearFilter(np.kron(np.eye(ny), A), np.kron(np.eye(ny), np.ones((len(A), 1))), dt, nu)
 
 
 def evenly_spaced(n: int, slowest: float, fastest: float) -> tuple[float, ...]:
-    """Space real eigenvalues evenly in the logarithm.
-
-    Parameters
-    ----------
-    n : int
-        How many.
-    slowest, fastest : float
-        The first and the last, both negative, in 1/s.
-
-    Returns
-    -------
-    tuple of float
-        The eigenvalues.
-    """
+    """Space real eigenvalues evenly in the logarithm."""
     return tuple((-np.geomspace(-slowest, -fastest, n)).tolist())
 
 
@@ -89,23 +53,7 @@ def papers_spectrum(system: System) -> tuple[float, ...]:
 
 
 def bessel_spectrum(order: int, cutoff: float, norm: Literal["mag", "phase"] = "mag") -> Spectrum:
-    """Poles of an analogue Bessel filter.
-
-    Parameters
-    ----------
-    order : int
-        How many.
-    cutoff : float
-        In rad/s.
-    norm : {"mag", "phase"}, default "mag"
-        What the cutoff means, as in :func:`scipy.signal.bessel`: where the gain is -3 dB, or that of the Butterworth
-        filter with the same asymptotes, where the phase is about at its middle.
-
-    Returns
-    -------
-    Spectrum
-        The poles: pairs, and a real one if the order is odd.
-    """
+    """Poles of an analogue Bessel filter."""
     _, poles, _ = scipy.signal.besselap(order, norm=norm)
     real = tuple(float(cutoff * pole.real) for pole in poles if pole.imag == 0)
     return Spectrum(real, tuple((float(cutoff * p.real), float(cutoff * p.imag)) for p in poles if p.imag > 0))

@@ -24,15 +24,7 @@ _LANES = 32  # rows that make a step together: a few of the processor's vectors
 
 @dataclass(frozen=True)
 class CompiledBatch:
-    """A kernel and the system that it is of, called as ``step(x, u, w, dt)``.
-
-    Parameters
-    ----------
-    system : System
-        Takes the steps that the kernel leaves.
-    kernel : callable
-        Substeps of one length for each row.
-    """
+    """A kernel and the system that it is of, called as ``step(x, u, w, dt)``."""
 
     system: System
     kernel: Any
@@ -86,16 +78,6 @@ def batch_step(system: System) -> SamplingStep[np.ndarray]:
     compared each time this is called, and compiled anew where they say something else. The logger ``kkl_gym`` says at
     level INFO, once for each system, that NumPy goes on and why. Systems in discrete time are not integrated, and make
     their steps in NumPy.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are taken.
-
-    Returns
-    -------
-    SamplingStep
-        The step, and why it is not compiled where it is not.
     """
     said = f"{system.name} goes on with NumPy, not compiled"
     return shared_step(system, compiled_step, advance_batch, said=said, again=_again)
@@ -110,27 +92,7 @@ def _again(step: Advance[np.ndarray], system: System) -> Advance[np.ndarray]:
 
 
 def compiled_step(system: System) -> CompiledBatch:
-    """The compiled step of :func:`batch_step`.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are taken.
-
-    Returns
-    -------
-    CompiledBatch
-        From (x, u, w, dt) to the next states.
-
-    Raises
-    ------
-    ImportError
-        If Numba or sympy is not installed.
-    ValueError
-        If the equations are too long to compile in seconds, or the result is not what NumPy makes of them.
-    Exception
-        What sympy or Numba raise if they cannot take the equations.
-    """
+    """The compiled step of :func:`batch_step`."""
     import numba
     import sympy
 

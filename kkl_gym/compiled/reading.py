@@ -12,40 +12,14 @@ from kkl_gym.system import System
 
 
 def made_of(system: System) -> tuple[Any, ...]:
-    """All that a compiled step depends on, as far as it can be seen.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are compiled.
-
-    Returns
-    -------
-    tuple
-        The functions, and the numbers that they read, as text: 0.0 is not -0.0.
-    """
+    """All that a compiled step depends on, as far as it can be seen."""
     functions = tuple(getattr(type(system), name) for name in ("f", "g", "rate"))
     numbers = (repr((found.on_self, found.of_module)) for found in (Read(system, each) for each in functions))
     return type(system), *functions, repr((system.parameters, system.G, system.X, system.bounds, system.dt)), *numbers
 
 
 class Read:
-    """What a method reads beside its arguments.
-
-    Parameters
-    ----------
-    system : System
-        What the method is called on.
-    function : callable
-        The method, or a function that it calls.
-
-    Attributes
-    ----------
-    on_self, of_module : dict of str to float
-        Numbers by name: of the system, and of the function's module.
-    attributes, others : dict of str to object
-        All else by name, likewise.
-    """
+    """What a method reads beside its arguments."""
 
     def __init__(self, system: System, function: Any) -> None:
         self.on_self, self.of_module = dict[str, float](), dict[str, float]()

@@ -34,44 +34,13 @@ def single_step(system: System) -> SamplingStep[Components]:
     The equations must depend on nothing but state, input, parameters, and numbers in attributes and in their module.
     Those are as they were when this was called. The logger ``kkl_gym`` says at level INFO, once for each system, if
     they are not compiled and why.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are taken.
-
-    Returns
-    -------
-    SamplingStep
-        The step, and why it is not compiled where it is not.
     """
     said = f"single steps of {system.name} stay in Python"
     return shared_step(system, compiled_step, advance, said=said)
 
 
 def compiled_step(system: System) -> Advance[Components]:
-    """The compiled step of :func:`single_step`.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are taken.
-
-    Returns
-    -------
-    callable
-        From (x, u, w, dt) to the next x.
-
-    Raises
-    ------
-    ImportError
-        If Numba is not installed.
-    ValueError
-        If the equations hold what might be rounded in another way, are too long, or the result is not what Python makes
-        of them.
-    Exception
-        What Numba raises if it cannot take the equations.
-    """
+    """The compiled step of :func:`single_step`."""
     import numba
 
     _teach_elementary()

@@ -24,15 +24,7 @@ logger = logging.getLogger("kkl_gym")
 
 @dataclass(frozen=True)
 class SamplingStep(Generic[Values]):
-    """One sampling interval, called as ``step(x, u, w, dt)``.
-
-    Parameters
-    ----------
-    advance : callable
-        Takes the step.
-    obstacle : str, optional
-        Why it is not compiled; None where it is.
-    """
+    """One sampling interval, called as ``step(x, u, w, dt)``."""
 
     advance: Advance[Values]
     obstacle: str | None = None
@@ -40,21 +32,8 @@ class SamplingStep(Generic[Values]):
     def __call__(self, x: Values, u: Values, w: Values, dt: float) -> Values:
         """Take the step.
 
-        Parameters
-        ----------
-        x : ndarray, shape (nx, n), or sequence of float
-            States, component first, or a single one.
-        u : ndarray, shape (nu, n), or sequence of float
-            Inputs, held over the interval.
-        w : ndarray, shape (nx, n), or sequence of float
-            Process noise, held over the interval.
-        dt : float
-            Length of the interval in seconds.
-
-        Returns
-        -------
-        ndarray, shape (nx, n), or sequence of float
-            The next states; those that escape are not finite.
+        Shapes: ``x`` (nx, n), or sequence of float, ``u`` (nu, n), or sequence of float, ``w`` (nx, n), or sequence of
+        float; returns (nx, n), or sequence of float.
         """
         return self.advance(x, u, w, dt)
 
@@ -67,26 +46,7 @@ def shared_step(
     said: str,
     again: Callable[[Advance[Values], System], Advance[Values]] | None = None,
 ) -> SamplingStep[Values]:
-    """The compiled step of a system, made once for all systems that it is the same of.
-
-    Parameters
-    ----------
-    system : System
-        Whose equations are taken.
-    compile_step : callable
-        Compiles them, or raises anything at all.
-    otherwise : callable
-        From (system, x, u, w, dt) to the next x, where it does.
-    said : str
-        What the logger then says once, before the reason.
-    again : callable, optional
-        From a compiled step and another system to the same for that; ValueError if its equations say something else.
-
-    Returns
-    -------
-    SamplingStep
-        The step, and why it is not compiled where it is not.
-    """
+    """The compiled step of a system, made once for all systems that it is the same of."""
     plain = functools.partial(otherwise, system)
     if system.discrete:
         return SamplingStep(plain, f"{system.name} makes its step itself")
@@ -124,21 +84,7 @@ def _reason(error: Exception) -> str:
 def trial_states(system: System, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """States at which compiled equations are compared with the others.
 
-    Parameters
-    ----------
-    system : System
-        Whose box and bounds are taken.
-    n : int
-        How many of each of five kinds.
-    rng : numpy.random.Generator
-        Draws them.
-
-    Returns
-    -------
-    ndarray, shape (2 n, nx)
-        Random ones within X and within the bounds.
-    ndarray, shape (3 n, nx)
-        Where equations tend to branch: at bounds and zeros, whole numbers, and where the system draws its starts.
+    Shapes: returns (2 n, nx), (3 n, nx).
     """
     low, high = np.array(system.bounds, dtype=float).T
     random = np.concatenate([rng.uniform(*system.box(), (n, system.nx)), rng.uniform(low, high, (n, system.nx))])

@@ -18,133 +18,48 @@ from observers.spread import deviations
 
 
 class Estimator(Protocol):
-    """A batch of observers, as :class:`VectorEstimate` drives them.
-
-    Attributes
-    ----------
-    space : gymnasium.spaces.Box
-        Of one row's observation.
-    """
+    """A batch of observers, as :class:`VectorEstimate` drives them."""
 
     space: gym.spaces.Box
 
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> object:
         """Forget the past and take in the first samples.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (n, ny)
-            First samples.
-        x0 : ndarray, shape (n, nx)
-            True states at these samples, for observers that are meant to know their starts.
+        Shapes: ``y0`` (n, ny), ``x0`` (n, nx).
         """
         ...
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows and take in their first samples.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (number of True in rows, ny)
-            First samples.
-        rows : ndarray of bool, shape (n,)
-            Which rows begin anew.
-        x0 : ndarray, shape (number of True in rows, nx)
-            True states at these samples, as for :meth:`reset`.
+        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
         """
         ...
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
         """Take in one sample and the input that led to it.
 
-        Parameters
-        ----------
-        y : ndarray, shape (n, ny)
-            Samples.
-        u : ndarray, shape (n, nu), or None
-            Inputs held before them; None is zero.
-        rows : ndarray of bool, shape (n,), optional
-            Which rows take them in; None is all.
+        Shapes: ``y`` (n, ny), ``u`` (n, nu), or None, ``rows`` (n,).
         """
         ...
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains.
 
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (n,), optional
-            Of which rows; None is all.
-
-        Returns
-        -------
-        dict of str to ndarray, shape (number of rows, ...)
-            Values by their key in ``info``; ``x_hat`` are estimated states.
+        Shapes: ``rows`` (n,); returns (number of rows, ...).
         """
         ...
 
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """What of a report is the observation.
 
-        Parameters
-        ----------
-        report : mapping of str to ndarray
-            As :meth:`report` returns it.
-
-        Returns
-        -------
-        ndarray, shape (number of rows, width)
-            Values for ``space``, not yet clipped.
+        Shapes: returns (number of rows, width).
         """
         ...
 
 
 class KKLEstimator:
-    """A learned observer, one sample or a batch at a time, and the space of what it shows.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    space : gymnasium.spaces.Box
-        Of what is shown of a row.
-    estimate : {"x", "z"}
-        Whether the state estimate is shown, or the filter's state.
-    measurement_noise : float, sequence of float or None
-        The noise level that the observer assumes, of all outputs or each; None takes the artifact's.
-    process_noise : float, optional
-        Likewise of the motion.
-    blind : bool
-        Whether inputs act that the map does not know of.
-    ignore_input : bool
-        Whether it is used even so.
-    monitor : bool
-        Whether to keep the score.
-    known_start : bool
-        Whether the observer is told the true state at the start of an episode, and only there.
-    uncertainty : bool
-        Whether standard deviations are shown behind the state estimate.
-    compiled : bool, optional
-        As for :class:`observers.KKLObserver`.
-
-    Attributes
-    ----------
-    observer : KKLObserver
-        The observer, its noise levels set.
-    estimate : str
-        As given.
-    space : gymnasium.spaces.Box
-        As given.
-
-    Raises
-    ------
-    ValueError
-        If ``estimate`` is unknown, a flag is no bool, the noise level is beyond the map's range, or ``uncertainty`` is
-        asked for beside z.
-    observers.ArtifactError
-        If the artifact holds no forward map or flow and ``known_start`` is asked for, or no error bars and
-        ``uncertainty``.
-    """
+    """A learned observer, one sample or a batch at a time, and the space of what it shows."""
 
     def __init__(
         self,
@@ -185,31 +100,7 @@ class KKLEstimator:
         uncertainty: bool,
         compiled: bool | None = None,
     ) -> "KKLEstimator":
-        """An observer that was learned for a plant, at the plant's levels of noise.
-
-        Parameters
-        ----------
-        plant : Plant
-            What is observed.
-        observer : str or path or Artifact or None
-            A shipped name, a path if it ends in ``.safetensors``, or what is behind one; None takes the map shipped for
-            the plant's system.
-        estimate, measurement_noise, ignore_input, monitor, known_start, uncertainty, compiled
-            As for the class; without a level of measurement noise the plant's.
-
-        Returns
-        -------
-        KKLEstimator
-            The observer.
-
-        Raises
-        ------
-        ValueError
-            As the class, and if no map ships for the system.
-        observers.ArtifactError
-            As the class, and if the file is missing or damaged, or was made for another system, other parameters or
-            another dt.
-        """
+        """An observer that was learned for a plant, at the plant's levels of noise."""
         choice("estimate", estimate, ("x", "z"))
         uncertainty, system = flag("uncertainty", uncertainty), plant.system
         if observer is None and system.name not in shipped():
@@ -235,43 +126,11 @@ class KKLEstimator:
         )
 
     def replace(self, observer: str | os.PathLike[str] | Artifact) -> None:
-        """Take other maps for the same filter, which goes on.
-
-        Parameters
-        ----------
-        observer : str or path or Artifact
-            A shipped name, a path if it ends in ``.safetensors``, or what is behind one.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`observers.KKLObserver.replace`.
-        observers.ArtifactError
-            If it differs in more than its maps, or holds no forward map and starts are known, or no error bars and
-            they are shown.
-        """
+        """Take other maps for the same filter, which goes on."""
         self.observer.replace(self.asked(observer))
 
     def asked(self, observer: str | os.PathLike[str] | Artifact) -> Artifact:
-        """What :meth:`replace` would take.
-
-        Parameters
-        ----------
-        observer : str or path or Artifact
-            As there.
-
-        Returns
-        -------
-        Artifact
-            The observer, without its flow where nobody asks for what that estimates.
-
-        Raises
-        ------
-        ValueError
-            If it holds no forward map and starts are known, or no error bars and they are shown.
-        observers.ArtifactError
-            If the file is missing or damaged.
-        """
+        """What :meth:`replace` would take."""
         artifact = observer if isinstance(observer, Artifact) else Artifact.read(resolve(observer))
         if self._known_start:
             artifact.require_known_start()  # an error now, not at the first reset
@@ -286,20 +145,7 @@ class KKLEstimator:
     def known(self, u: np.ndarray) -> np.ndarray | None:
         """The input as far as the map knows it.
 
-        Parameters
-        ----------
-        u : ndarray, shape (..., nu)
-            What the environment applied.
-
-        Returns
-        -------
-        ndarray, shape (..., nu), or None
-            The same; None if the map knows no inputs.
-
-        Raises
-        ------
-        ValueError
-            If the agent acts on a map that knows no inputs, and ``ignore_input`` is false.
+        Shapes: ``u`` (..., nu); returns (..., nu), or None.
         """
         if not self._blind:
             return u
@@ -313,62 +159,28 @@ class KKLEstimator:
     def reset(self, y0: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past and take in the first samples.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (..., ny)
-            First samples, whose leading shape is the batch's.
-        x0 : ndarray, shape (..., nx)
-            True states, which are not looked at unless starts are known.
+        Shapes: ``y0`` (..., ny), ``x0`` (..., nx).
         """
         self.observer.reset(y0, x0 if self._known_start else None)
 
     def restart(self, y0: np.ndarray, rows: np.ndarray, x0: np.ndarray) -> None:
         """Forget the past in some rows and take in their first samples.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (number of True in rows, ny)
-            First samples.
-        rows : ndarray of bool, shape (n,)
-            Which rows begin anew.
-        x0 : ndarray, shape (number of True in rows, nx)
-            True states, as for :meth:`reset`.
+        Shapes: ``y0`` (number of True in rows, ny), ``rows`` (n,), ``x0`` (number of True in rows, nx).
         """
         self.observer.restart(y0, rows, x0 if self._known_start else None)
 
     def advance(self, y: np.ndarray, u: np.ndarray | None, rows: np.ndarray | None = None) -> None:
         """Take in samples and the inputs that led to them.
 
-        Parameters
-        ----------
-        y : ndarray, shape (..., ny)
-            Samples.
-        u : ndarray, shape (..., nu), or None
-            Inputs held before them; None is zero.
-        rows : ndarray of bool, shape (...,), optional
-            Which rows take them in; None is all.
-
-        Raises
-        ------
-        ValueError
-            As :meth:`known`.
+        Shapes: ``y`` (..., ny), ``u`` (..., nu), or None, ``rows`` (...,).
         """
         self.observer.advance(y, None if u is None else self.known(u), rows)
 
     def report(self, rows: np.ndarray | None = None) -> dict[str, np.ndarray]:
         """What ``info`` gains.
 
-        Parameters
-        ----------
-        rows : ndarray of bool, shape (...,), optional
-            Of which rows; None is all.
-
-        Returns
-        -------
-        dict of str to ndarray
-            ``z``, and ``x_hat`` if it is shown, with ``x_cov`` beside it if standard deviations are, and
-            ``parameters_hat`` if the map estimates parameters: with ``estimate="z"`` the network is not evaluated.
-            ``score`` with a monitor, which evaluates the network in any case.
+        Shapes: ``rows`` (...,).
         """
         found = {"z": self.observer.z if rows is None else self.observer.z[rows]}
         if self.estimate == "x":
@@ -384,33 +196,14 @@ class KKLEstimator:
     def shown(self, report: Mapping[str, np.ndarray]) -> np.ndarray:
         """What of a report is the observation.
 
-        Parameters
-        ----------
-        report : mapping of str to ndarray
-            As :meth:`report` returns it.
-
-        Returns
-        -------
-        ndarray, shape (..., width)
-            x_hat or z, not yet clipped; behind x_hat its standard deviations if they are shown.
+        Shapes: returns (..., width).
         """
         if self._uncertainty:
             return np.concatenate([report["x_hat"], deviations(report["x_cov"])], axis=-1)
         return report["x_hat" if self.estimate == "x" else "z"]
 
     def listed(self, report: Mapping[str, np.ndarray]) -> list[float]:
-        """As :meth:`shown`, of a single sample: of so few numbers every call of NumPy would be felt.
-
-        Parameters
-        ----------
-        report : mapping of str to ndarray
-            As :meth:`report` returns it.
-
-        Returns
-        -------
-        list of float
-            What :meth:`shown` returns.
-        """
+        """As :meth:`shown`, of a single sample: of so few numbers every call of NumPy would be felt."""
         values: list[float] = report["x_hat" if self.estimate == "x" else "z"].tolist()
         if self._uncertainty:
             variances = report["x_cov"].ravel().tolist()[:: len(values) + 1]
@@ -421,17 +214,7 @@ class KKLEstimator:
 def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
     """Values as observations: float32, within the bounds of their space.
 
-    Parameters
-    ----------
-    values : ndarray, shape (..., width)
-        One row or many.
-    space : gymnasium.spaces.Box, shape (width,)
-        Of one row.
-
-    Returns
-    -------
-    ndarray of float32, shape (..., width)
-        A copy.
+    Shapes: ``values`` (..., width), ``space`` (width,); returns (..., width).
     """
     return clipped(values, space.low, space.high)
 
@@ -439,15 +222,7 @@ def observation(values: np.ndarray, space: gym.spaces.Box) -> np.ndarray:
 def with_deviations(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of states and of their standard deviations behind them, which are no larger than the bounds are wide.
 
-    Parameters
-    ----------
-    low, high : ndarray, shape (nx,)
-        Bounds of the states.
-
-    Returns
-    -------
-    low, high : ndarray, shape (2 nx,)
-        Bounds of both.
+    Shapes: ``low``, ``high`` (nx,); returns ``low, high`` (2 nx,).
     """
     with np.errstate(over="ignore"):  # what float32 cannot hold is unbounded
         return np.concatenate([low, np.zeros_like(low)]), np.concatenate([high, high - low])
@@ -469,19 +244,7 @@ def reach(linear: LinearFilter, y_max: np.ndarray, u_max: np.ndarray) -> np.ndar
     Each is the response to the worst signal, the L1 norm of its impulse response. The filter starts from where a
     constant output would have led, so that its start lies within as well.
 
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    y_max : ndarray, shape (ny,)
-        Largest sizes of the outputs, which may be infinite.
-    u_max : ndarray, shape (nu,)
-        Those of the inputs, likewise.
-
-    Returns
-    -------
-    ndarray, shape (size,)
-        Infinite where a signal's size is that acts there.
+    Shapes: ``y_max`` (ny,), ``u_max`` (nu,); returns (size,).
     """
     driven = np.hstack([linear.early_y, linear.late_y, linear.held_u])
     limits = np.concatenate([y_max, y_max, u_max])

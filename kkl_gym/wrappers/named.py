@@ -15,41 +15,7 @@ from observers.checks import choice, flag
 
 
 class NamedEstimator(KKLEstimator):
-    """An observer from rollouts: what is measured is shown beside what it estimates.
-
-    Parameters
-    ----------
-    env : gymnasium.Env or gymnasium.vector.VectorEnv
-        The environment that the artifact says.
-    observation_space, action_space : gymnasium.Space
-        Of one environment.
-    artifact : Artifact
-        With an environment.
-    estimate : {"x", "z"}
-        Whether the estimates of hidden signals are shown, or the filter's state.
-    measurement_noise : float, sequence of float or None
-        The noise level that the observer assumes; None takes the artifact's.
-    monitor : bool
-        Whether to keep the score.
-    known_start : bool
-        Whether an observer that tracks is told the hidden signals at the reset, which have to be shown there.
-    uncertainty : bool
-        Whether standard deviations are shown behind the estimates.
-    compiled : bool, optional
-        As for :class:`observers.KKLObserver`.
-
-    Attributes
-    ----------
-    samples : Samples
-        What the observer sees of the environment.
-
-    Raises
-    ------
-    ValueError
-        If an argument makes no sense.
-    observers.ArtifactError
-        If the environment is another, or lacks a signal.
-    """
+    """An observer from rollouts: what is measured is shown beside what it estimates."""
 
     def __init__(
         self,
@@ -133,33 +99,7 @@ class NamedEstimator(KKLEstimator):
 
 
 class Samples:
-    """What an observer from rollouts sees of an environment.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        It names the signals.
-    observation_space, action_space : gymnasium.Space
-        Of one environment.
-    source : str
-        The environment, for messages.
-
-    Attributes
-    ----------
-    outputs, inputs : callable
-        What reads them.
-    hidden : callable or None
-        What reads the hidden signals; None where observations do not show them.
-    nx : int
-        Number of hidden signals.
-    count : int
-        Samples since the reset.
-
-    Raises
-    ------
-    ValueError
-        If the environment lacks a signal.
-    """
+    """What an observer from rollouts sees of an environment."""
 
     def __init__(
         self, artifact: Artifact, observation_space: gym.Space[Any], action_space: gym.Space[Any], *, source: str
@@ -189,22 +129,7 @@ class Samples:
         return y, u
 
     def states(self, observation: Any, info: Mapping[str, Any], batch: tuple[int, ...] = ()) -> dict[str, np.ndarray]:
-        """True hidden signals.
-
-        Parameters
-        ----------
-        observation : object
-            Of the environment inside, or as many as ``batch`` says.
-        info : mapping
-            What came with it.
-        batch : tuple of int
-            Leading shape of both.
-
-        Returns
-        -------
-        dict of str to ndarray
-            ``x``, shape (*batch, nx); nothing where they are not shown.
-        """
+        """True hidden signals."""
         if self.hidden is None:
             return {}
         try:

@@ -32,24 +32,6 @@ class VectorEstimate(VectorWrapper):
 
     ``info`` gains what the observers report, a row for each environment; so does ``info["final_info"]``, and
     ``info["final_obs"]`` holds the last estimates.
-
-    Parameters
-    ----------
-    env : gymnasium.vector.VectorEnv
-        A vector environment over :class:`kkl_gym.KKLEnv`, bare or under wrappers that leave ``info`` alone.
-    estimator : Estimator
-        The observers.
-
-    Attributes
-    ----------
-    autoreset_mode : gymnasium.vector.AutoresetMode
-        The environment's.
-
-    Raises
-    ------
-    ValueError
-        If the environment does not say its autoreset mode. At a step, if a wrapper inside hides samples from the
-        observers.
     """
 
     def __init__(self, env: VectorEnv, estimator: Estimator) -> None:
@@ -68,19 +50,7 @@ class VectorEstimate(VectorWrapper):
     ) -> tuple[np.ndarray, Infos]:
         """Reset environments and observers, all or the rows of ``options["reset_mask"]``.
 
-        Parameters
-        ----------
-        seed : int or sequence of int or None, length num_envs, optional
-            As for the environment.
-        options : mapping, optional
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Estimates in all rows.
-        info : dict
-            The environment's, with what the observers add.
+        Shapes: ``seed`` of length num_envs; returns ``observations`` (num_envs, width).
         """
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
@@ -102,26 +72,8 @@ class VectorEstimate(VectorWrapper):
     def step(self, actions: np.ndarray) -> Step:
         """Step the environments, and the observers with the new samples and the inputs that led to them.
 
-        Parameters
-        ----------
-        actions : array_like, shape (num_envs, nu)
-            As for the environment.
-
-        Returns
-        -------
-        observations : ndarray of float32, shape (num_envs, width)
-            Estimates after the new samples.
-        rewards : ndarray, shape (num_envs,)
-            The environment's.
-        terminated, truncated : ndarray of bool, shape (num_envs,)
-            The environment's.
-        info : dict
-            The environment's, with what the observers add.
-
-        Raises
-        ------
-        ValueError
-            As described above.
+        Shapes: ``actions`` (num_envs, nu); returns ``observations`` (num_envs, width), ``rewards`` (num_envs,),
+        ``terminated, truncated`` (num_envs,).
         """
         _, reward, terminated, truncated, info = self.env.step(actions)
         before, ended = self._ended, terminated | truncated
@@ -174,10 +126,7 @@ class VectorEstimate(VectorWrapper):
         Estimates are drawn on :class:`kkl_gym.KKLVectorEnv`, where the observers report ``x_hat``. For Sync and Async
         vectors put :class:`kkl_gym.KKLObservation` into each environment.
 
-        Returns
-        -------
-        tuple of ndarray of uint8, shape (height, width, 3), length num_envs, or None
-            RGB images; None without ``render_mode``.
+        Shapes: returns (height, width, 3), length num_envs, or None.
         """
         env: Any = self.env
         return env.render() if self._trails is None else env.unwrapped.draw(self._trails)
@@ -536,17 +485,7 @@ def _merged(old: Infos, new: Infos) -> Infos:
 def column(mask: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Shape a mask over rows to go with values.
 
-    Parameters
-    ----------
-    mask : ndarray of bool, shape (n,)
-        The mask.
-    values : ndarray, shape (n, ...)
-        What it is to be combined with.
-
-    Returns
-    -------
-    ndarray of bool, shape (n, 1, ...)
-        With as many axes as the values.
+    Shapes: ``mask`` (n,), ``values`` (n, ...); returns (n, 1, ...).
     """
     return mask.reshape(-1, *(1,) * (values.ndim - 1))
 
@@ -563,25 +502,7 @@ def autoreset_mode_in(env: VectorEnv) -> AutoresetMode:
 
 
 def plant_of(env: VectorEnv, *also: str) -> Plant:
-    """What the rows of a vector environment have in common.
-
-    Parameters
-    ----------
-    env : gymnasium.vector.VectorEnv
-        The vector environment.
-    *also : str
-        Attributes of a plant in which the rows must agree, beside system, dt and measurement noise.
-
-    Returns
-    -------
-    Plant
-        Of the first row.
-
-    Raises
-    ------
-    ValueError
-        If the rows are not environments of ours, or differ.
-    """
+    """What the rows of a vector environment have in common."""
     base: Any = env.unwrapped if isinstance(env, gym.vector.VectorEnv) else env
     if isinstance(base, KKLVectorEnv):
         return base.plant

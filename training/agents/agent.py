@@ -35,32 +35,7 @@ class AgentError(ValueError):
 
 @dataclass(frozen=True)
 class Agent:
-    """A deterministic policy, the task it was trained on and what it knows of the state.
-
-    Parameters
-    ----------
-    network : MLP
-        Features in, actions out.
-    squashed : bool
-        Whether tanh bounds the actions (SAC) or a cut at -1 and 1 (PPO).
-    task : ControlTask
-        Where it acts.
-    information : {"state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"}
-        What it is shown.
-    observer : str, optional
-        Name and version of the shipped map, or path of the file, that it was trained on.
-    fingerprint : str, optional
-        Checksum of what that file holds.
-    rules : mapping, optional
-        What else its observations follow from, see :func:`rules`.
-    training : mapping, optional
-        How it was trained.
-
-    Raises
-    ------
-    AgentError
-        If ``squashed`` is no bool, ``information`` is unknown, a name is no string, or the seed no whole number.
-    """
+    """A deterministic policy, the task it was trained on and what it knows of the state."""
 
     network: MLP
     squashed: bool
@@ -95,15 +70,7 @@ class Agent:
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """Act.
 
-        Parameters
-        ----------
-        obs : ndarray, shape (n, width)
-            Features.
-
-        Returns
-        -------
-        ndarray, shape (n, nu)
-            Actions in [-1, 1].
+        Shapes: ``obs`` (n, width); returns (n, nu).
         """
         action = self.network(obs)
         bounded: np.ndarray = np.tanh(action) if self.squashed else np.clip(action, -1.0, 1.0)
@@ -120,26 +87,6 @@ class Agent:
 
         An agent may come from a stranger's file, and to make a system of a name imports the module or the script that
         it names. So the name of a system that does not ship does nothing unless the caller says it too.
-
-        Parameters
-        ----------
-        num_envs : int
-            Number of episodes at a time.
-        autoreset_mode : str or AutoresetMode, default DISABLED
-            What happens at the end of an episode, as for :class:`gymnasium.vector.VectorEnv`.
-        system : str, System or type of System, optional
-            The agent's system: itself, its class, or the name that the agent has for it. Needed if it does not ship.
-
-        Returns
-        -------
-        Features
-            The environment.
-
-        Raises
-        ------
-        AgentError
-            If its system does not ship and is not given; if its observer, the system's equations or what its
-            observations are made of have changed; or if the policy does not fit the environment.
         """
         task = self.task
         if not isinstance(system, str | None):
@@ -166,20 +113,7 @@ class Agent:
         return env
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and description to one safetensors file, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file, whose name should end in ``.safetensors``; its folder is made.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        TypeError, ValueError
-            If JSON cannot hold ``rules`` or ``training``.
-        """
+        """Write weights and description to one safetensors file, whole or not at all."""
         tensors: dict[str, np.ndarray] = {}
         storage.put_mlp(tensors, "", self.network)
         described = {
@@ -197,23 +131,7 @@ class Agent:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Agent":
-        """Read an agent.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file.
-
-        Returns
-        -------
-        Agent
-            What :meth:`save` wrote.
-
-        Raises
-        ------
-        AgentError
-            If the file is missing, not readable, damaged, foreign or of a newer format.
-        """
+        """Read an agent."""
         tensors, described = storage.read(path, key=_KEY, error=AgentError, what="an agent")
         with storage.explained(path, AgentError):
             if described.pop("format") != FORMAT:
@@ -228,18 +146,7 @@ class Agent:
 
 
 def rules(task: ControlTask) -> dict[str, Any]:
-    """Return what an agent's observations follow from beside its task and observer.
-
-    Parameters
-    ----------
-    task : ControlTask
-        Where it acts.
-
-    Returns
-    -------
-    dict
-        Equations, target, scale and constants, as JSON gives them back.
-    """
+    """Return what an agent's observations follow from beside its task and observer."""
     system = get_system(task.system)
     described = {
         "equations": describe(system)["equations"],
@@ -258,23 +165,7 @@ def versioned(observer: str) -> str:
 
 
 def fingerprint(observer: str) -> str:
-    """Return the checksum of what an observer's file holds.
-
-    Parameters
-    ----------
-    observer : str
-        A shipped name, or a path that ends in ``.safetensors``.
-
-    Returns
-    -------
-    str
-        As :func:`observers.storage.checksum` gives it.
-
-    Raises
-    ------
-    AgentError
-        If there is no such file.
-    """
+    """Return the checksum of what an observer's file holds."""
     try:
         return storage.checksum(resolve(observer), ArtifactError)
     except ArtifactError as error:

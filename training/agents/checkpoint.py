@@ -21,18 +21,6 @@ class Checkpoint(BaseCallback):
 
     It holds networks, optimisers, counters, the learning curve and SAC's replay buffer. It holds neither the
     environments nor random generators: a training that goes on begins new episodes, with random numbers of its own.
-
-    Parameters
-    ----------
-    path : Path
-        The file. The learning curve lies beside it.
-    fingerprint : str
-        What identifies the training.
-
-    Attributes
-    ----------
-    resumed : int
-        How many times the training has gone on from a checkpoint.
     """
 
     def __init__(self, path: Path, fingerprint: str) -> None:
@@ -41,20 +29,7 @@ class Checkpoint(BaseCallback):
         self._curve = path.with_name(CURVE)
 
     def restore(self, model: BaseAlgorithm, timesteps: int) -> None:
-        """Take up what was saved, if anything was; the learning curve's file is as it was then.
-
-        Parameters
-        ----------
-        model : BaseAlgorithm
-            With a logger that writes to the file of the learning curve.
-        timesteps : int
-            Actions to learn from, all together.
-
-        Raises
-        ------
-        ValueError
-            If the checkpoint is damaged or belongs to another training.
-        """
+        """Take up what was saved, if anything was; the learning curve's file is as it was then."""
         if not self.path.exists():
             return
         found = checkpoints.load(self.path, fingerprint=self.fingerprint)

@@ -45,25 +45,7 @@ PROTOCOL = 1  # changes where results must not be mixed with earlier ones
 class Case:
     """One agent: trained, then played on the evaluation's episodes.
 
-    Parameters
-    ----------
-    system : str
-        A shipped system, or a class of the user's as "module:Class" or "script.py:Class".
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y.
-    information : {"state", "ekf", "x_hat", "x_hat_std", "z", "stacked", "y", "recurrent", "recurrent-state"}
-        What the agent knows.
-    seed : int
-        The agent's.
-    episodes : int
-        Number of episodes that it is played on.
-    timesteps : int or None
-        Actions to learn from; None takes what the hyperparameters say.
-    folder : Path
-        Receives job.json, scores.json, the learning curve and, where the policy is a perceptron, agent.safetensors.
-    observer : str, optional
-        A shipped map or a ``.safetensors`` file, for what agents know of an observer; by default
-        :func:`training.agents.information.observer_of` the system.
+    Shapes: ``measurement_noise`` of length ny.
     """
 
     system: str
@@ -114,18 +96,7 @@ class Case:
 
 
 def run_case(case: Case) -> None:
-    """Train and evaluate an agent, unless that is done.
-
-    Parameters
-    ----------
-    case : Case
-        The agent.
-
-    Raises
-    ------
-    ValueError
-        If another process is at work on it, or its folder holds an agent of another comparison.
-    """
+    """Train and evaluate an agent, unless that is done."""
     with claimed_job(case.folder, case.identity, OTHER):
         if not case.done:
             _run(case)
@@ -164,19 +135,7 @@ def _run(case: Case) -> None:
 def idle(system: str, measurement_noise: Level, episodes: int) -> np.ndarray:
     """Scores of zero input on the evaluation's episodes.
 
-    Parameters
-    ----------
-    system : str
-        A system with a control task.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y.
-    episodes : int
-        Their number.
-
-    Returns
-    -------
-    ndarray, shape (episodes,)
-        As :func:`training.agents.tasks.scores` gives them.
+    Shapes: ``measurement_noise`` of length ny; returns (episodes,).
     """
     task = get_task(system, measurement_noise)
     env = make(task, "state", episodes, autoreset_mode="Disabled")
@@ -188,22 +147,7 @@ def idle(system: str, measurement_noise: Level, episodes: int) -> np.ndarray:
 def kinds(
     levels: Mapping[str, Sequence[Key]], information: Sequence[Compared] = COMPARED, seeds: int = SEEDS
 ) -> Iterator[tuple[str, Key, Compared, int]]:
-    """Agents of a comparison, the first seed of each first.
-
-    Parameters
-    ----------
-    levels : mapping of str to sequence of levels
-        For each system those of measurement noise, or what stands for them; the task's own first.
-    information : sequence of str
-        What agents know.
-    seeds : int
-        Agents of each kind; of recurrent ones at most three, and one at the further noise levels.
-
-    Yields
-    ------
-    system, level, information, seed
-        Of one agent.
-    """
+    """Agents of a comparison, the first seed of each first."""
     for seed in range(seeds):
         for system, at in levels.items():
             for level in at:
@@ -214,25 +158,7 @@ def kinds(
 
 
 def noise_levels(systems: Sequence[str] = tuple(TASKS), more_noise: bool = True) -> dict[str, tuple[Level, ...]]:
-    """Levels of measurement noise at which agents are compared on each system.
-
-    Parameters
-    ----------
-    systems : sequence of str
-        Shipped ones, or classes of the user's.
-    more_noise : bool
-        Also the further level of those that have one.
-
-    Returns
-    -------
-    dict of str to tuple of levels
-        The task's own level first.
-
-    Raises
-    ------
-    ValueError
-        On an unknown name, or if a system has no inputs.
-    """
+    """Levels of measurement noise at which agents are compared on each system."""
     more = MORE_NOISE if more_noise else {}
     further = {system: (more[system],) if system in more else () for system in systems}
     return {system: (get_task(system).measurement_noise, *further[system]) for system in systems}
@@ -249,37 +175,7 @@ def planned(
     more_noise: bool = True,
     observers: Mapping[str, str] | None = None,
 ) -> list[Case]:
-    """All agents of a comparison; the defaults are the full set.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the comparison, under which each agent has one.
-    systems : sequence of str
-        Shipped ones, or classes of the user's.
-    information : sequence of str
-        What agents know.
-    seeds : int
-        Agents of each kind, as for :func:`kinds`.
-    episodes : int
-        Number of episodes that each is played on.
-    timesteps : int, optional
-        Actions to learn from; by default what the hyperparameters say.
-    more_noise : bool
-        Also at the further noise level of those systems that have one.
-    observers : mapping of str to str, optional
-        Shipped map or ``.safetensors`` file by the name of the system that it is for.
-
-    Returns
-    -------
-    list of Case
-        What is to be done.
-
-    Raises
-    ------
-    ValueError
-        On an unknown name, or if a system has no inputs.
-    """
+    """All agents of a comparison; the defaults are the full set."""
     names = {system: get_system(system).name for system in systems}
     return [
         Case(
@@ -304,31 +200,7 @@ def collect(
     own: Sequence[str] = (),
     observers: Mapping[str, str] | None = None,
 ) -> "pd.DataFrame":
-    """What there is in a comparison's folder of shipped systems and some others, whichever run it is from.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the comparison.
-    episodes : int
-        Number of episodes that each agent was played on.
-    timesteps : int or None
-        Actions that each learned from; None for what the hyperparameters say.
-    own : sequence of str
-        Classes of the user's.
-    observers : mapping of str to str, optional
-        As for :func:`planned`.
-
-    Returns
-    -------
-    DataFrame
-        One row for each agent.
-
-    Raises
-    ------
-    ValueError
-        If some agents are of another comparison.
-    """
+    """What there is in a comparison's folder of shipped systems and some others, whichever run it is from."""
     import pandas as pd
 
     systems = (*TASKS, *own)

@@ -13,21 +13,7 @@ WORST = 10.0  # of the cost, three scales off in every state; beyond it, network
 def paid(task: ControlTask, total: Any, age: Any, terminated: Any) -> Any:
     """Minus the cost c, at most ``WORST``, from the reward 1/(1 + 4c) averaged over an action's samples.
 
-    Parameters
-    ----------
-    task : ControlTask
-        What is to be done.
-    total : float or ndarray, shape (n,)
-        Sums of the environment's rewards over the samples of an action.
-    age : int or ndarray of int, shape (n,)
-        Samples since reset, where the episode has ended.
-    terminated : bool or ndarray of bool, shape (n,)
-        Whether a state has escaped; it is taken to stay where it left for the rest of the episode.
-
-    Returns
-    -------
-    ndarray, shape () or (n,)
-        What the agent is paid for the action.
+    Shapes: ``total`` (n,), ``age`` (n,), ``terminated`` (n,); returns () or (n,).
     """
     samples = np.where(terminated, (age - 1) % task.repeat + 1, task.repeat)
     remaining = np.where(terminated, task.steps - np.ceil(age / task.repeat), 0.0)
@@ -40,13 +26,6 @@ class Cost(VectorWrapper):
 
     The environment's reward is flat far from the target, where c still tells an agent which way to go. Escaping never
     pays.
-
-    Parameters
-    ----------
-    env : VectorEnv
-        Whose rewards are replaced; it resets in the same step.
-    task : ControlTask
-        What made it.
     """
 
     def __init__(self, env: VectorEnv, task: ControlTask) -> None:
@@ -56,15 +35,7 @@ class Cost(VectorWrapper):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Step, and replace the rewards.
 
-        Parameters
-        ----------
-        actions : ndarray, shape (n, nu)
-            As the environment takes them.
-
-        Returns
-        -------
-        obs, reward, terminated, truncated, info
-            What the environment returns, but for the rewards.
+        Shapes: ``actions`` (n, nu).
         """
         obs, total, terminated, truncated, info = self.env.step(actions)
         age = info["final_info"]["sample"] if terminated.any() else info["sample"]

@@ -33,28 +33,7 @@ Feature = Callable[[Mapping[str, np.ndarray]], np.ndarray]
 
 
 class Features(VectorWrapper):
-    """Shows features of what ``info`` holds, float32, optionally of several steps with the actions that led to them.
-
-    Parameters
-    ----------
-    env : VectorEnv
-        With ``autoreset_mode`` SAME_STEP or DISABLED, as :class:`kkl_gym.VectorActionRepeat` offers them.
-    keys : sequence of str
-        Of ``info``, what the feature is made of.
-    feature : callable
-        A mapping of the keys to arrays of shape (n, ...) in, an array of shape (n, width) out.
-    width : int
-        Of the feature.
-    stacked : int
-        Steps shown, the latest last; before an episode's first step, its first feature and action 0.
-    with_action : bool
-        Whether each feature has the action before it appended.
-
-    Raises
-    ------
-    ValueError
-        If the environment resets in the step after an episode's last.
-    """
+    """Shows features of what ``info`` holds, float32, optionally of several steps with the actions that led to them."""
 
     def __init__(
         self,
@@ -83,19 +62,7 @@ class Features(VectorWrapper):
     ) -> tuple[np.ndarray, Infos]:
         """Reset the environments and what is remembered of them.
 
-        Parameters
-        ----------
-        seed : int or sequence of int, optional
-            As for any vector environment.
-        options : mapping, optional
-            As for any vector environment; "reset_mask" says which rows are meant.
-
-        Returns
-        -------
-        obs : ndarray, shape (n, stacked * (width + actions))
-            The features.
-        info : dict
-            The environment's.
+        Shapes: returns ``obs`` (n, stacked * (width + actions)).
         """
         options, mask = with_mask(options, self.num_envs)
         _, info = self.env.reset(seed=seed, options=options)  # type: ignore[arg-type]
@@ -107,15 +74,7 @@ class Features(VectorWrapper):
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Step the environments.
 
-        Parameters
-        ----------
-        actions : ndarray, shape (n, nu)
-            As the environment takes them.
-
-        Returns
-        -------
-        obs, reward, terminated, truncated, info
-            The features, and what the environment returns beside its observation.
+        Shapes: ``actions`` (n, nu).
         """
         _, reward, terminated, truncated, info = self.env.step(actions)
         values = {key: info[key] for key in self._keys}
@@ -146,13 +105,7 @@ class Features(VectorWrapper):
 
 
 class KalmanFilters:
-    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them.
-
-    Parameters
-    ----------
-    env : VectorEnv
-        Whose rows they follow.
-    """
+    """Extended Kalman filters that know model, noise level and input, as VectorEstimate drives them."""
 
     def __init__(self, env: VectorEnv) -> None:
         plant = plant_of(env)
@@ -189,37 +142,7 @@ def make(
     observer: str | None = None,
     with_action: bool = False,
 ) -> Features:
-    """Make a task in which the agent knows what ``information`` says, in units of about one, taken from the target.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What the agent is to do.
-    information : {"state", "x_hat", "x_hat_std", "z", "ekf", "y", "stacked"}
-        "state": the true state. "x_hat": the learned observer's estimate. "x_hat_std": the same, with how sure the
-        observer is of each state. "z": its filter's state as its network sees it, with the time since reset. "ekf": the
-        estimate of an extended Kalman filter with the exact model. These observers see every sample. "y": the noisy
-        output when the agent acts. "stacked": the last ``STACKED`` of those, each with the action before it.
-    num_envs : int
-        Rows.
-    autoreset_mode : str or AutoresetMode
-        Same step or disabled.
-    observer : str, optional
-        A shipped map or a ``.safetensors`` file; by default :func:`observer_of` the system.
-    with_action : bool
-        Whether "state" and "y" come with the action before them.
-
-    Returns
-    -------
-    Features
-        The vector environment.
-
-    Raises
-    ------
-    ValueError
-        On an unknown name, if no observer is named and none ships for the system, or if "x_hat_std" is asked of one
-        without error bars.
-    """
+    """Make a task in which the agent knows what ``information`` says, in units of about one, taken from the target."""
     if information not in INFORMATION:
         raise ValueError(f"unknown information {information!r}; there are {', '.join(INFORMATION)}")
     system = get_system(task.system)
@@ -257,23 +180,7 @@ def make(
 
 
 def observer_of(system: System) -> str:
-    """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on.
-
-    Parameters
-    ----------
-    system : System
-        Where the agents act.
-
-    Returns
-    -------
-    str
-        A shipped map.
-
-    Raises
-    ------
-    ValueError
-        If none ships for the system.
-    """
+    """Name of the map that agents get for a system: for a shipped one the version that the agents' results rest on."""
     name = profile(system).agent_observer or system.name
     if name not in shipped():
         raise ValueError(f"no observer ships for {system.name!r}: name a .safetensors file (--observer FILE)")
@@ -284,16 +191,6 @@ def estimate_and_spread(system: System) -> Feature:
     """Make the feature of an estimate from the target, and of its standard deviations, both in units of the scale.
 
     Standard deviations differ by orders of magnitude in the course of an episode, so that their logarithms are shown.
-
-    Parameters
-    ----------
-    system : System
-        Whose target and scale are meant.
-
-    Returns
-    -------
-    callable
-        A mapping with "x_hat" of shape (n, nx) and "x_cov" of shape (n, nx, nx) in, an array of shape (n, 2 nx) out.
     """
     scale = np.array(system.scale)
 
@@ -305,18 +202,7 @@ def estimate_and_spread(system: System) -> Feature:
 
 
 def output_deviation(system: System) -> Feature:
-    """Make the feature (y - h(target)) over the size that the states' scales give to y, to first order.
-
-    Parameters
-    ----------
-    system : System
-        Whose output it is.
-
-    Returns
-    -------
-    callable
-        A mapping with "y" of shape (n, ny) in, an array of the same shape out.
-    """
+    """Make the feature (y - h(target)) over the size that the states' scales give to y, to first order."""
     _, _, C = linearised(system, system.target)
     y, size = np.array(system.h(system.target)), np.abs(C) @ np.array(system.scale)
     size = np.where(size > 0, size, 1.0)  # an output that is flat at the target
@@ -324,22 +210,7 @@ def output_deviation(system: System) -> Feature:
 
 
 def modes(observer: KKLObserver, system: System) -> tuple[Feature, int]:
-    """Make the feature of z as the observer's network sees it, but from its value at the target, and of the age.
-
-    Parameters
-    ----------
-    observer : KKLObserver
-        Whose z it is.
-    system : System
-        Whose target is meant.
-
-    Returns
-    -------
-    feature : callable
-        A mapping with "z" of shape (n, nz) and "sample" of shape (n,) in, an array of shape (n, width) out.
-    width : int
-        Number of modes, and one for the age if the network is told it.
-    """
+    """Make the feature of z as the observer's network sees it, but from its value at the target, and of the age."""
     inverse, linear = observer.artifact.inverse, observer.artifact.filter
     matrix = (inverse.gain(observer.measurement_noise)[:, None] * inverse.whiten).T
     rest = linear.start(np.array(system.h(system.target), dtype=float))

@@ -54,39 +54,6 @@ def learn(
 
     A training that goes on from a checkpoint begins new episodes, so that it makes another agent than one that never
     stopped; ``Agent.training`` then says how many times it was resumed.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What it is to do.
-    information : {"state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf"}
-        What it knows, as for :func:`training.agents.information.make`.
-    folder : Path
-        Receives agent.safetensors, the learning curve, progress.csv, and agent.checkpoint.pt.
-    seed : int
-        Seed of networks, exploration and episodes.
-    timesteps : int, optional
-        Actions in all rows together; by default what hyperparameters/ALGORITHM.yml says.
-    observer : str, optional
-        A shipped map or a ``.safetensors`` file, for an agent that knows "x_hat", "x_hat_std" or "z"; by default
-        :func:`training.agents.information.observer_of` the system.
-    algorithm : {"ppo", "sac"}, optional
-        By default that of the system's profile.
-    resume : bool
-        Whether to go on from the checkpoint in ``folder``, if there is one. Without it, that checkpoint is removed.
-    progress : rich.progress.Progress, optional
-        Where a bar is shown.
-
-    Returns
-    -------
-    Agent
-        As saved.
-
-    Raises
-    ------
-    ValueError
-        On an unknown algorithm or a number of timesteps that makes no sense, if no observer ships for the system, or if
-        the checkpoint to go on from is damaged or of another training.
     """
     if algorithm is not None and algorithm not in FEEDFORWARD:
         raise ValueError(f"algorithm must be one of {', '.join(FEEDFORWARD)}, got {algorithm!r}")
@@ -139,31 +106,7 @@ def learn_recurrent(
     seed: int = 0,
     timesteps: int | None = None,
 ) -> Callable[[], Policy]:
-    """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What the agent is to do.
-    of : {"y", "state"}
-        What it sees.
-    folder : Path
-        Receives the learning curve, progress.csv.
-    seed : int
-        Seed of networks, exploration and episodes.
-    timesteps : int, optional
-        Actions in all rows together; by default what hyperparameters/ppo_lstm.yml says.
-
-    Returns
-    -------
-    callable
-        Makes a policy, with a memory of its own, for one play.
-
-    Raises
-    ------
-    ValueError
-        If the number of timesteps makes no sense.
-    """
+    """Train RecurrentPPO on the noisy output, or on the full state as a control, each with the action before."""
     name, settings = hyperparameters(task, "ppo_lstm")
     env = make(task, of, settings["n_envs"], with_action=True)
     timesteps = _positive(settings["n_timesteps"] if timesteps is None else timesteps)
@@ -244,27 +187,7 @@ def _fit(
 
 
 def hyperparameters(task: ControlTask, algorithm: str | None = None) -> tuple[str, dict[str, Any]]:
-    """Find the algorithm and its settings for a task.
-
-    Parameters
-    ----------
-    task : ControlTask
-        Of a shipped system, which has settings of its own, or of one of the user's, which gets the defaults.
-    algorithm : {"ppo", "sac", "ppo_lstm"}, optional
-        By default that of the system's profile.
-
-    Returns
-    -------
-    algorithm : str
-        Its name.
-    settings : dict
-        What hyperparameters/ALGORITHM.yml says of it.
-
-    Raises
-    ------
-    ValueError
-        If the algorithm is unknown.
-    """
+    """Find the algorithm and its settings for a task."""
     system = get_system(task.system)
     name = algorithm or profile(system).algorithm
     if name not in ALGORITHMS:

@@ -22,30 +22,6 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     Noise, starts and length of the episodes are the environment's: make it with
     ``gym.make(ID, **training.agents.tasks.get_task(SYSTEM).options)``. The files in training/agents/hyperparameters do
     so for rl-zoo3.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        A :class:`kkl_gym.KKLEnv` with inputs, bare or under wrappers that leave ``info`` alone.
-    observer : str or path, optional
-        As for :class:`kkl_gym.KKLObservation`; by default the map that the system's agents act on.
-
-    Raises
-    ------
-    ValueError
-        As :class:`kkl_gym.KKLObservation`, and if the environment is another, its dt is not the task's, or its system
-        has no inputs.
-
-    Examples
-    --------
-    >>> import gymnasium as gym
-    >>> from training.agents import OnTask
-    >>> from training.agents.tasks import get_task
-    >>> env = OnTask(gym.make("KKLLorenz-v0", **get_task("lorenz").options))
-    >>> obs, info = env.reset(seed=0)
-    >>> obs, reward, terminated, truncated, info = env.step([0.0])
-    >>> obs.shape, reward < 0, info["sample"]
-    ((3,), True, array(5))
     """
 
     def __init__(self, env: gym.Env[np.ndarray, np.ndarray], observer: str | None = None) -> None:
@@ -65,19 +41,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode.
 
-        Parameters
-        ----------
-        seed : int, optional
-            As for the environment.
-        options : dict, optional
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32, shape (nx,)
-            The first estimate, from the target and in scales.
-        info : dict
-            The environment's.
+        Shapes: returns ``observation`` (nx,).
         """
         _, info = self.env.reset(seed=seed, options=options)
         return self._seen(info), info
@@ -85,21 +49,7 @@ class OnTask(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Record
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Act for a period.
 
-        Parameters
-        ----------
-        action : array_like, shape (nu,)
-            As for the environment.
-
-        Returns
-        -------
-        observation : ndarray of float32, shape (nx,)
-            The estimate after the last sample, from the target and in scales.
-        reward : float
-            Minus the cost.
-        terminated, truncated : bool
-            The environment's.
-        info : dict
-            The environment's, of the last sample.
+        Shapes: ``action`` (nu,); returns ``observation`` (nx,).
         """
         _, total, terminated, truncated, info = self.env.step(action)
         reward = float(paid(self._task, total, info["sample"], terminated))

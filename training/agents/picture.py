@@ -19,33 +19,13 @@ SECONDS = 10.0  # that it lasts
 
 
 def draw(task: ControlTask, episodes: Episodes, path: Path) -> None:
-    """Draw states, estimates, target, outputs and inputs over time.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What was played.
-    episodes : Episodes
-        The first few are shown, a column for each.
-    path : Path
-        Of the figure.
-    """
+    """Draw states, estimates, target, outputs and inputs over time."""
     shown = [("", episodes.row(i)) for i in range(min(SHOWN, episodes.x.shape[1]))]
     _draw(path, task, shown, width=2.6)
 
 
 def draw_agents(task: ControlTask, played: Mapping[str, Episodes], path: Path) -> None:
-    """Draw the first episode of several agents side by side, as :func:`draw` draws several of one.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What all of them played.
-    played : mapping of str to Episodes
-        What each agent is called, and its episodes from the same seed.
-    path : Path
-        Of the figure.
-    """
+    """Draw the first episode of several agents side by side, as :func:`draw` draws several of one."""
     _draw(path, task, [(name, episodes.row(0)) for name, episodes in played.items()], width=4.6)
 
 
@@ -84,17 +64,7 @@ def _numbered(symbol: str, number: int) -> list[str]:
 
 
 def animate(task: ControlTask, played: Mapping[str, Episodes], path: Path) -> None:
-    """Draw the phase portrait of an agent's first episode, moving, and those of several side by side.
-
-    Parameters
-    ----------
-    task : ControlTask
-        What was played.
-    played : mapping of str to Episodes
-        The title of each portrait, and the episodes whose first it shows.
-    path : Path
-        Of the GIF.
-    """
+    """Draw the phase portrait of an agent's first episode, moving, and those of several side by side."""
     system = get_system(task.system)
     shown = {title: episodes.row(0) for title, episodes in played.items()}
     points = [found[:, 0] for one in shown.values() for found in (one.x, one.x_hat) if found is not None]

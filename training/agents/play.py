@@ -15,18 +15,8 @@ Policy = Callable[[np.ndarray], np.ndarray]
 class Episodes:
     """Episodes side by side, at the instants at which the agent acts.
 
-    Parameters
-    ----------
-    x : ndarray, shape (steps + 1, n, nx)
-        True states; after an escape the last one inside.
-    x_hat : ndarray, shape (steps + 1, n, nx), or None
-        Estimates, where an observer makes them.
-    y : ndarray, shape (steps + 1, n, ny)
-        Measured outputs.
-    u : ndarray, shape (steps, n, nu)
-        Inputs.
-    escaped : ndarray of bool, shape (n,)
-        Whether the state left the system's bounds.
+    Shapes: ``x`` (steps + 1, n, nx), ``x_hat`` (steps + 1, n, nx), or None, ``y`` (steps + 1, n, ny), ``u`` (steps, n,
+    nu), ``escaped`` (n,).
     """
 
     x: np.ndarray
@@ -44,31 +34,7 @@ class Episodes:
 def play(
     env: VectorEnv, policy: Policy, *, steps: int, seed: int, report: Callable[[int], object] = lambda done: None
 ) -> Episodes:
-    """Play one episode in each row of an environment that does not reset by itself.
-
-    Parameters
-    ----------
-    env : VectorEnv
-        Made with ``autoreset_mode="Disabled"``.
-    policy : callable
-        Observations (n, ...) in, actions (n, nu) out; rows that have ended are played on in place.
-    steps : int
-        Actions in an episode.
-    seed : int
-        Row i starts from seed + i.
-    report : callable, optional
-        Told the number of actions that are done.
-
-    Returns
-    -------
-    Episodes
-        One for each row.
-
-    Raises
-    ------
-    ValueError
-        If the environment resets by itself.
-    """
+    """Play one episode in each row of an environment that does not reset by itself."""
     if env.metadata["autoreset_mode"] is not AutoresetMode.DISABLED:
         raise ValueError(
             'play needs an environment made with autoreset_mode="Disabled", or episodes would run together'

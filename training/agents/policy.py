@@ -16,18 +16,7 @@ ACTIVATIONS: dict[type[nn.Module], str] = {nn.Tanh: "tanh", nn.ReLU: "relu", nn.
 
 
 def perceptron(model: BaseAlgorithm) -> MLP:
-    """Take the layers of the deterministic policy out of a trained agent.
-
-    Parameters
-    ----------
-    model : stable_baselines3 algorithm
-        SAC, TQC, TD3, DQN, PPO or A2C.
-
-    Returns
-    -------
-    MLP
-        Observations in; actions before they are bounded, or values of discrete ones, out.
-    """
+    """Take the layers of the deterministic policy out of a trained agent."""
     body = actor(model)
     layers = [layer for layer in body if isinstance(layer, nn.Linear)]
     activation = next((ACTIVATIONS[type(layer)] for layer in body if type(layer) in ACTIVATIONS), "tanh")
@@ -35,18 +24,7 @@ def perceptron(model: BaseAlgorithm) -> MLP:
 
 
 def actor(model: BaseAlgorithm) -> list[nn.Module]:
-    """The modules of an agent's deterministic policy, linear ones and activations, in their order.
-
-    Parameters
-    ----------
-    model : stable_baselines3 algorithm
-        As for :func:`perceptron`.
-
-    Returns
-    -------
-    list of torch.nn.Module
-        From observations to actions before they are bounded, or to values of discrete ones.
-    """
+    """The modules of an agent's deterministic policy, linear ones and activations, in their order."""
     policy: Any = model.policy
     if isinstance(model, SAC | TQC):
         return [*model.actor.latent_pi, model.actor.mu]
@@ -58,18 +36,7 @@ def actor(model: BaseAlgorithm) -> list[nn.Module]:
 
 
 def linear(start: float) -> Callable[[float], float]:
-    """Make a schedule that ends at zero.
-
-    Parameters
-    ----------
-    start : float
-        Its first value.
-
-    Returns
-    -------
-    callable
-        Of the share of the training that is left.
-    """
+    """Make a schedule that ends at zero."""
     return lambda remaining: start * max(remaining, 0.0)  # the last rollout ends past the last step
 
 

@@ -34,23 +34,6 @@ def to_sb3(agent: Agent, *, system: str | System | None = None) -> BaseAlgorithm
     """Make an agent of stable-baselines3 that acts as this one; its ``save`` writes the zip.
 
     Its value functions are not trained, since agents are kept without: it is for playing, not for training on.
-
-    Parameters
-    ----------
-    agent : Agent
-        The agent.
-    system : str or System, optional
-        As for :meth:`training.agents.agent.Agent.make`.
-
-    Returns
-    -------
-    stable_baselines3.PPO or stable_baselines3.SAC
-        SAC where tanh bounds the actions.
-
-    Raises
-    ------
-    AgentError
-        As :meth:`training.agents.agent.Agent.make`.
     """
     network = agent.network
     activation = {name: module for module, name in ACTIVATIONS.items()}[network.activation]
@@ -72,26 +55,6 @@ def from_sb3(path: str | os.PathLike[str], system: str | System, observer: str |
     """Read an agent that stable-baselines3 or rl-zoo3 has trained on :class:`training.agents.OnTask`.
 
     Of the file, its tensors and its text are read; what is pickled in it stays so.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The zip of a PPO or SAC agent with ``MlpPolicy``.
-    system : str or System
-        Whose task it was trained on.
-    observer : str, optional
-        The shipped map or ``.safetensors`` file that it was trained on; by default
-        :func:`training.agents.information.observer_of` the system.
-
-    Returns
-    -------
-    Agent
-        One that knows x_hat.
-
-    Raises
-    ------
-    AgentError
-        If the file is missing, damaged or of another kind of agent, or the policy does not fit the task.
     """
     with explained(path, AgentError):
         try:

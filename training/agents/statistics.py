@@ -18,22 +18,7 @@ COLUMNS = 3  # of panels in a figure
 
 
 def normalised(scores: Any, top: Any, idle: float) -> np.ndarray:
-    """Scores on a scale on which doing nothing of use has 0.
-
-    Parameters
-    ----------
-    scores : array_like
-        To be put on the scale.
-    top : array_like
-        What has 1, of a shape that goes with that of ``scores``.
-    idle : float
-        Score of zero input, or of random actions.
-
-    Returns
-    -------
-    ndarray
-        NaN where ``top`` is no better than that.
-    """
+    """Scores on a scale on which doing nothing of use has 0."""
     span = np.where(np.asarray(top) > idle, np.asarray(top) - idle, np.nan)
     return np.asarray((scores - idle) / span)
 
@@ -48,19 +33,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
 
     With five agents the interval covers about nine times in ten, for which bootstrap intervals of so few are known.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Scores of these agents, one for each.
-    best : ndarray, shape (m,)
-        Scores of those that know the full state. They are resampled as well, unless they are ``values`` itself.
-    idle : float
-        Score of zero input, or of random actions.
-
-    Returns
-    -------
-    found, low, high : float
-        The mean and the ends of the interval, which are NaN for fewer than three agents.
+    Shapes: ``values`` (n,), ``best`` (m,).
     """
 
     def statistic(mine: np.ndarray, tops: np.ndarray = best, axis: int = -1) -> np.ndarray:
@@ -78,19 +51,7 @@ def interval(values: np.ndarray, best: np.ndarray, idle: float) -> tuple[float, 
 
 
 def draw_scores(path: Path, panels: Mapping[str, Sequence[Cell | None]], labels: Sequence[str], title: str) -> None:
-    """Draw the normalised scores of several tasks.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    panels : mapping of str to sequence of mapping or None
-        For each task what :func:`draw_panel` takes.
-    labels : sequence of str
-        What is told apart, in the same order.
-    title : str
-        Of the figure.
-    """
+    """Draw the normalised scores of several tasks."""
     columns = min(COLUMNS, max(1, len(panels)))
     rows = -(-len(panels) // columns)
     with drawing(path, 2.6 * columns + 1.5, 2.6 * rows + 0.6) as figure:
@@ -103,20 +64,7 @@ def draw_scores(path: Path, panels: Mapping[str, Sequence[Cell | None]], labels:
 
 
 def draw_panel(ax: "Axes", cells: Sequence[Cell | None], labels: Sequence[str], title: str) -> None:
-    """Draw the normalised scores of one task: agents as dots, their means with intervals.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        Where.
-    cells : sequence of mapping or None
-        From bottom to top: ``interval``, as :func:`interval` gives it, and ``agents``, each one's normalised score;
-        None where there are none.
-    labels : sequence of str
-        What is told apart, in the same order.
-    title : str
-        Of the task.
-    """
+    """Draw the normalised scores of one task: agents as dots, their means with intervals."""
     for place, cell in enumerate(cells):
         if cell is not None:
             found, low, high = cell["interval"]

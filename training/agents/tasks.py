@@ -15,22 +15,7 @@ TASKS: dict[str, ControlTask] = {name: found.task for name, found in PROFILES.it
 def get_task(name: str | System, measurement_noise: Level | None = None) -> ControlTask:
     """The task of a system, with another noise level if one is given.
 
-    Parameters
-    ----------
-    name : str or System
-        A shipped system, ``"script.py:Class"``, or the system itself.
-    measurement_noise : float or tuple of float, length ny, optional
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-
-    Returns
-    -------
-    ControlTask
-        That of the system's profile, or one with the defaults.
-
-    Raises
-    ------
-    ValueError
-        On an unknown name, or if the system has no inputs.
+    Shapes: ``measurement_noise`` of length ny.
     """
     system = get_system(name)
     if not system.nu:
@@ -44,17 +29,7 @@ def get_task(name: str | System, measurement_noise: Level | None = None) -> Cont
 def deviation(system: System, x: np.ndarray) -> np.ndarray:
     """(x - target) / scale.
 
-    Parameters
-    ----------
-    system : System
-        Whose target and scale are meant.
-    x : ndarray, shape (..., nx)
-        States.
-
-    Returns
-    -------
-    ndarray, shape (..., nx)
-        Zero at the target.
+    Shapes: ``x`` (..., nx); returns (..., nx).
     """
     out: np.ndarray = (x - np.array(system.target)) / np.array(system.scale)
     return out
@@ -63,17 +38,7 @@ def deviation(system: System, x: np.ndarray) -> np.ndarray:
 def scores(system: System, x: np.ndarray) -> np.ndarray:
     """Scores of episodes: mean over time of exp(-4 c) - 1, where c = mean(((x - target) / scale)^2).
 
-    Parameters
-    ----------
-    system : System
-        Whose target and scale are meant.
-    x : ndarray, shape (steps, n, nx)
-        States.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In [-1, 0]; 0 is best.
+    Shapes: ``x`` (steps, n, nx); returns (n,).
     """
     c = np.square(deviation(system, x)).mean(-1)
     return np.asarray(np.expm1(-4.0 * c).mean(0))
@@ -82,17 +47,7 @@ def scores(system: System, x: np.ndarray) -> np.ndarray:
 def successes(task: ControlTask, x: np.ndarray) -> np.ndarray:
     """Whether episodes stay within the task's tolerance of the target for their last fifth.
 
-    Parameters
-    ----------
-    task : ControlTask
-        What was to be done.
-    x : ndarray, shape (steps, n, nx)
-        States.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        One for each episode.
+    Shapes: ``x`` (steps, n, nx); returns (n,).
     """
     late = x[-max(1, round(0.2 * len(x))) :]
     distance = np.linalg.norm(deviation(get_system(task.system), late), axis=-1)

@@ -28,29 +28,7 @@ REVISION = 7  # rises with every change of the shipped methods: results from bef
 
 @dataclass(frozen=True)
 class Job:
-    """One method on one system.
-
-    Parameters
-    ----------
-    system : str
-        A shipped system, or a class as for :func:`kkl_gym.systems.get_system`.
-    method : str
-        As for :func:`training.methods.get_method`.
-    folder : Path
-        Receives trained.safetensors, errors.csv, info.json, and what the search tried.
-    budget : Budget
-        Of the training.
-    protocol : Protocol
-        What the trained observer is measured on.
-    search : float or None
-        Seconds of CPU time for each configuration; None takes the first as it is.
-    validation : Protocol
-        Trajectories on which configurations are compared, from the stream of validation.
-    seed : int
-        Of the training.
-    device : str
-        Where networks are trained.
-    """
+    """One method on one system."""
 
     system: str
     method: str
@@ -93,20 +71,7 @@ class Job:
 
 
 def run_job(job: Job) -> None:
-    """Choose, train, measure; steps that were done before are not done again.
-
-    Parameters
-    ----------
-    job : Job
-        If the method fails, its folder receives the traceback in failure.txt.
-
-    Raises
-    ------
-    ValueError
-        If the folder is another benchmark's, or another process is at work there.
-    Exception
-        Whatever the method raises.
-    """
+    """Choose, train, measure; steps that were done before are not done again."""
     torch.set_num_threads(1)
     with claimed_job(job.folder, job.identity, OTHER):
         if not job.done:
@@ -118,18 +83,7 @@ def run_job(job: Job) -> None:
 
 
 def time_steps(job: Job) -> None:
-    """Time the steps of a job's observer, unless that is done; to be called while no training runs.
-
-    Parameters
-    ----------
-    job : Job
-        One that is done; its folder receives speed.json.
-
-    Raises
-    ------
-    Exception
-        Whatever the method raises.
-    """
+    """Time the steps of a job's observer, unless that is done; to be called while no training runs."""
     path = job.folder / "speed.json"
     if path.exists():
         return

@@ -21,21 +21,7 @@ LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts a
 
 @dataclass(frozen=True)
 class Protocol:
-    """Trajectories to test on.
-
-    Parameters
-    ----------
-    domains : tuple of {"X", "1.5X", "2X"}
-        Where they start: in X, or in a multiple of X without X.
-    measurement_noise : tuple of float or of tuple of float
-        Standard deviations of the noise on each sample of y, of all outputs or each.
-    trajectories : int
-        Number for each domain; each is taken at every noise level.
-    duration : float
-        Their length in seconds.
-    seed : int
-        Of starts and noise.
-    """
+    """Trajectories to test on."""
 
     domains: tuple[Domain, ...] = ("X", "1.5X", "2X")
     measurement_noise: tuple[Level, ...] = (0.0, 0.5)
@@ -47,17 +33,7 @@ class Protocol:
 def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
     """Give an observer one sample of y after the other.
 
-    Parameters
-    ----------
-    observer : CausalObserver
-        It is reset.
-    y : ndarray, shape (steps + 1, n, ny)
-        Outputs.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, n, nx)
-        Estimates.
+    Shapes: ``y`` (steps + 1, n, ny); returns (steps + 1, n, nx).
     """
     first = observer.reset(y[0])
     out = np.empty((len(y), *first.shape))
@@ -72,23 +48,7 @@ def with_shared_noise(
 ) -> np.ndarray:
     """Outputs with noise on every sample, the same for every method.
 
-    Parameters
-    ----------
-    system : System
-        Of the trajectories.
-    runs : UnseenTrajectories
-        All ``n``, or the first few.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation, of all outputs or each.
-    n : int
-        Trajectories for which noise is drawn.
-    seed : tuple
-        As for :func:`training.seeds.generator`.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, trajectories inside bounds, ny)
-        y = h(x) + v.
+    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, trajectories inside bounds, ny).
     """
     unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
     v = np.asarray(measurement_noise) * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
@@ -97,29 +57,7 @@ def with_shared_noise(
 
 
 def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
-    """Measure an observer on test trajectories.
-
-    Parameters
-    ----------
-    method : Method
-        Makes the observer.
-    trained : object
-        What the method's ``train`` returned.
-    system : System
-        To be observed.
-    dt : float
-        Sampling interval in seconds.
-    protocol : Protocol
-        The trajectories; a slow method is given the first few of each domain.
-
-    Returns
-    -------
-    DataFrame
-        A row for each trajectory, noise level and domain. Columns: starts, noise, trajectory, escaped, smape (all
-        steps), smape_late, component_late, rmse_late (after the first fifth), rmse, settling (seconds), lost, and for
-        each state nrmse1, nrmse2, ... (after the first fifth). A trajectory that leaves the system's declared bounds
-        is marked as escaped and has no errors.
-    """
+    """Measure an observer on test trajectories."""
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     frames = []
     for i, domain in enumerate(protocol.domains):
@@ -157,26 +95,7 @@ def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
 
 
 def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
-    """Score a configuration on validation trajectories from X: smaller is better.
-
-    Parameters
-    ----------
-    method, trained, system, dt
-        As for :func:`measure`.
-    protocol : Protocol
-        The trajectories, apart from where they start.
-
-    Returns
-    -------
-    float
-        Geometric mean, over the noise levels that the method is tuned for, of the median SMAPE over all steps, in
-        percent.
-
-    Raises
-    ------
-    ValueError
-        If no trajectory stays within the system's bounds.
-    """
+    """Score a configuration on validation trajectories from X: smaller is better."""
     n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
     everyone = unseen_trajectories(
         system,
@@ -202,22 +121,7 @@ def validate(method: Method[Any], trained: Any, system: System, *, dt: float, pr
 def step_time(
     method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
 ) -> float:
-    """Time one step of a whole batch along motions from X, once an observer has followed them for a while.
-
-    Parameters
-    ----------
-    method, trained, system, dt
-        As for :func:`measure`.
-    batch : int
-        Number of rows.
-    seconds : float
-        CPU time to spend on it.
-
-    Returns
-    -------
-    float
-        Microseconds of CPU time, the least of five rounds.
-    """
+    """Time one step of a whole batch along motions from X, once an observer has followed them for a while."""
     observer = method.observer(trained, system, dt, system.measurement_noise)
     x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
     y = np.nan_to_num(system.output(x))

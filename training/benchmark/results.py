@@ -30,20 +30,7 @@ def _full_set(found: Iterable[str]) -> list[str]:
 
 
 def collect(out: Path, beside: Path | None = None) -> None:
-    """Write one CSV file of all errors and one of all costs, from every job found in the folder.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the benchmark.
-    beside : Path, optional
-        Folder with the two CSV files of an earlier run, whose rows of other observers are taken over as they are.
-
-    Raises
-    ------
-    ValueError
-        If they are not all of one benchmark, or a file is damaged or missing.
-    """
+    """Write one CSV file of all errors and one of all costs, from every job found in the folder."""
     errors, costs = [], []
     rules: dict[str, Any] = {}
 
@@ -139,23 +126,7 @@ def check_results(folder: Path) -> None:
 
 
 def report(out: Path) -> str:
-    """Write table.md and heatmap.png from the CSV files.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the benchmark.
-
-    Returns
-    -------
-    str
-        What was compared, and what is missing.
-
-    Raises
-    ------
-    ValueError
-        If there are no CSV files.
-    """
+    """Write table.md and heatmap.png from the CSV files."""
     results, methods, note, missing = _read(out)
     write_table(out / "table.md", results, methods, note=note + missing)
     draw(out / "heatmap.png", results, methods, note=note)
@@ -163,20 +134,7 @@ def report(out: Path) -> str:
 
 
 def draw_results(out: Path, path: Path) -> None:
-    """Draw the heatmap alone from the CSV files.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the benchmark.
-    path : Path
-        Of the picture.
-
-    Raises
-    ------
-    ValueError
-        If there are no CSV files.
-    """
+    """Draw the heatmap alone from the CSV files."""
     results, methods, note, _ = _read(out)
     draw(path, results, methods, note=note)
 

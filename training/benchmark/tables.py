@@ -53,21 +53,7 @@ DOMAINS = {"X": "starts in X", "1.5X": "starts in 1.5X \\ X", "2X": "starts in 2
 
 
 def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
-    """Median, half the interquartile range and a bootstrap 95 % interval of the median, for each cell.
-
-    Parameters
-    ----------
-    results : DataFrame
-        A row for each trajectory. Those that escaped are not among the values.
-    column : str
-        Of the values, infinite ones included.
-
-    Returns
-    -------
-    DataFrame
-        A row for each cell, which is a system, method, starts and noise, in the order of the results. Columns: these
-        four, n (number of values), median, half_iqr, low and high (of the interval).
-    """
+    """Median, half the interquartile range and a bootstrap 95 % interval of the median, for each cell."""
     from scipy.stats import bootstrap  # here, because it takes half a second that other commands need not wait for
 
     rows = []
@@ -85,19 +71,7 @@ def summarise(results: pd.DataFrame, column: str) -> pd.DataFrame:
 
 
 def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
-    """Write all measures as Markdown, a table for each measure and case with a row for each method.
-
-    Parameters
-    ----------
-    path : Path
-        File to write, whole or not at all.
-    results : DataFrame
-        A row for each trajectory: results.csv.
-    methods : DataFrame
-        A row for each method on each system: methods.csv.
-    note : str
-        What the page begins with.
-    """
+    """Write all measures as Markdown, a table for each measure and case with a row for each method."""
     results = _by_text_of_noise(results)
     cases = sorted(
         results[["starts", "noise"]].drop_duplicates().itertuples(index=False, name=None),
@@ -224,35 +198,12 @@ def _escaped(results: pd.DataFrame) -> list[str]:
 
 
 def draw(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> None:
-    """Write :func:`heatmap` as a picture.
-
-    Parameters
-    ----------
-    path : Path
-        File to write, whole or not at all; its ending says the format.
-    results, methods : DataFrame
-        As for :func:`write_table`.
-    note : str
-        The figure's title.
-    """
+    """Write :func:`heatmap` as a picture."""
     save(path, heatmap(results, methods, note=note))
 
 
 def heatmap(results: pd.DataFrame, methods: pd.DataFrame, *, note: str) -> "Figure":
-    """Draw the paper's heatmap: median ± half the interquartile range of the SMAPE over all steps.
-
-    Parameters
-    ----------
-    results, methods : DataFrame
-        As for :func:`write_table`.
-    note : str
-        Title.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Rows are where trajectories start, columns the levels of measurement noise.
-    """
+    """Draw the paper's heatmap: median ± half the interquartile range of the SMAPE over all steps."""
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
 

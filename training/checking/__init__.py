@@ -44,31 +44,7 @@ def check(
     policy: Controller | None = None,
     spinn: bool = False,
 ) -> Iterator[Finding]:
-    """Look for what would go wrong with a system in environments, training and evaluation.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float, optional
-        Sampling interval in seconds; the system's own if it is left out.
-    duration : float, optional
-        Length of motions in seconds; the system's own if it is left out, but no more than what is followed in seconds.
-    policy : callable, optional
-        States (n, nx) to actions (n, nu) in [-1, 1]. It acts on the system in place of random inputs.
-    spinn : bool, default False
-        Whether to look for a spectrum that makes T smooth, too.
-
-    Yields
-    ------
-    Finding
-        One after the other, as they come. Where starts or equations do not work, the rest is left out.
-
-    Raises
-    ------
-    ValueError
-        If ``dt`` or ``duration`` make no sense.
-    """
+    """Look for what would go wrong with a system in environments, training and evaluation."""
     for name, look in FIRST.items():
         findings = list(_guarded(name, look, system))
         yield from findings

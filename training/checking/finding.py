@@ -8,19 +8,7 @@ Verdict = Literal["ok", "note", "problem"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a check's table.
-
-    Parameters
-    ----------
-    check : str
-        What was looked at.
-    verdict : {"ok", "note", "problem"}
-        A problem spoils what is trained or measured. A note is worth knowing.
-    found : str
-        What there is, with units.
-    advice : str
-        What to change; empty where nothing need be.
-    """
+    """One line of a check's table."""
 
     check: str
     verdict: Verdict

@@ -37,14 +37,7 @@ def of_bounds(system: System, n: int) -> np.ndarray:
 class Motions:
     """Motions of several kinds.
 
-    Parameters
-    ----------
-    kinds : tuple of str
-        What acts on them, for people.
-    x : ndarray, shape (steps + 1, n, nx)
-        States; NaN from where the bounds are left. The first half of each kind starts in X, the other in 2X.
-    u : ndarray, shape (steps, n, nu)
-        Inputs.
+    Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
 
     kinds: tuple[str, ...]
@@ -65,19 +58,7 @@ class Motions:
 
 @dataclass(frozen=True)
 class Subject:
-    """A system and how it is sampled. What is random is the same each time.
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length of motions in seconds.
-    policy : callable, optional
-        States (n, nx) to actions (n, nu) in [-1, 1]: what acts on the system in place of random inputs.
-    """
+    """A system and how it is sampled. What is random is the same each time."""
 
     system: System
     dt: float
@@ -121,17 +102,7 @@ class Subject:
     def derivative(self, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """The drift under inputs: its mean over a sampling interval in discrete time.
 
-        Parameters
-        ----------
-        x : ndarray, shape (n, nx)
-            States.
-        u : ndarray, shape (n, nu)
-            Inputs.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            Derivatives in units of the states per second.
+        Shapes: ``x`` (n, nx), ``u`` (n, nu); returns (n, nx).
         """
         system = self.system
         with np.errstate(all="ignore"):
@@ -147,15 +118,7 @@ class Subject:
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """df/dx by central differences, with states in half-widths of X.
 
-        Parameters
-        ----------
-        x : ndarray, shape (n, nx)
-            States.
-
-        Returns
-        -------
-        ndarray, shape (m, nx, nx)
-            In 1/s; those of them that are finite.
+        Shapes: ``x`` (n, nx); returns (m, nx, nx).
         """
         columns = []
         with np.errstate(all="ignore"):
@@ -195,15 +158,7 @@ class Subject:
     def substeps(self, x: np.ndarray) -> np.ndarray:
         """The substeps that sampling intervals ask for under the largest input, not rounded, and one at least.
 
-        Parameters
-        ----------
-        x : ndarray, shape (steps, n, nx)
-            States at the start of the intervals; NaN where there is none.
-
-        Returns
-        -------
-        ndarray, shape (steps,)
-            Mean over states, so that what ignites now and then hardly counts.
+        Shapes: ``x`` (steps, n, nx); returns (steps,).
         """
         with np.errstate(all="ignore"):
             rate = self.system.rate_under(np.moveaxis(x, -1, 0), self.system.u_max)

@@ -84,20 +84,7 @@ class Train:
     """Of an agent in an environment."""
 
     def run(self, console: Console) -> None:
-        """Train, and play a hundred episodes.
-
-        Parameters
-        ----------
-        console : Console
-            Where progress and the scores are shown.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, or the observer cannot be had.
-        FileExistsError
-            If the folder holds an agent or a checkpoint already, and nothing is to be resumed.
-        """
+        """Train, and play a hundred episodes."""
         import torch  # which takes seconds to import, as stable-baselines3 does
 
         from training.agents.learn import learn
@@ -185,18 +172,7 @@ class Evaluate:
     """Folder for NAME.png and NAME.gif."""
 
     def run(self, console: Console) -> None:
-        """Evaluate.
-
-        Parameters
-        ----------
-        console : Console
-            Where the scores are printed.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, or the agent cannot be played.
-        """
+        """Evaluate."""
         from training.agents.picture import animate, draw
 
         path = find(self.agent)
@@ -241,31 +217,7 @@ class AgentCommand:
 def show(
     progress: ProgressBars, agent: Agent, n: int, seed: int = 0, *, trusted: str | System | None = None
 ) -> Episodes:
-    """Play episodes; print score and success.
-
-    Parameters
-    ----------
-    progress : ProgressBars
-        Where they are printed.
-    agent : Agent
-        Who plays.
-    n : int
-        Number of episodes.
-    seed : int
-        Seed of the episodes.
-    trusted : str or System, optional
-        The agent's system, if it may be imported.
-
-    Returns
-    -------
-    Episodes
-        As played.
-
-    Raises
-    ------
-    ValueError
-        If number or seed make no sense, or the agent does not fit its task.
-    """
+    """Play episodes; print score and success."""
     first = agent_evaluation_seed(seed, n)
     task = agent.task
     system = get_system(task.system)
@@ -291,15 +243,7 @@ def show(
 def interval(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
     """Mean of what episodes gave, with a bootstrap 95 % interval over the episodes.
 
-    Parameters
-    ----------
-    values : array_like, shape (n,)
-        One for each episode.
-
-    Returns
-    -------
-    mean, low, high : float
-        NaN for both ends if there is one episode only.
+    Shapes: ``values`` (n,).
     """
     mean = float(np.mean(values))
     if len(values) < 2:

@@ -27,18 +27,7 @@ class Export:
     """The agent's system if it is one of your own, as the agent's file names it."""
 
     def run(self, console: Console) -> None:
-        """Export.
-
-        Parameters
-        ----------
-        console : Console
-            Where it is said what was written.
-
-        Raises
-        ------
-        ValueError
-            If the agent cannot be read or does not fit its task.
-        """
+        """Export."""
         from training.agents.sb3_files import to_sb3
 
         model = to_sb3(Agent.read(find(self.agent)), system=self.system)
@@ -64,18 +53,7 @@ class Import:
     """The shipped map or .safetensors file that it was trained on."""
 
     def run(self, console: Console) -> None:
-        """Import.
-
-        Parameters
-        ----------
-        console : Console
-            Where it is said what was written.
-
-        Raises
-        ------
-        ValueError
-            If the file is no such agent.
-        """
+        """Import."""
         from training.agents.sb3_files import from_sb3
 
         from_sb3(self.path, self.system, self.observer).save(self.out)
@@ -83,23 +61,7 @@ class Import:
 
 
 def find(name: str) -> Path:
-    """Find the file of an agent.
-
-    Parameters
-    ----------
-    name : str
-        An agent that ships, such as ``van_der_pol``, or a path that ends in ``.safetensors``.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    AgentError
-        If no such agent ships.
-    """
+    """Find the file of an agent."""
     if name.endswith(".safetensors"):
         return Path(name)
     folder = files("training.agents").joinpath("shipped")

@@ -57,23 +57,7 @@ class Benchmark:
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
-        """Run what is missing, then report.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Path
-            The folder of results.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, the folder holds another benchmark, or jobs failed.
-        """
+        """Run what is missing, then report."""
         from training.benchmark.jobs import run_job, time_steps  # torch takes seconds to import
         from training.benchmark.results import check_results, collect, report
 

@@ -56,23 +56,7 @@ class Certify:
     """Folder for what is written."""
 
     def run(self, console: Console) -> "list[Certificate]":
-        """Certify.
-
-        Parameters
-        ----------
-        console : Console
-            Where the table is printed.
-
-        Returns
-        -------
-        list of Certificate
-            One for each observer.
-
-        Raises
-        ------
-        ValueError
-            If an observer cannot be had, or a number makes no sense.
-        """
+        """Certify."""
         from training.evaluation.certificates.certificate import certify, parts  # torch takes seconds to import
         from training.evaluation.certificates.settled import record_settled
 
@@ -124,18 +108,7 @@ class Certify:
 
 
 def lines(found: "Certificate") -> list[dict[str, str]]:
-    """What a certificate says, in sections: label to value.
-
-    Parameters
-    ----------
-    found : Certificate
-        Of any observer.
-
-    Returns
-    -------
-    list of dict
-        The sections, with the same labels for all observers of systems of one pace.
-    """
+    """What a certificate says, in sections: label to value."""
     from training.evaluation.certificates.forward import QUANTILES
 
     forward = found.forward
@@ -253,23 +226,7 @@ def draw(
     noise: Mapping[str, Any],
     motion: "SettledTrajectories",
 ) -> None:
-    """Draw the PDE's residual over X, and along the motion the error that noise will make.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    name : str
-        For the title.
-    noise : mapping
-        The levels ``measurement_noise`` and ``process_noise``.
-    motion : SettledTrajectories
-        Where the error is shown.
-    """
+    """Draw the PDE's residual over X, and along the motion the error that noise will make."""
     from matplotlib.colors import LogNorm
 
     from training.evaluation.certificates.gains import noise_variance

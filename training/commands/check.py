@@ -47,25 +47,7 @@ class Check:
     """File to which the findings are written as well."""
 
     def run(self, console: Console) -> "list[Finding]":
-        """Check and print.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        list of Finding
-            All that was found, if none of it is a problem.
-
-        Raises
-        ------
-        ValueError
-            If the system cannot be had, or an option makes no sense.
-        SystemExit
-            With status 1, if there is a problem.
-        """
+        """Check and print."""
         from training.checking import check  # here, because it imports torch, which help need not wait for
         from training.systems import named_policy
 

@@ -107,18 +107,7 @@ class Compare:
     """Of agents in environments."""
 
     def run(self, console: Console) -> None:
-        """Run what is missing, then report.
-
-        Parameters
-        ----------
-        console : Console
-            Where progress is shown.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, the folder holds another comparison, or a training failed.
-        """
+        """Run what is missing, then report."""
         if min(self.seeds, self.episodes) < 1:
             raise ValueError(f"seeds and episodes must be positive, got {self.seeds} and {self.episodes}")
         known: tuple[Any, ...] = SHOWN if self.environments else ALL
@@ -206,13 +195,7 @@ class Compare:
 
 
 def report(out: Path) -> None:
-    """Write table.md and scores.png from results.csv alone.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the comparison.
-    """
+    """Write table.md and scores.png from results.csv alone."""
     results, partial = _read(out)
     tasks = _tasks(results)
     lines = [
@@ -245,15 +228,7 @@ def report(out: Path) -> None:
 
 
 def draw_results(out: Path, path: Path) -> None:
-    """Draw the scores alone from results.csv.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the comparison.
-    path : Path
-        Of the figure.
-    """
+    """Draw the scores alone from results.csv."""
     results, partial = _read(out)
     tasks, shown = _tasks(results), _shown(results)[::-1]
     cells = _cells(results, tasks)

@@ -39,36 +39,7 @@ def compare_environments(
     workers: Workers,
     beside: Path | None = None,
 ) -> None:
-    """Run what is missing of a comparison, then report.
-
-    Parameters
-    ----------
-    tasks : sequence of HiddenTask
-        Where agents act.
-    out : Path
-        Receives results.csv, curves.csv, table.md, scores.png and curves.png.
-    console : rich.console.Console
-        Where progress is shown.
-    kinds : sequence of str
-        What agents are shown.
-    seeds, episodes : int
-        Agents of each kind, and episodes that each is played on.
-    timesteps : int or None
-        Steps to learn from.
-    aggregate : int
-        How many times observers are fitted again.
-    workers : Workers
-        Where agents are trained.
-    beside : Path, optional
-        Folder with results.csv and curves.csv of an earlier run, of which is taken over what this one does not train.
-
-    Raises
-    ------
-    ValueError
-        If the folder holds another comparison, a file of the earlier run is damaged, or a training failed.
-    OSError
-        If a file of the earlier run is missing.
-    """
+    """Run what is missing of a comparison, then report."""
     earlier = {name: _earlier(beside, name) for name in COLUMNS}  # an error now, not after hours
     cases = planned(tasks, out, kinds=kinds, seeds=seeds, episodes=episodes, timesteps=timesteps, aggregate=aggregate)
     for task in tasks:

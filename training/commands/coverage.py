@@ -40,25 +40,7 @@ def judged(
 ) -> list[dict[str, Any]]:
     """Judge error bars, and a Kalman filter's covariance beside them, on trajectories.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with error bars.
-    system : System
-        What it was made for.
-    trajectories : UnseenTrajectories
-        What is to be followed.
-    level : float or tuple of float, length ny
-        Of measurement noise.
-    seed : int
-        Seed of the noise.
-    ekf : bool
-        Whether to judge an extended Kalman filter too.
-
-    Returns
-    -------
-    list of dict of str to object
-        A row for each of them and span of time: "observer", "span", and the measures of :class:`Coverage` in percent.
+    Shapes: ``level`` of length ny.
     """
     dt, steps = artifact.filter.dt, len(trajectories.x)
     first, settled = (round(seconds * system.pace / dt) for seconds in (FIRST, SETTLED))
@@ -88,20 +70,7 @@ def _cells(found: Coverage, system: System) -> dict[str, float]:
 
 
 def coverage_table(title: str, rows: "pd.DataFrame") -> Table:
-    """Show rows of :func:`judged`.
-
-    Parameters
-    ----------
-    title : str
-        Of the table.
-    rows : DataFrame
-        Rows with the columns "starts" and "driven" beside theirs.
-
-    Returns
-    -------
-    Table
-        To be printed.
-    """
+    """Show rows of :func:`judged`."""
     regions = [f"{100 * region:g}" for region in REGIONS]
     limits = f"{rows.nees_low.min():.2f} to {rows.nees_high.max():.2f}"
     shown = Table(title=title, caption=f"NEES lies from {limits} with probability 95 % where covariances are true")
@@ -123,15 +92,7 @@ def coverage_table(title: str, rows: "pd.DataFrame") -> Table:
 
 
 def draw(path: Path, rows: "pd.DataFrame") -> None:
-    """Draw the coverage of 90 % regions by level of noise, a panel for each span.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    rows : DataFrame
-        As for :func:`coverage_table`.
-    """
+    """Draw the coverage of 90 % regions by level of noise, a panel for each span."""
     spans = list(rows.span.unique())
     with drawing(path, 4.0 * len(spans), 3.4) as figure:
         axes: Any = figure.subplots(1, len(spans), sharey=True, squeeze=False)[0]

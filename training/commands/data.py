@@ -40,47 +40,11 @@ class DataOptions:
         return Signals(self.time, measured, inputs, hidden)
 
     def read(self, progress: ProgressBars, system: System | None = None) -> list[Record]:
-        """Read the files.
-
-        Parameters
-        ----------
-        progress : ProgressBars
-            Where it is said what is odd.
-        system : System, optional
-            What was recorded, where that is known.
-
-        Returns
-        -------
-        list of Record
-            One of each file or episode.
-
-        Raises
-        ------
-        ValueError
-            As :func:`training.records.read_records`.
-        """
+        """Read the files."""
         return self._read(self.signals, progress, system)
 
     def read_for(self, artifact: Artifact, progress: ProgressBars) -> list[Record]:
-        """Read the files for an observer from recorded states: columns that are not named are its own.
-
-        Parameters
-        ----------
-        artifact : Artifact
-            The observer.
-        progress : ProgressBars
-            Where it is said what is odd.
-
-        Returns
-        -------
-        list of Record
-            One of each file or episode.
-
-        Raises
-        ------
-        ValueError
-            If no file is named, or as :meth:`read`.
-        """
+        """Read the files for an observer from recorded states: columns that are not named are its own."""
         signals = artifact.signals or {}
         if not self.data:
             raise ValueError(

@@ -51,23 +51,7 @@ class Demo:
     the sensor. Keys are shown there."""
 
     def run(self, console: Console) -> Path | None:
-        """Run.
-
-        Parameters
-        ----------
-        console : Console
-            Where the table is printed.
-
-        Returns
-        -------
-        Path or None
-            The figure; None of a window.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, there is no observer for the system, or no window can be opened.
-        """
+        """Run."""
         if self.seed < 0:
             raise ValueError(f"seed must not be negative, got {self.seed}")
         if self.live and (self.duration is not None or self.gif):
@@ -166,33 +150,7 @@ def play(
     policy: str | None = None,
     report: Callable[[int], object] = lambda done: None,
 ) -> Episode:
-    """Play one episode with an observer, undriven unless it was trained under a policy.
-
-    Parameters
-    ----------
-    environment : Shown
-        What is shown.
-    steps : int
-        Length in sampling intervals.
-    measurement_noise : float, tuple of float or None
-        Standard deviation of the noise on each sample of y; None for the system's own.
-    seed : int
-        Seed of start and noise.
-    policy : str, optional
-        What acts, on the true state: as for :func:`training.commands.options.read_policy`.
-    report : callable, optional
-        Told now and then the number of steps that are done.
-
-    Returns
-    -------
-    Episode
-        It ends early where the state leaves the system's bounds.
-
-    Raises
-    ------
-    ValueError
-        If the observer was trained under a policy of the user's that is not named.
-    """
+    """Play one episode with an observer, undriven unless it was trained under a policy."""
     made = gym.make(
         environment.env_id, **environment.options, measurement_noise=measurement_noise, max_episode_steps=steps
     )
@@ -231,18 +189,7 @@ def play(
 
 
 def table(episodes: Sequence[Episode]) -> Table:
-    """Errors of the observers, and the time of a step.
-
-    Parameters
-    ----------
-    episodes : sequence of Episode
-        A row each.
-
-    Returns
-    -------
-    Table
-        For the console.
-    """
+    """Errors of the observers, and the time of a step."""
     noise = ", ".join(dict.fromkeys(episode.measurement_noise for episode in episodes))
     with_spinn = any(episode.spinn is not None for episode in episodes)
     found = Table(
@@ -266,15 +213,7 @@ def table(episodes: Sequence[Episode]) -> Table:
 
 
 def draw(path: Path, episodes: Sequence[Episode]) -> None:
-    """Draw true and estimated states over time, a column for each episode (like the paper's fig. 2).
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure; its folder is made.
-    episodes : sequence of Episode
-        What is shown.
-    """
+    """Draw true and estimated states over time, a column for each episode (like the paper's fig. 2)."""
     rows = max(episode.x.shape[1] for episode in episodes)
     with drawing(path, max(6.0, 2.6 * len(episodes)), 1.9 * rows) as figure:
         axes = figure.subplots(rows, len(episodes), squeeze=False)

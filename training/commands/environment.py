@@ -58,25 +58,7 @@ class EnvironmentOptions:
             raise ValueError(f"{', '.join(given)}: this is for agents in an environment, and none is named")
 
     def task(self, env_id: str, measurement_noise: float = 0.0) -> HiddenTask:
-        """The task that these options describe.
-
-        Parameters
-        ----------
-        env_id : str
-            The environment.
-        measurement_noise : float
-            Standard deviation of the noise on what is measured.
-
-        Returns
-        -------
-        HiddenTask
-            The task.
-
-        Raises
-        ------
-        ValueError
-            If nobody says what is measured, or an index is none.
-        """
+        """The task that these options describe."""
         known = HIDDEN_VELOCITIES.get(env_id)
         if known is None and not self.measured:
             raise ValueError(
@@ -135,30 +117,7 @@ def train_in_environment(
     progress: ProgressBars,
     **how: Any,
 ) -> None:
-    """Train an agent in an environment and play a hundred episodes.
-
-    Parameters
-    ----------
-    options : EnvironmentOptions
-        What of the environment is measured.
-    env_id : str
-        The environment.
-    information : str
-        What the agent is shown.
-    folder : Path
-        Receives what :func:`training.agents.any_environment.learning.learn_to_play` writes.
-    measurement_noise : float
-        On what is measured.
-    progress : ProgressBars
-        Where bars are.
-    **how
-        Algorithm, timesteps, seed, observer and observer_steps.
-
-    Raises
-    ------
-    ValueError
-        If something makes no sense or does not fit the environment.
-    """
+    """Train an agent in an environment and play a hundred episodes."""
     from training.agents.any_environment.learning import learn_to_play
 
     task = options.task(env_id, measurement_noise)
@@ -181,28 +140,7 @@ def show_returns(
 ) -> np.ndarray:
     """Play episodes; print their mean return, and how good estimates were where the truth is shown.
 
-    Parameters
-    ----------
-    progress : ProgressBars
-        Where it is printed.
-    player : Player
-        Who acts.
-    episodes : int
-        Their number.
-    seed : int
-        Of the episodes.
-    trusted : str, optional
-        The agent's environment, if it may be imported.
-
-    Returns
-    -------
-    ndarray, shape (episodes,)
-        Returns.
-
-    Raises
-    ------
-    ValueError
-        If number or seed make no sense, or the agent cannot be played.
+    Shapes: returns (episodes,).
     """
     first, returns = agent_evaluation_seed(seed, episodes), []
     states, estimates = list[np.ndarray](), list[np.ndarray]()

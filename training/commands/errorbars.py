@@ -31,23 +31,7 @@ class ErrorBars(Teaching):
     """The file to write; by default one of the map's own name in runs/errorbars."""
 
     def run(self, console: Console) -> Artifact:
-        """Learn and write.
-
-        Parameters
-        ----------
-        console : Console
-            Where progress is shown.
-
-        Returns
-        -------
-        Artifact
-            What was written.
-
-        Raises
-        ------
-        ValueError
-            If the observer cannot be had or has no error bars to learn, or a number makes no sense.
-        """
+        """Learn and write."""
         from training.recorded.errorbars import learn_recorded_error_bars
         from training.teaching.errorbars import learn_error_bars  # torch takes seconds that help need not wait for
 

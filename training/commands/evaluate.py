@@ -101,23 +101,7 @@ class Evaluate:
     """File to which the errors of each trajectory are written as well."""
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Evaluate.
-
-        Parameters
-        ----------
-        console : Console
-            Where the tables are printed.
-
-        Returns
-        -------
-        DataFrame
-            The rows of the CSV file, one for each observer, case and trajectory.
-
-        Raises
-        ------
-        ValueError
-            If an observer cannot be had, a number makes no sense, or nothing can be measured.
-        """
+        """Evaluate."""
         import pandas as pd  # which takes half a second that help need not wait for
 
         if self.measurement_noise is not None and not self.measurement_noise:

@@ -50,25 +50,7 @@ class ExportCommand:
     """Folder for what is written."""
 
     def run(self, console: Console) -> list[Path]:
-        """Export.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            Where it is said what was written, and how large it is.
-
-        Returns
-        -------
-        list of Path
-            The files.
-
-        Raises
-        ------
-        ValueError
-            If there is no such observer, it cannot be exported, or an option makes no sense.
-        ModuleNotFoundError
-            If an ONNX graph is asked for without the extra ``onnx``.
-        """
+        """Export."""
         from training.export import Exported
 
         if self.format == "onnx" and (self.measurement_noise, self.process_noise) != (None, None):

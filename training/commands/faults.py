@@ -59,23 +59,7 @@ class Faults:
     """Folder for what is written."""
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Simulate and report.
-
-        Parameters
-        ----------
-        console : Console
-            Where the table is printed.
-
-        Returns
-        -------
-        DataFrame
-            The rows of faults.csv.
-
-        Raises
-        ------
-        ValueError
-            If an observer cannot be had or has no limits, or a number makes no sense.
-        """
+        """Simulate and report."""
         import pandas as pd  # which takes half a second that help need not wait for
 
         from training.evaluation.faults import PARTS, simulate_faults
@@ -117,18 +101,7 @@ class Faults:
 
 
 def report(out: Path) -> Table:
-    """Write table.md and scores.png from faults.csv alone.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of faults.csv.
-
-    Returns
-    -------
-    Table
-        To be printed.
-    """
+    """Write table.md and scores.png from faults.csv alone."""
     import pandas as pd
 
     found = pd.read_csv(out / "faults.csv")
@@ -166,15 +139,7 @@ def _by_amplitude(duffing: "pd.DataFrame") -> list[str]:
 
 
 def draw(path: Path, found: "pd.DataFrame") -> None:
-    """Draw how many runs exceed a threshold of the score in time, as it varies: sound ones and faulty ones.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    found : DataFrame
-        The rows of faults.csv.
-    """
+    """Draw how many runs exceed a threshold of the score in time, as it varies: sound ones and faulty ones."""
     from training.evaluation.faults import FAULTS
 
     observers = list(found.observer.unique())

@@ -61,23 +61,7 @@ class Identify:
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
-        """Identify.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Path
-            The observer's file.
-
-        Raises
-        ------
-        ValueError
-            If an option or a record makes no sense, as :func:`training.identification.identify` says.
-        """
+        """Identify."""
         began = time.monotonic()
         import torch
 
@@ -132,23 +116,7 @@ class Adapt:
     """What is to differ in the training of the observer."""
 
     def run(self, console: Console) -> Path:
-        """Adapt.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Path
-            The new observer's file.
-
-        Raises
-        ------
-        ValueError
-            If an option or a record makes no sense, as :func:`training.identification.adapt` says.
-        """
+        """Adapt."""
         began = time.monotonic()
         import torch
 
@@ -185,23 +153,7 @@ class Adapt:
 
 
 def merged(unknown: Sequence[Sequence[tuple[str, tuple[float, ...]]]]) -> dict[str, tuple[float, ...]]:
-    """Unknown parameters of one option or several.
-
-    Parameters
-    ----------
-    unknown : sequence of sequences of (str, tuple of float)
-        Names with numbers, as each option gives them.
-
-    Returns
-    -------
-    dict of str to tuple of float
-        The numbers by name.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is named twice.
-    """
+    """Unknown parameters of one option or several."""
     pairs = [pair for option in unknown for pair in option]
     names = [name for name, _ in pairs]
     if len({*names}) < len(names):
@@ -210,25 +162,7 @@ def merged(unknown: Sequence[Sequence[tuple[str, tuple[float, ...]]]]) -> dict[s
 
 
 def limits(system: System, unknown: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, float]]:
-    """Limits of unknown parameters: those given, or ten times as large and small as the first guess.
-
-    Parameters
-    ----------
-    system : System
-        With the first guesses.
-    unknown : mapping of str to tuple of float
-        A first guess and, where they were given, the lowest and the highest value.
-
-    Returns
-    -------
-    dict of str to (float, float)
-        Lowest and highest value of each.
-
-    Raises
-    ------
-    ValueError
-        If a guess is zero and has no limits.
-    """
+    """Limits of unknown parameters: those given, or ten times as large and small as the first guess."""
     found: dict[str, tuple[float, float]] = {}
     for name, (guess, *ends) in unknown.items():
         if not ends and not guess:
@@ -239,24 +173,7 @@ def limits(system: System, unknown: Mapping[str, tuple[float, ...]]) -> dict[str
 
 
 def finished(learned: "Learned", folder: Path, *, began: float, say: Any) -> Path:
-    """Draw the observer's report, and say what was written.
-
-    Parameters
-    ----------
-    learned : Learned
-        What records taught.
-    folder : Path
-        The run's.
-    began : float
-        When, by ``time.monotonic``.
-    say : callable
-        Prints a line.
-
-    Returns
-    -------
-    Path
-        The observer's file.
-    """
+    """Draw the observer's report, and say what was written."""
     from training.evaluation.report import write_report
 
     system = learned.identified.system

@@ -130,13 +130,7 @@ class Live:
                 self.restart()
 
     def draw(self) -> list[Any]:
-        """Bring the drawing up to date.
-
-        Returns
-        -------
-        list of matplotlib artists
-            Those that have changed.
-        """
+        """Bring the drawing up to date."""
         x, x_hat, y, score = (np.array(column) for column in zip(*self.history, strict=True))
         t = (np.arange(len(x)) - len(x) + 1) * self.dt
         i, j = self.system.portrait
@@ -155,13 +149,7 @@ class Live:
         return self.artists
 
     def press(self, key: str | None) -> None:
-        """Do what a key is for; ``KEYS`` says what that is.
-
-        Parameters
-        ----------
-        key : str or None
-            Its name, as matplotlib has it.
-        """
+        """Do what a key is for; ``KEYS`` says what that is."""
         if key == " ":
             self.paused = not self.paused
         elif key == "n":
@@ -236,27 +224,7 @@ class Live:
 
 
 def show(environment: Shown, measurement_noise: Level | None, *, seed: int) -> Any:
-    """Open a window and show an environment in it until it is closed.
-
-    Parameters
-    ----------
-    environment : Shown
-        What is shown.
-    measurement_noise : float, tuple of float or None
-        As for :class:`Live`.
-    seed : int
-        As for :class:`Live`.
-
-    Returns
-    -------
-    matplotlib.animation.FuncAnimation
-        What has drawn it.
-
-    Raises
-    ------
-    ValueError
-        If no window can be opened.
-    """
+    """Open a window and show an environment in it until it is closed."""
     import matplotlib.pyplot as plt
     from matplotlib.animation import FuncAnimation
     from matplotlib.backends.registry import BackendFilter, backend_registry

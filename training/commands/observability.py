@@ -76,23 +76,7 @@ class ObservabilityCommand:
     """Recorded data; --measured and --hidden are of an environment, too, and named as for `kkl-gym record`."""
 
     def run(self, console: Console) -> "Observability":
-        """Look, print and, if asked to, write.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Observability
-            What was found.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense or is for something else, or there is too little data.
-        """
+        """Look, print and, if asked to, write."""
         from training.observable.report import save, table  # pandas takes half a second to import
 
         if self.out:

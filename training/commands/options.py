@@ -138,25 +138,7 @@ OwnPolicy = Annotated[
 
 
 def read_parameter(text: str) -> tuple[str, float]:
-    """Read a parameter, written as ``mu=3.3``.
-
-    Parameters
-    ----------
-    text : str
-        What the user wrote.
-
-    Returns
-    -------
-    name : str
-        Of the parameter; nobody has looked for it.
-    value : float
-        Its value.
-
-    Raises
-    ------
-    ValueError
-        If it is not a name and a number with an equals sign between them.
-    """
+    """Read a parameter, written as ``mu=3.3``."""
     name, _, value = text.partition("=")
     try:
         return name.strip(), float(value)
@@ -167,22 +149,7 @@ def read_parameter(text: str) -> tuple[str, float]:
 def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
     """Read an unknown parameter, written as ``mu=1.5``, or with limits as ``mu=1.5:0.5:6``.
 
-    Parameters
-    ----------
-    text : str
-        What the user wrote.
-
-    Returns
-    -------
-    name : str
-        Of the parameter; nobody has looked for it.
-    numbers : tuple of float, length 1 or 3
-        A first guess and, where they were given, the lowest and the highest value.
-
-    Raises
-    ------
-    ValueError
-        If it is something else.
+    Shapes: returns ``numbers`` of length 1 or 3.
     """
     name, _, values = text.partition("=")
     try:
@@ -197,25 +164,7 @@ def read_unknown(text: str) -> tuple[str, tuple[float, ...]]:
 
 
 def read_half_width(text: str) -> tuple[str, float]:
-    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters.
-
-    Parameters
-    ----------
-    text : str
-        What the user wrote.
-
-    Returns
-    -------
-    name : str
-        Of the parameter, or "all".
-    share : float
-        How far it may be from its value, as a part of that.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Read how uncertain a parameter is, written as ``mu=0.1``; a number alone is of all parameters."""
     name, _, share = text.rpartition("=")
     try:
         return name.strip() or EVERY, float(share)
@@ -226,25 +175,7 @@ def read_half_width(text: str) -> tuple[str, float]:
 
 
 def read_observers(names: Sequence[str], own_system: str | None) -> list[tuple[str, Artifact, System]]:
-    """Read observers and find their systems.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Shipped maps, or ``.safetensors`` files.
-    own_system : str or None
-        Class of the observers' system, unless it ships.
-
-    Returns
-    -------
-    list of (str, Artifact, System)
-        Each name with what is behind it.
-
-    Raises
-    ------
-    ValueError
-        If no observer is named, one cannot be read, or it does not fit the system.
-    """
+    """Read observers and find their systems."""
     if not names:
         raise ValueError(f"name an observer; shipped: {', '.join(shipped()) or 'none'}")
     artifacts = [(name, Artifact.read(resolve(name))) for name in names]
@@ -282,25 +213,7 @@ class Shown:
 
 
 def shown(system: str | None, observer: str | None) -> list[Shown]:
-    """Find the environments to show: those that ship, or one that is named.
-
-    Parameters
-    ----------
-    system : str or None
-        A shipped system, or a class of the user's.
-    observer : str or None
-        In place of the one that ships for it.
-
-    Returns
-    -------
-    list of Shown
-        One at least.
-
-    Raises
-    ------
-    ValueError
-        If the system is unknown, or the observer cannot be had or was made for another.
-    """
+    """Find the environments to show: those that ship, or one that is named."""
     if system is None:
         if observer is not None:
             raise ValueError(f"name the system that the observer {observer} is for")
@@ -315,28 +228,7 @@ def shown(system: str | None, observer: str | None) -> list[Shown]:
 
 
 def read_policy(artifact: Artifact, system: System, own_policy: str | None) -> Controller | None:
-    """Find the policy under which an observer is to be judged: one like that of its training.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer. A file never makes code run that is named in it alone.
-    system : System
-        What it was made for.
-    own_policy : str or None
-        What the user names: as for :attr:`training.config.Config.policy`.
-
-    Returns
-    -------
-    callable or None
-        None for an observer that was trained without one, unless the user names one.
-
-    Raises
-    ------
-    ValueError
-        If the observer was trained under a policy of the user's that is not named, takes in no inputs, or the policy
-        is none.
-    """
+    """Find the policy under which an observer is to be judged: one like that of its training."""
     trained = artifact.training.get("policy")
     if own_policy is None and trained is not None and trained != "controller":
         raise ValueError(

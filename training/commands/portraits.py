@@ -40,15 +40,7 @@ class Motion:
 
 
 def animate(path: Path, motions: Sequence[Motion]) -> None:
-    """Draw states and estimates as they move, a column for each motion.
-
-    Parameters
-    ----------
-    path : Path
-        Of the GIF; its folder is made.
-    motions : sequence of Motion
-        The beginning of each is shown, which is where estimates converge.
-    """
+    """Draw states and estimates as they move, a column for each motion."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -106,24 +98,12 @@ class Column:
         self.outputs = [strip.plot([], [], color=MEASURED, lw=0.6, animated=True)[0] for _ in self.y.T]
 
     def name_lines(self, figure: Any) -> None:
-        """Put the legend of all columns above them.
-
-        Parameters
-        ----------
-        figure : matplotlib Figure
-            Where it goes.
-        """
+        """Put the legend of all columns above them."""
         lines = [*(trail for trail, _ in self.trails), self.outputs[0]]
         figure.legend(lines, ["state", "estimate", "what the observer sees"], loc="outside upper center", ncols=3)
 
     def show(self, share: float) -> None:
-        """Draw a frame.
-
-        Parameters
-        ----------
-        share : float
-            How much of the motion has passed.
-        """
+        """Draw a frame."""
         now = max(1, round(share * self.samples))
         first = max(0, now - round(TRAIL * self.samples))
         for (trail, head), states in zip(self.trails, (self.x, self.x_hat), strict=True):

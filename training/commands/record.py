@@ -62,23 +62,7 @@ class RecordCommand:
     """Name of the data set, as in pendulum/random-v0."""
 
     def run(self, console: Console) -> str:
-        """Record.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        str
-            Name of the data set.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, as :func:`training.rollouts.roll_out` says, or there is such a data set.
-        """
+        """Record."""
         from training.records.minari import dataset_folder, write_dataset
         from training.rollouts import make, policy_of, roll_out
 
@@ -133,25 +117,7 @@ def names_in(text: str) -> list[str]:
 
 
 def read_argument(text: str) -> tuple[str, Any]:
-    """Read ``NAME=VALUE``.
-
-    Parameters
-    ----------
-    text : str
-        What the user wrote.
-
-    Returns
-    -------
-    name : str
-        Of the argument.
-    value : object
-        As JSON says, or the text itself.
-
-    Raises
-    ------
-    ValueError
-        If it is not of that form.
-    """
+    """Read ``NAME=VALUE``."""
     name, equals, value = text.partition("=")
     if not equals or not name.isidentifier():
         raise ValueError(f"an argument of an environment is given as NAME=VALUE, got {text!r}")

@@ -49,31 +49,7 @@ class Workers:
 def run_missing(
     run: Callable[[Job], None], jobs: Sequence[Job], *, workers: Workers, what: str, progress: ProgressBars
 ) -> list[str]:
-    """Run the jobs that are not done.
-
-    Parameters
-    ----------
-    run : callable
-        What to do with a job; a function of a module.
-    jobs : sequence of jobs
-        All of them.
-    workers : Workers
-        Where they run.
-    what : str
-        What they make, for the bar.
-    progress : ProgressBars
-        Where the bar is, and what has ended is said.
-
-    Returns
-    -------
-    list of str
-        Names of jobs that failed, each with what went wrong.
-
-    Raises
-    ------
-    ValueError
-        If there are no such workers.
-    """
+    """Run the jobs that are not done."""
     todo, failures = [job for job in jobs if not job.done], list[str]()
     bar = progress.add_task(what, total=len(jobs), completed=len(jobs) - len(todo))
     with engine(workers.jobs, backend=workers.backend, address=workers.address) as here:

@@ -34,14 +34,7 @@ class Other(System):
 
 
 def defaults() -> dict[str, str]:
-    """What each setting is where nobody says it, for people.
-
-    Returns
-    -------
-    dict of str to str
-        For each setting such as "fast 128, paper 512". A value that a system's profile changes is followed by that;
-        "from the system" stands for what no two systems need have in common.
-    """
+    """What each setting is where nobody says it, for people."""
     given = {"eigenvalues": (-1.0,)}  # none are to be looked for, which takes time
     found: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for pipeline in get_args(Pipeline):

@@ -56,23 +56,7 @@ class Sizes:
     """Folder for what is written."""
 
     def run(self, console: Console) -> "pd.DataFrame":
-        """Train, measure and draw.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        DataFrame
-            The rows of sizes.csv.
-
-        Raises
-        ------
-        ValueError
-            If a number makes no sense, or the system or the settings cannot be had.
-        """
+        """Train, measure and draw."""
         import pandas as pd  # which, as torch, takes a second or more that help need not wait for
 
         if not self.widths or min(self.widths) < 1 or len({*self.widths}) < len(self.widths):
@@ -152,15 +136,7 @@ class Sizes:
 
 
 def draw(path: Path, *frames: "pd.DataFrame") -> None:
-    """Errors of all sizes against the time of a step.
-
-    Parameters
-    ----------
-    path : Path
-        The picture's file.
-    *frames : DataFrame
-        Rows of sizes.csv, of one system each.
-    """
+    """Errors of all sizes against the time of a step."""
     from matplotlib.ticker import LogLocator
 
     with drawing(path, 3.6 * len(frames), 3.4) as figure:

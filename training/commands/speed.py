@@ -55,18 +55,7 @@ class Speed:
     """Steps of each vector environment in a turn, from starts in the training box on."""
 
     def run(self, console: Console) -> dict[str, float]:
-        """Measure and print.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        dict of str to float
-            Steps per second of each environment, as a multiple of its reference's.
-        """
+        """Measure and print."""
         for name in ("steps", "turns", "num_envs", "vector_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
@@ -241,20 +230,7 @@ class StillVector(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
-    """Time an environment.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        It is reset first, which does not count.
-    actions : list of ndarray
-        One for each step.
-
-    Returns
-    -------
-    float
-        Seconds, resets of ended episodes included.
-    """
+    """Time an environment."""
     env.reset(seed=0)
     started = time.process_time()
     for action in actions:
@@ -265,20 +241,7 @@ def timed(env: gym.Env, actions: list[np.ndarray]) -> float:
 
 
 def timed_vector(env: gym.vector.VectorEnv, actions: list[np.ndarray]) -> float:
-    """Time a vector environment that resets by itself.
-
-    Parameters
-    ----------
-    env : gymnasium.vector.VectorEnv
-        It is reset first, which does not count.
-    actions : list of ndarray
-        One of all rows for each step.
-
-    Returns
-    -------
-    float
-        Seconds.
-    """
+    """Time a vector environment that resets by itself."""
     env.reset(seed=0)
     started = time.process_time()
     for action in actions:

@@ -23,22 +23,7 @@ Name = TypeVar("Name", bound=Hashable)
 def in_turns(
     tasks: Mapping[Name, Callable[[], float]], turns: int, report: Callable[[int], object] = lambda done: None
 ) -> dict[Name, list[float]]:
-    """Let tasks take turns, because a shared machine's speed drifts.
-
-    Parameters
-    ----------
-    tasks : mapping of name to callable
-        Each gives the seconds that it took.
-    turns : int
-        How many there are, after one that warms up and does not count.
-    report : callable, optional
-        Told how many tasks are done.
-
-    Returns
-    -------
-    dict of name to list of float
-        Seconds in each turn.
-    """
+    """Let tasks take turns, because a shared machine's speed drifts."""
     seconds: dict[Name, list[float]] = {name: [] for name in tasks}
     for turn in range(turns + 1):
         for i, (name, task) in enumerate(tasks.items(), 1):
@@ -56,24 +41,6 @@ def observer_tasks(
 
     Of observers the first half is not timed: there those that track may still ask T_inv at each sample. What takes a
     single sample in Python, by far the slowest, is timed on fewer of them.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    rows : int or None
-        How many are observed at once; None is a single one, without an axis.
-    steps : int
-        Number of samples.
-
-    Returns
-    -------
-    dict of str to callable
-        CPU seconds for each step, by name: "KKL"; "KKL, error bars" where the artifact has them; the same followed by
-        ", NumPy" of a single one where Numba is installed; "EKF" of this package, which is for batches; and "EKF of
-        filterpy" where that is installed, one filter for each row.
     """
     rng, n = np.random.default_rng(0), rows or 1
     u = np.array(system.u_max) * rng.uniform(-1, 1, (steps + 1, n, system.nu))
@@ -114,22 +81,7 @@ def observer_tasks(
 
 
 def limit(inverse: InverseMap, rows: int) -> tuple[Callable[[], float], float]:
-    """The matrix products of a map's network, and nothing else.
-
-    Parameters
-    ----------
-    inverse : InverseMap
-        The map.
-    rows : int
-        Of the batch.
-
-    Returns
-    -------
-    task : callable
-        CPU seconds that they take, all together.
-    operations : float
-        How many additions and multiplications they are.
-    """
+    """The matrix products of a map's network, and nothing else."""
     weights = [np.ascontiguousarray(weight.T, dtype=np.float32) for weight in inverse.mlp.weights]
     values = [np.ones((rows, len(weight)), np.float32) for weight in weights]
     out = [np.empty((rows, weight.shape[1]), np.float32) for weight in weights]
@@ -147,24 +99,7 @@ def limit(inverse: InverseMap, rows: int) -> tuple[Callable[[], float], float]:
 def table_rows(
     single: Mapping[str, float], batch: Mapping[str, float], *, network: float, products: float, operations: float
 ) -> list[list[str]]:
-    """Rows of the table.
-
-    Parameters
-    ----------
-    single, batch : mapping of str to float
-        Seconds per step by name, of one and of many.
-    network : float
-        Seconds of a batch's network, with what it is given.
-    products : float
-        Seconds of the matrix products in it.
-    operations : float
-        Additions and multiplications in these.
-
-    Returns
-    -------
-    list of list of str
-        Name, µs of one, µs of a batch, and for the observer GFLOP/s of the network, of the products, and the share.
-    """
+    """Rows of the table."""
     found = []
     for name, seconds in single.items():
         many = f"{1e6 * batch[name]:,.0f}" if name in batch else ""

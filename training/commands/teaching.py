@@ -41,31 +41,7 @@ class Teaching:
         trajectories: int,
         **settings: Any,
     ) -> Artifact:
-        """Teach the observer, from simulated motions or from the records that it was learned from, and write it.
-
-        Parameters
-        ----------
-        out : Path
-            The file to write.
-        console : rich.console.Console
-            Where progress is shown.
-        from_system, from_records : callable
-            What teaches it: of the artifact, and of its system or of records.
-        trajectories : int
-            Number of motions that are simulated.
-        **settings : object
-            Of both.
-
-        Returns
-        -------
-        Artifact
-            What was written.
-
-        Raises
-        ------
-        ValueError
-            If the observer cannot be had, is what would be written over, or an option makes no sense for it.
-        """
+        """Teach the observer, from simulated motions or from the records that it was learned from, and write it."""
         if out.suffix != ".safetensors":
             raise ValueError(f"out = {out} must end in .safetensors")
         if out.is_dir():

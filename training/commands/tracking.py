@@ -38,23 +38,7 @@ class Tracking(Teaching):
     """The file to write; by default one of the map's own name in runs/tracking."""
 
     def run(self, console: Console) -> Artifact:
-        """Learn and write.
-
-        Parameters
-        ----------
-        console : Console
-            Where progress is shown.
-
-        Returns
-        -------
-        Artifact
-            What was written.
-
-        Raises
-        ------
-        ValueError
-            If the observer cannot be had, has no error bars or serves a range of plants, or a number makes no sense.
-        """
+        """Learn and write."""
         from training.recorded.tracking import learn_recorded_tracking
         from training.teaching.tracking import learn_tracking  # torch takes seconds that help need not wait for
 

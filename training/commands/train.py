@@ -87,23 +87,7 @@ class Train:
     """What of the preset's configuration is to differ."""
 
     def run(self, console: Console) -> Path | None:
-        """Train.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Path or None
-            The artifact's file; None if the run is a dry one.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, as :func:`training.presets.preset` and :func:`training.train` say.
-        """
+        """Train."""
         began = time.monotonic()
         import torch  # which takes longer to import than all the rest
 
@@ -198,21 +182,7 @@ class Train:
 def find_limits(
     path: Path, result: "Result", system: System, *, policy: Controller | None, progress: ProgressBars
 ) -> None:
-    """Write an artifact again, with limits for its monitor, or say why there are none.
-
-    Parameters
-    ----------
-    path : Path
-        The artifact's file.
-    result : Result
-        What the training made.
-    system : System
-        What it was made for.
-    policy : callable or None
-        Under which it was trained.
-    progress : ProgressBars
-        Where progress is shown.
-    """
+    """Write an artifact again, with limits for its monitor, or say why there are none."""
     from training.teaching.monitor import PARTS, calibrate
 
     artifact = result.artifact
@@ -224,24 +194,7 @@ def find_limits(
 
 
 def described(system: System, config: Config, name: Preset, changes: Mapping[str, Any]) -> list[str]:
-    """What is going to be done.
-
-    Parameters
-    ----------
-    system : System
-        Of the run.
-    config : Config
-        Of the run.
-    name : {"fast", "paper"}
-        The preset.
-    changes : mapping of str to object
-        Settings that differ from the preset's.
-
-    Returns
-    -------
-    list of str
-        Lines for people.
-    """
+    """What is going to be done."""
     own = "".join(f", {parameter} = {value:g}" for parameter, value in system.parameters.items())
     given = "".join(f"; {setting} = {value}" for setting, value in changes.items())
     counts = {"state": system.nx, "output": system.ny, "input": system.nu}
@@ -266,20 +219,7 @@ def described(system: System, config: Config, name: Preset, changes: Mapping[str
 
 
 def expected(config: Config, found: "Estimate") -> Table:
-    """What a run will take, stage by stage.
-
-    Parameters
-    ----------
-    config : Config
-        Of the run.
-    found : Estimate
-        What was estimated.
-
-    Returns
-    -------
-    Table
-        For the console.
-    """
+    """What a run will take, stage by stage."""
     batches = {"forward": config.forward_steps}
     table = Table(
         "stage",

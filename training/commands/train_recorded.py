@@ -29,35 +29,7 @@ def train_from_data(
     device: "torch.device | None",
     console: Console,
 ) -> Path:
-    """Learn an observer from recorded states, and write it and its report.
-
-    Parameters
-    ----------
-    name : str
-        Of the plant, as the user calls it.
-    data : DataOptions
-        The records.
-    settings : mapping of str to object
-        Of :class:`training.recorded.config.RecordedConfig`, those that the user gives.
-    out : Path or None
-        The run's folder; by default runs/NAME.
-    resume : bool
-        Go on from checkpoints.
-    device : torch.device or None
-        Where networks are trained; None takes a GPU if there is one.
-    console : rich.console.Console
-        For people.
-
-    Returns
-    -------
-    Path
-        The artifact's file.
-
-    Raises
-    ------
-    ValueError
-        If the name is none for a file, a setting is unknown here, or as :func:`training.recorded.fit.train_recorded`.
-    """
+    """Learn an observer from recorded states, and write it and its report."""
     from training.recorded.fit import train_recorded
     from training.recorded.report import write_recorded_report
 

@@ -66,23 +66,7 @@ class Tune:
     workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
 
     def run(self, console: Console) -> Choice:
-        """Choose, print and write.
-
-        Parameters
-        ----------
-        console : rich.console.Console
-            For people.
-
-        Returns
-        -------
-        Choice
-            What config.json holds.
-
-        Raises
-        ------
-        ValueError
-            If an option makes no sense, or the system's motions cannot be followed.
-        """
+        """Choose, print and write."""
         if self.modes < 1:
             raise ValueError(f"modes = {self.modes} must be positive")
         if self.check is not None and not 0 < self.check < np.inf:

@@ -21,19 +21,7 @@ INTERVAL = 0.95  # of the mean NEES of a filter that is consistent
 class Coverage:
     """How many errors lie in the regions that covariances say, in a span of time.
 
-    Parameters
-    ----------
-    joint : ndarray, shape (regions,)
-        Parts of the errors in the ellipsoids of ``REGIONS``, over all samples of all trajectories.
-    states : ndarray, shape (regions, nx)
-        Parts of each state's errors in its own intervals.
-    nees : float
-        Mean of (x - x_hat)^T P^-1 (x - x_hat), the normalised estimation error squared: nx for a true P.
-    limits : tuple of float
-        Between which it lies for so many trajectories with a probability of 95 %, were the errors of a trajectory one
-        Gaussian (Bar-Shalom, Li and Kirubarajan, 2001, sec. 5.4). They are wider than those of independent samples.
-    rms, said : ndarray, shape (nx,)
-        Root mean square of each state's errors, and of the standard deviations said of them.
+    Shapes: ``joint`` (regions,), ``states`` (regions, nx), ``rms``, ``said`` (nx,).
     """
 
     joint: np.ndarray
@@ -55,30 +43,7 @@ def coverage(
 ) -> list[Coverage]:
     """Judge an observer's error bars on test trajectories. It is told the levels of noise, nothing of another plant.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with error bars.
-    system : System
-        What it was made for.
-    trajectories : UnseenTrajectories
-        What it is to follow.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of the measurement noise.
-    spans : tuple of slice
-        Of samples, each judged by itself.
-
-    Returns
-    -------
-    list of Coverage
-        One for each span.
-
-    Raises
-    ------
-    ValueError
-        If the level of noise is none or beyond the map's range, or the artifact holds no error bars.
+    Shapes: ``measurement_noise`` of length ny.
     """
     artifact.require_spread()
     observer = KKLObserver(artifact, measurement_noise, process_noise=trajectories.process_noise)
@@ -103,30 +68,7 @@ def kalman_coverage(
 ) -> list[Coverage]:
     """Judge the covariance that an extended Kalman filter says, on what :func:`coverage` takes.
 
-    Parameters
-    ----------
-    system : System
-        What it takes for what moves.
-    trajectories : UnseenTrajectories
-        What it is to follow.
-    dt : float
-        Sampling interval in seconds.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of the measurement noise.
-    spans : tuple of slice
-        As for :func:`coverage`.
-
-    Returns
-    -------
-    list of Coverage
-        One for each span.
-
-    Raises
-    ------
-    ValueError
-        If the equations take no symbols.
+    Shapes: ``measurement_noise`` of length ny.
     """
     y = measured(system, trajectories, measurement_noise, seed)
 

@@ -33,16 +33,7 @@ class NoStartsError(ValueError):
 class Errors:
     """Errors in percent of each trajectory that stayed within bounds, and how many did not.
 
-    Parameters
-    ----------
-    full : ndarray, shape (n,)
-        SMAPE over all steps (the paper's).
-    late : ndarray, shape (n,)
-        SMAPE after the transient: what :func:`errors` was told to skip, else the first 20 % of the steps.
-    nrmse : ndarray, shape (n, nx)
-        Of each state after the transient, see :func:`training.evaluation.metrics.nrmse`.
-    escaped : int
-        Number of trajectories that left the system's declared bounds and are not among these.
+    Shapes: ``full`` (n,), ``late`` (n,), ``nrmse`` (n, nx).
     """
 
     full: np.ndarray
@@ -55,18 +46,7 @@ class Errors:
 class UnseenTrajectories:
     """Test trajectories, measured without noise.
 
-    Parameters
-    ----------
-    x : ndarray, shape (steps + 1, n, nx)
-        States of the trajectories that stayed within the system's declared bounds.
-    u : ndarray, shape (steps, n, nu)
-        Their inputs.
-    inside : ndarray of bool, shape (drawn,)
-        Which of the trajectories drawn these are.
-    process_noise : float
-        Level of their process noise, in multiples of the system's scale per second.
-    plant : System, optional
-        What moved, where it was not the system that the observer was made for.
+    Shapes: ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu), ``inside`` (drawn,).
     """
 
     x: np.ndarray
@@ -84,16 +64,6 @@ class UnseenTrajectories:
         """Take the first of those drawn.
 
         Drawn alone they might differ: rounding depends on the batch, and chaos on rounding.
-
-        Parameters
-        ----------
-        n : int
-            How many of those drawn, whether they stayed within bounds or not.
-
-        Returns
-        -------
-        UnseenTrajectories
-            Those of them that stayed.
         """
         inside = self.inside[:n]
         return replace(self, x=self.x[:, : inside.sum()], u=self.u[:, : inside.sum()], inside=inside)
@@ -102,26 +72,7 @@ class UnseenTrajectories:
 def starts(system: System, domain: Domain, n: int, rng: np.random.Generator) -> np.ndarray:
     """Starts, uniform in the training box X, or in a multiple of X (as in the paper) without X itself.
 
-    Parameters
-    ----------
-    system : System
-        Whose X is meant.
-    domain : {"X", "1.5X", "2X"}
-        Where to start.
-    n : int
-        Number of starts.
-    rng : numpy.random.Generator
-        From which they are drawn.
-
-    Returns
-    -------
-    ndarray, shape (n, nx)
-        The starts.
-
-    Raises
-    ------
-    NoStartsError
-        If there are hardly any beyond X.
+    Shapes: returns (n, nx).
     """
     if domain == "X":
         return system.draw_starts(rng, n)
@@ -274,28 +225,7 @@ def estimates(
 ) -> np.ndarray:
     """What an observer makes of test trajectories: its errors are what :func:`errors` measures.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    trajectories : UnseenTrajectories
-        What it is to follow.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of the measurement noise.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, n, nx)
-        Estimates.
-
-    Raises
-    ------
-    ValueError
-        If the level of noise is none, or beyond the map's range.
+    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, n, nx).
     """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     observer = KKLObserver(artifact, level, process_noise=trajectories.process_noise)
@@ -316,30 +246,7 @@ def kalman_errors(
 
     It knows the system's equations, the inputs and both levels of noise, and that starts are uniform in X.
 
-    Parameters
-    ----------
-    system : System
-        What it takes for what moves.
-    trajectories : UnseenTrajectories
-        What it is to follow.
-    dt : float
-        Sampling interval in seconds.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of the measurement noise.
-    skip : float, optional
-        As for :func:`errors`.
-
-    Returns
-    -------
-    Errors
-        One for each trajectory.
-
-    Raises
-    ------
-    ValueError
-        If the level of noise is none, or the equations take no symbols.
+    Shapes: ``measurement_noise`` of length ny.
     """
     x_hat = kalman_estimates(system, trajectories, dt, measurement_noise=measurement_noise, seed=seed)
     return _errors(trajectories, x_hat, dt, skip)
@@ -350,28 +257,7 @@ def kalman_estimates(
 ) -> np.ndarray:
     """What the filter of :func:`kalman_errors` makes of test trajectories.
 
-    Parameters
-    ----------
-    system : System
-        What it takes for what moves.
-    trajectories : UnseenTrajectories
-        What it is to follow.
-    dt : float
-        Sampling interval in seconds.
-    measurement_noise : float or sequence of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of the measurement noise.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, n, nx)
-        Estimates.
-
-    Raises
-    ------
-    ValueError
-        If the level of noise is none, or the equations take no symbols.
+    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, n, nx).
     """
     level = noise_levels("measurement_noise", measurement_noise, system.ny)
     y = measured(system, trajectories, level, seed)
@@ -386,26 +272,7 @@ def kalman_estimates(
 def kalman_filter(system: System, dt: float, process_noise: float, measurement_noise: Level) -> ExtendedKalmanFilter:
     """Make an extended Kalman filter that is told both levels of noise, and assumes a little process noise at least.
 
-    Parameters
-    ----------
-    system : System
-        The model.
-    dt : float
-        Sampling interval in seconds.
-    process_noise : float
-        Its level, in multiples of the system's scale per second.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample, of all outputs or each.
-
-    Returns
-    -------
-    ExtendedKalmanFilter
-        One that awaits its first samples.
-
-    Raises
-    ------
-    ValueError
-        If the equations take no symbols.
+    Shapes: ``measurement_noise`` of length ny.
     """
     Q = process_intensity(system, process_noise, dt)
     return ExtendedKalmanFilter(system, dt, Q=Q, R=measurement_covariance(system, measurement_noise))
@@ -414,21 +281,7 @@ def kalman_filter(system: System, dt: float, process_noise: float, measurement_n
 def measured(system: System, trajectories: UnseenTrajectories, level: Level, seed: int) -> np.ndarray:
     """Measure trajectories.
 
-    Parameters
-    ----------
-    system : System
-        What measures, unless there is a plant.
-    trajectories : UnseenTrajectories
-        What is measured.
-    level : float or tuple of float, length ny
-        Standard deviation of the noise on each sample, of all outputs or each.
-    seed : int
-        Seed of the noise.
-
-    Returns
-    -------
-    ndarray, shape (steps + 1, n, ny)
-        Samples.
+    Shapes: ``level`` of length ny; returns (steps + 1, n, ny).
     """
     rng = generator(Stream.EVALUATION, seed, 1)
     return noisy_output(trajectories.plant or system, trajectories.x, measurement_noise=level, rng=rng)

@@ -38,37 +38,7 @@ def simulate_faults(
 ) -> pd.DataFrame:
     """Simulate sensors that fail in the middle of a trajectory, under the eyes of an observer's monitor.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer with limits for its monitor.
-    system : System
-        What it was made for.
-    trajectories : int
-        Number of trajectories; each has every fault once.
-    duration : float
-        Length of each in seconds.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of starts, inputs and noise.
-    policy : callable, optional
-        Acts on the system, as for :func:`training.teaching.monitor.calibrate`.
-    report : callable, optional
-        Told how many of the ``PARTS`` of the work are done.
-
-    Returns
-    -------
-    DataFrame
-        One row for each trajectory and fault. ``deadline``: seconds within which the fault should be noticed.
-        ``amplitude``: the largest sound |y| after the middle. ``score``: the monitor's highest within the deadline
-        after the fault, or of the whole trajectory where nothing is at fault. ``delay``: seconds until the score
-        exceeded 1, infinite where it never does.
-
-    Raises
-    ------
-    ValueError
-        If the artifact has no limits, or most trajectories leave the system's bounds.
+    Shapes: ``measurement_noise`` of length ny.
     """
     allowed = deadline(system, duration)
     if not allowed <= duration / 2:

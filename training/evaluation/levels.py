@@ -12,23 +12,7 @@ Level = float | tuple[float, ...]  # standard deviation on each sample of y: of 
 
 
 def read_level(text: str) -> Level:
-    """Read what :func:`show_level` writes, or a user.
-
-    Parameters
-    ----------
-    text : str
-        A number, or one for each output with commas between them.
-
-    Returns
-    -------
-    float or tuple of float
-        The level.
-
-    Raises
-    ------
-    ValueError
-        If it is neither.
-    """
+    """Read what :func:`show_level` writes, or a user."""
     try:
         levels = tuple(float(number) for number in text.split(","))
     except ValueError:
@@ -56,17 +40,7 @@ def as_cell(level: Level) -> float | str:
 def multiple(system: System, factor: float) -> Level:
     """Return a multiple of a system's own level of measurement noise.
 
-    Parameters
-    ----------
-    system : System
-        Any system.
-    factor : float
-        The multiple.
-
-    Returns
-    -------
-    float or tuple of float, length ny
-        The level, of all outputs or each.
+    Shapes: returns of length ny.
     """
     return noise_levels("measurement_noise", np.multiply(factor, system.measurement_noise), system.ny)
 
@@ -76,24 +50,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 
     A map that is told one level for all outputs gets the largest of those that are the system's own.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    given : float or sequence of float, length ny, optional
-        What is asked for.
-
-    Returns
-    -------
-    float or tuple of float, length ny
-        The level; a float if it is the same for all outputs.
-
-    Raises
-    ------
-    ValueError
-        If what is given is no level, or not one for each output.
+    Shapes: ``given`` of length ny; returns of length ny.
     """
     if given is not None:
         return noise_levels("measurement_noise", given, system.ny)
@@ -107,17 +64,7 @@ def level_for(artifact: Artifact, system: System, given: Level | None = None) ->
 def beyond(artifact: Artifact, level: Level) -> str:
     """Say why a map cannot be told a level of measurement noise.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    level : float or tuple of float, length ny
-        The level.
-
-    Returns
-    -------
-    str
-        The reason; empty if the map can.
+    Shapes: ``level`` of length ny.
     """
     try:
         if artifact.inverse.within(level) == level:

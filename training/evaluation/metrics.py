@@ -37,22 +37,7 @@ def smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
 def percentage_error(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Symmetric absolute percentage error at each step, whose mean over the steps is :func:`smape`.
 
-    Parameters
-    ----------
-    x, x_hat : ndarray, shape (steps, n, nx)
-        States and estimates.
-    skip : int
-        Number of first steps left out.
-
-    Returns
-    -------
-    ndarray, shape (steps - skip, n)
-        Percent, between 0 and 200.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or no step is left.
+    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (steps - skip, n).
     """
     x, x_hat = _compared(x, x_hat, skip)
     size = np.linalg.norm(x, axis=-1) + np.linalg.norm(x_hat, axis=-1)
@@ -64,22 +49,7 @@ def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarr
 
     This is what the notebooks released with the paper print, after the first 20 % of the steps.
 
-    Parameters
-    ----------
-    x, x_hat : ndarray, shape (steps, n, nx)
-        States and estimates.
-    skip : int
-        Number of first steps left out.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Percent.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or no step is left.
+    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
     """
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(_percentage(np.abs(x - x_hat), np.abs(x) + np.abs(x_hat)).mean((0, 2)))
@@ -88,22 +58,7 @@ def component_smape(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarr
 def rmse(x: np.ndarray, x_hat: np.ndarray, skip: int = 0) -> np.ndarray:
     """Root of the mean over the steps of |x - x_hat|^2.
 
-    Parameters
-    ----------
-    x, x_hat : ndarray, shape (steps, n, nx)
-        States and estimates.
-    skip : int
-        Number of first steps left out.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        In units of the state.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, or no step is left.
+    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
     """
     x, x_hat = _compared(x, x_hat, skip)
     return np.asarray(np.sqrt(((x - x_hat) ** 2).sum(-1).mean(0)))
@@ -150,22 +105,7 @@ def by_state(values: np.ndarray) -> dict[str, np.ndarray]:
 def settling_time(x: np.ndarray, x_hat: np.ndarray, dt: float) -> np.ndarray:
     """Time from which |x - x_hat| stays below a tenth of the root mean square of |x|.
 
-    Parameters
-    ----------
-    x, x_hat : ndarray, shape (steps, n, nx)
-        States and estimates.
-    dt : float
-        Sampling interval in seconds.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Seconds; infinite where it never stays below.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ.
+    Shapes: ``x``, ``x_hat`` (steps, n, nx); returns (n,).
     """
     x, x_hat = _compared(x, x_hat, 0)
     limit = SETTLED * np.sqrt((x**2).sum(-1).mean(0))

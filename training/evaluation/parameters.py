@@ -33,39 +33,7 @@ def parameter_errors(
 ) -> np.ndarray:
     """Errors of estimated parameters after the transient, on a plant or on many from the ranges of the training.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer that estimates parameters.
-    system : System
-        What it was made for.
-    trajectories : int
-        How many, each of a plant of its own.
-    duration : float
-        Length of each in seconds.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int
-        Seed of plants, starts, inputs and noise.
-    process_noise : float
-        Level of the process noise, in multiples of the system's scale per second.
-    driven : bool
-        As for :func:`training.evaluation.errors.unseen_trajectories`.
-    policy : callable, optional
-        As there.
-    plant : System, optional
-        What moves in all trajectories, such as the system with other parameters.
-
-    Returns
-    -------
-    ndarray, shape (number,)
-        Root mean square error of each, in percent of the parameter's value.
-
-    Raises
-    ------
-    ValueError
-        If the artifact estimates no parameters, a level of noise is none or beyond its range, or every trajectory left
-        the system's bounds.
+    Shapes: ``measurement_noise`` of length ny; returns (number,).
     """
     nx, estimated = system.nx, artifact.estimated_parameters
     moving = plant or with_parameters(system, {name: artifact.parameter_ranges[name] for name in estimated})

@@ -25,19 +25,6 @@ def write_report(
     Where no T was learned, the error by noise level takes the place of the residual. The trajectories shown are
     unseen, without process noise and input but a policy's, and not those that ``kkl-gym evaluate`` takes. Above each
     state stands its NRMSE after the transient, the median of 20 of them.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    result : Result
-        What the training made.
-    system : System
-        What it was made for.
-    policy : callable, optional
-        Acts on the system, with errors and exploration.
-    seed : int
-        Seed of the trajectories and their noise.
     """
     artifact = result.artifact
     seconds = min(20.0 * system.pace, artifact.training["duration"])
@@ -95,22 +82,7 @@ def _draw_noise_levels(ax: Any, result: Result, system: System, trajectories: Un
 
 
 def draw_residual(ax: Any, artifact: Artifact, system: System) -> None:
-    """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X.
-
-    Parameters
-    ----------
-    ax : matplotlib.axes.Axes
-        Where to draw; its figure gets a colour bar.
-    artifact : Artifact
-        An observer with a forward map.
-    system : System
-        What it was made for.
-
-    Raises
-    ------
-    ValueError
-        If the artifact holds no forward map.
-    """
+    """Draw the size of the PDE's residual over the plane of the phase portrait, other states at the centre of X."""
     from matplotlib.colors import LogNorm
 
     points = 150  # along each axis

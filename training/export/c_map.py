@@ -16,19 +16,7 @@ SQUARE = "#ifndef SQUARE\n#define SQUARE(a) ((a) * (a))\n#endif\n"
 
 @dataclass(frozen=True)
 class Level:
-    """A level of noise as a macro.
-
-    Parameters
-    ----------
-    macro : str
-        Its name. ``CUT_`` before it makes what T_inv is told.
-    meaning : str
-        For people.
-    value : float
-        Unless the compiler is told another.
-    end : float
-        The highest that T_inv is told.
-    """
+    """A level of noise as a macro."""
 
     macro: str
     meaning: str

@@ -14,23 +14,7 @@ from training.export.exported import Exported
 
 
 def c_files(exported: Exported) -> dict[str, str]:
-    """Write the observer in C.
-
-    Parameters
-    ----------
-    exported : Exported
-        The observer. Its levels of noise are those that the source assumes unless the compiler is told others.
-
-    Returns
-    -------
-    dict of str to str
-        By the names of the files: ``NAME.h``, ``NAME.c``, and ``NAME_main.c``, a program around them.
-
-    Raises
-    ------
-    ArtifactError
-        If it tracks, and its output is not linear.
-    """
+    """Write the observer in C."""
     exported.refuse_nonlinear("C")
     name, words = exported.name, _words(exported)
     return {

@@ -27,22 +27,7 @@ _MOST_SAMPLES = 2**32 - 1  # that C's unsigned long can count everywhere
 class Exported:
     """An observer as it leaves this package.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        What was learned.
-    name : str
-        An identifier of C.
-    source : str
-        The file's name, for people.
-    checksum : str
-        Of what the file holds, as :func:`observers.storage.checksum` has it.
-    precision : {"float", "double"}
-        Of the network, of samples and of estimates.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample that is assumed, of all outputs or each.
-    process_noise : float
-        Level of process noise that is assumed, in multiples of the system's scale per second.
+    Shapes: ``measurement_noise`` of length ny.
     """
 
     artifact: Artifact
@@ -64,28 +49,7 @@ class Exported:
     ) -> "Exported":
         """Read an observer that is to be exported.
 
-        Parameters
-        ----------
-        name_or_path : str or PathLike
-            A shipped name, or a ``.safetensors`` file.
-        precision : {"float", "double"}, default "float"
-            As the attribute.
-        measurement_noise : float or tuple of float, length ny, optional
-            As for :class:`observers.KKLObserver`.
-        process_noise : float, optional
-            As for :class:`observers.KKLObserver`.
-
-        Returns
-        -------
-        Exported
-            The observer.
-
-        Raises
-        ------
-        ArtifactError
-            If there is no such observer, its file is damaged, or a number of it is beyond the range of floats.
-        ValueError
-            If the precision is unknown, or a level of noise is out of range.
+        Shapes: ``measurement_noise`` of length ny.
         """
         choice("precision", precision, PRECISIONS)
         text, path = os.fspath(name_or_path), resolve(name_or_path)
@@ -105,18 +69,7 @@ class Exported:
         return exported
 
     def refuse_nonlinear(self, what: str) -> None:
-        """See that it does not track by an output that is not linear.
-
-        Parameters
-        ----------
-        what : str
-            What takes no other.
-
-        Raises
-        ------
-        ArtifactError
-            If it does.
-        """
+        """See that it does not track by an output that is not linear."""
         if self.artifact.flow is not None and self.artifact.C is None:
             raise ArtifactError(
                 f"{self.source} tracks by an output h(x) that is not linear, and {what} takes y = C x alone: export "
@@ -210,18 +163,7 @@ class Exported:
 
 
 def identifier(name: str) -> str:
-    """Make an identifier of C of an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``.
-
-    Parameters
-    ----------
-    name : str
-        Any text.
-
-    Returns
-    -------
-    str
-        Letters of ASCII, digits and underscores, a letter first.
-    """
+    """Make an identifier of C of an observer's name: ``lorenz-spinn`` becomes ``lorenz_spinn``."""
     word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     return word if word[:1].isalpha() else f"observer_{word}".rstrip("_")
 

@@ -11,17 +11,7 @@ FLAGS = ("-std=c99", "-O2")
 
 @dataclass(frozen=True)
 class Footprint:
-    """Memory of an observer in C, in bytes.
-
-    Parameters
-    ----------
-    flash : int
-        Code and constants.
-    static : int
-        Variables of the source itself.
-    state : int
-        The struct of one observer.
-    """
+    """Memory of an observer in C, in bytes."""
 
     flash: int
     static: int
@@ -35,18 +25,7 @@ class Footprint:
 
 
 def footprint(source: Path) -> Footprint | None:
-    """Compile exported C and look at the object.
-
-    Parameters
-    ----------
-    source : Path
-        ``NAME.c``, beside its header.
-
-    Returns
-    -------
-    Footprint or None
-        None where there is no ``cc`` or no ``size``, or they are of another kind.
-    """
+    """Compile exported C and look at the object."""
     cc, size = shutil.which("cc"), shutil.which("size")
     if cc is None or size is None:
         return None

@@ -24,23 +24,6 @@ def onnx_model(exported: Exported) -> Any:
     and ``process_noise``. The outputs are ``z_next`` (size) and ``x_hat`` (nx, and estimated parameters). A row of age
     0 begins: its z, y and u count for nothing. An observer that tracks has ``tracker`` and ``tracker_next`` beside z,
     which hold y as well, and takes a y_next of NaN for missing. docs/guides/export.md says more.
-
-    Parameters
-    ----------
-    exported : Exported
-        The observer. Its levels of noise are named in the metadata alone.
-
-    Returns
-    -------
-    onnx.ModelProto
-        The model.
-
-    Raises
-    ------
-    ArtifactError
-        If it tracks, and its output is not linear.
-    ModuleNotFoundError
-        Without the extra ``onnx``.
     """
     from onnx import checker, helper
 

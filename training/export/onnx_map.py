@@ -13,36 +13,14 @@ from training.export.onnx_nodes import Graph
 
 @dataclass(frozen=True)
 class Read:
-    """What the networks of a map are given.
-
-    Parameters
-    ----------
-    inverse : InverseMap
-        The map.
-    signals : list of str
-        All but the age, (n, ...) each.
-    """
+    """What the networks of a map are given."""
 
     inverse: InverseMap
     signals: list[str]
 
 
 class Maps:
-    """The maps of an observer at a step: that of driven motion, and where there is one that of free motion.
-
-    Parameters
-    ----------
-    graph : Graph
-        What receives the nodes.
-    exported : Exported
-        The observer.
-    z : str
-        The filter's state, (n, size).
-    given : dict of str to str
-        ``measurement_noise`` and ``process_noise``, as far as the maps are told, in doubles.
-    real : numpy type
-        Of the networks.
-    """
+    """The maps of an observer at a step: that of driven motion, and where there is one that of free motion."""
 
     def __init__(self, graph: Graph, exported: Exported, z: str, given: dict[str, str], real: Any) -> None:
         self._graph, self._given, self._real, self._dt = graph, given, real, exported.artifact.filter.dt

@@ -27,19 +27,7 @@ def state_width(artifact: Artifact) -> int:
 
 
 class TrackerNodes:
-    """The step of a tracker, in two parts: between them the filter takes in the sample.
-
-    Parameters
-    ----------
-    graph : Graph
-        What receives the nodes.
-    artifact : Artifact
-        The observer.
-    given : dict of str to str
-        What the graph is given, in doubles.
-    real : numpy type
-        Of the networks.
-    """
+    """The step of a tracker, in two parts: between them the filter takes in the sample."""
 
     def __init__(self, graph: Graph, artifact: Artifact, given: dict[str, str], real: Any) -> None:
         assert artifact.C is not None

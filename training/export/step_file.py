@@ -29,22 +29,7 @@ def javascript() -> str:
 
 
 def write_step(path: str | os.PathLike[str], exported: Exported) -> None:
-    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, limits of the monitor.
-
-    Parameters
-    ----------
-    path : str or PathLike
-        The file.
-    exported : Exported
-        The observer. Its levels of noise are those that are assumed until ``Observer.tell`` is told others.
-
-    Raises
-    ------
-    ArtifactError
-        If it tracks, and its output is not linear.
-    OSError
-        If the file cannot be written.
-    """
+    """Write what a step needs to a safetensors file: matrices of the filter at its dt, maps, limits of the monitor."""
     exported.refuse_nonlinear("JavaScript")
     artifact, linear = exported.artifact, exported.artifact.filter
     nz = len(linear.A)

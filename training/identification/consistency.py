@@ -34,16 +34,7 @@ FITTED = 100_000  # samples from which the filter's coordinates are found
 class Filtered:
     """A filter's state beside records, from where it has forgotten its start.
 
-    Parameters
-    ----------
-    z : list of ndarray, each of shape (m, size)
-        Of each record.
-    y : list of ndarray, each of shape (m, ny)
-        Measured at the same times.
-    u : list of ndarray, each of shape (m, nu)
-        Held from then on.
-    noise : ndarray, shape (ny,)
-        Standard deviation of the measurement noise, as differences of neighbouring samples show it.
+    Shapes: ``z`` (m, size), ``y`` (m, ny), ``u`` (m, nu), ``noise`` (ny,).
     """
 
     z: list[np.ndarray]
@@ -53,22 +44,7 @@ class Filtered:
 
 
 def filtered(records: Sequence[Record], linear: LinearFilter, first: int) -> Filtered:
-    """Run a filter along records.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Without gaps, at the filter's sampling interval, and longer than what it remembers.
-    linear : LinearFilter
-        The filter; it takes in as many inputs as it has.
-    first : int
-        Samples after which it has forgotten its start.
-
-    Returns
-    -------
-    Filtered
-        All of them, in their order.
-    """
+    """Run a filter along records."""
     z = [run_filter(record, linear, np.arange(first, len(record.t))) for record in records]
     u = [np.zeros((len(record.t), linear.nu)) if record.u is None else record.u for record in records]
     return Filtered(z, [record.y[first:] for record in records], [inputs[first:] for inputs in u], noise_level(records))
@@ -90,23 +66,7 @@ def noise_level(records: Sequence[Record]) -> np.ndarray:
 
 
 class ConsistencyProblem(nn.Module):
-    """A network from z to x and the parameters' logarithms, with what both have to fulfil.
-
-    Parameters
-    ----------
-    system : System
-        The model, with first guesses of its parameters.
-    unknown : mapping of str to (float, float)
-        Limits of the parameters that are unknown.
-    data : Filtered
-        What was measured.
-    linear : LinearFilter
-        The filter that made it.
-    width, depth : int
-        Of the network.
-    batch : int
-        Samples in a batch.
-    """
+    """A network from z to x and the parameters' logarithms, with what both have to fulfil."""
 
     def __init__(
         self,
@@ -169,18 +129,7 @@ class ConsistencyProblem(nn.Module):
         return (self._centre + self._half * self.network(modes)).clamp(self._low, self._high).double().numpy()
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """How far estimates are from explaining outputs, and from following the equations.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss", and its parts "output" and "dynamics".
-        """
+        """How far estimates are from explaining outputs, and from following the equations."""
         rows = self._pairs[torch.randint(len(self._pairs), (self._batch,), generator=generator)]
         modes = torch.cat([self._modes[rows], self._modes[rows + HORIZON]])
         before, after = (self._centre + self._half * self.network(modes)).split(self._batch)

@@ -21,15 +21,7 @@ POINTS = 64
 def hidden_directions(information: np.ndarray) -> np.ndarray:
     """Find the changes of parameters that leave the outputs as they are, or nearly.
 
-    Parameters
-    ----------
-    information : ndarray, shape (p, p)
-        Fisher information of the parameters, each in units of its own size.
-
-    Returns
-    -------
-    ndarray, shape (p, k)
-        Orthonormal columns; none if the outputs tell all parameters.
+    Shapes: ``information`` (p, p); returns (p, k).
     """
     values, vectors = np.linalg.eigh(information)
     return vectors[:, (values <= NOTHING * values[-1]) | (values <= HARDLY**-2)]
@@ -38,15 +30,7 @@ def hidden_directions(information: np.ndarray) -> np.ndarray:
 def told_directions(information: np.ndarray) -> np.ndarray:
     """Find the changes of parameters that the outputs show, however faintly.
 
-    Parameters
-    ----------
-    information : ndarray, shape (p, p)
-        Fisher information of the parameters.
-
-    Returns
-    -------
-    ndarray, shape (p, k)
-        Orthonormal columns.
+    Shapes: ``information`` (p, p); returns (p, k).
     """
     values, vectors = np.linalg.eigh(information)
     return vectors[:, values > NOTHING * max(values[-1], 0.0)]
@@ -55,17 +39,7 @@ def told_directions(information: np.ndarray) -> np.ndarray:
 def combinations(names: Sequence[str], hidden: np.ndarray) -> list[dict[str, Fraction | float]]:
     """Products of powers of parameters that outputs tell, where they do not tell all parameters one by one.
 
-    Parameters
-    ----------
-    names : sequence of str, length p
-        The parameters.
-    hidden : ndarray, shape (p, k)
-        As :func:`hidden_directions` finds them at these parameters, in units of their own size.
-
-    Returns
-    -------
-    list of dict of str to Fraction or float
-        Exponents by name, for each product; p - k of them. A parameter that is told by itself is a product of its own.
+    Shapes: ``names`` of length p, ``hidden`` (p, k).
     """
     p, k = hidden.shape
     if p == k:
@@ -99,22 +73,7 @@ def written(powers: dict[str, Fraction | float]) -> str:
 
 
 def sign_symmetries(system: System, parameters: Sequence[str], *, driven: bool = False) -> list[tuple[str, ...]]:
-    """States and parameters that may change sign together without any change of the outputs.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    parameters : sequence of str
-        The parameters that may change sign.
-    driven : bool, default False
-        Whether inputs acted, which do not change their sign with states.
-
-    Returns
-    -------
-    list of tuple of str
-        Names of what changes sign, for each symmetry.
-    """
+    """States and parameters that may change sign together without any change of the outputs."""
     values = system.parameters
     ranges = {name: _around(values[name]) for name in parameters}
     both = with_parameters(system, ranges)

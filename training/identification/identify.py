@@ -43,15 +43,7 @@ Limits = Mapping[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Product:
-    """A product of powers of parameters that the outputs tell.
-
-    Parameters
-    ----------
-    powers : dict of str to Fraction or float
-        Exponents by parameter; of a parameter that is told by itself, its own, 1.
-    value, standard_error : float
-        Of the product.
-    """
+    """A product of powers of parameters that the outputs tell."""
 
     powers: dict[str, Fraction | float]
     value: float
@@ -67,31 +59,7 @@ class Product:
 class Identified:
     """Parameters that records of outputs tell, and those that they do not.
 
-    Parameters
-    ----------
-    system : System
-        With the parameters found. Those that outputs do not tell have the values nearest to the first guesses that
-        explain the outputs as well as any.
-    standard_errors : dict of str to float or None
-        Of the parameters that were unknown; None for those that the outputs do not tell.
-    products : list of Product
-        What the outputs tell.
-    at_limits : tuple of str
-        Parameters that went as far as they were allowed to.
-    hanging_states : tuple of str
-        States that change with what the outputs do not tell, so that their units are those of the first guesses.
-    symmetries : list of tuple of str
-        States and parameters that may change their sign together and leave the outputs as they are.
-    noise : ndarray, shape (ny,)
-        Standard deviations of the residuals of the outputs.
-    expected_noise : ndarray, shape (ny,)
-        Those of the noise, as differences of neighbouring samples show it.
-    fit : Fit
-        What shooting found.
-    predictions : list of Prediction
-        Of records that took no part.
-    history : list of (int, dict)
-        Parameters by batch, while the network was trained; empty without one.
+    Shapes: ``noise`` (ny,), ``expected_noise`` (ny,).
     """
 
     system: System
@@ -176,39 +144,6 @@ def estimate_parameters(
     2. Shooting refines parameters and states over windows of growing length, from the rough ones or from those given
        (:mod:`training.identification.windows`), and says how well each is known.
     3. What the outputs do not tell goes back to what was given, as far as they allow.
-
-    Parameters
-    ----------
-    system : System
-        The model. Its parameters are the first guesses.
-    unknown : mapping of str to (float, float)
-        Lowest and highest value of each parameter that is unknown.
-    records : sequence of Record
-        On a uniform grid, of one plant; gaps are NaN.
-    folder : Path
-        Where checkpoints go.
-    progress : ProgressBars
-        Where progress is shown.
-    observer : Artifact, optional
-        An observer to begin with, for a system that is like it.
-    seed : int
-        Of the network.
-    steps : int
-        Its batches.
-    log : callable, optional
-        Takes scalars, as for :func:`training.maps.optimise.optimise`.
-    resume : bool
-        Whether to go on from checkpoints.
-
-    Returns
-    -------
-    Identified
-        What was found.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is unknown to the system, no record is long enough, or no window of them can be explained.
     """
     _check_unknown(system, unknown)
     check_signals(records, system)
@@ -352,19 +287,7 @@ def nearest(values: np.ndarray, given: np.ndarray, hidden: np.ndarray) -> np.nda
     A parameter of which they say nothing at all stays as it was given. Of the others near is what keeps their ratios to
     each other: a plant that is faster by a factor has them all larger.
 
-    Parameters
-    ----------
-    values : ndarray, shape (p,)
-        Parameters that explain the outputs.
-    given : ndarray, shape (p,)
-        The first guesses.
-    hidden : ndarray, shape (p, k)
-        Directions of relative changes that outputs do not tell.
-
-    Returns
-    -------
-    ndarray, shape (p,)
-        The parameters; those whose sign has changed stay as they are.
+    Shapes: ``values`` (p,), ``given`` (p,), ``hidden`` (p, k); returns (p,).
     """
     silent = (hidden**2).sum(1) > 1.0 - TOLD**2
     if silent.any():

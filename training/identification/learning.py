@@ -33,15 +33,7 @@ OBSERVER_FOLDER = "observer"
 
 @dataclass(frozen=True)
 class Learned:
-    """What records of outputs taught.
-
-    Parameters
-    ----------
-    identified : Identified
-        The parameters, and what the outputs do not tell.
-    result : Result
-        The observer for the plant with these parameters, and its training.
-    """
+    """What records of outputs taught."""
 
     identified: Identified
     result: Result

@@ -21,14 +21,7 @@ MOST_ROWS = 60_000  # motions simulated at once
 class Windows:
     """Equally long stretches of records, each with a start of its own.
 
-    Parameters
-    ----------
-    y : ndarray, shape (steps + 1, n, ny)
-        Measured outputs; NaN where one is missing.
-    u : ndarray, shape (steps, n, nu)
-        Inputs that acted.
-    x0 : ndarray, shape (n, nx)
-        Estimates of the state at their starts.
+    Shapes: ``y`` (steps + 1, n, ny), ``u`` (steps, n, nu), ``x0`` (n, nx).
     """
 
     y: np.ndarray
@@ -39,16 +32,7 @@ class Windows:
 class Shooting:
     """The least squares of one set of windows.
 
-    Parameters
-    ----------
-    system : System
-        The model, whose other parameters are right.
-    dt : float
-        Sampling interval in seconds.
-    limits : mapping of str to (float, float)
-        Lowest and highest value of each unknown parameter.
-    unit : ndarray, shape (p,)
-        Size of a change of each parameter.
+    Shapes: ``unit`` (p,).
     """
 
     def __init__(self, system: System, dt: float, limits: Mapping[str, tuple[float, float]], unit: np.ndarray) -> None:
@@ -87,14 +71,7 @@ class Shooting:
 class Motions:
     """Starts of windows with what follows from them.
 
-    Parameters
-    ----------
-    x0 : ndarray, shape (n, nx)
-        The starts.
-    y, r : ndarray, shape (steps + 1, n, ny)
-        Predicted outputs, and residuals, which are zero where nothing was measured.
-    each : ndarray, shape (n,)
-        Mean squares of each window's residuals, over the outputs' variances; inf where it leaves the bounds.
+    Shapes: ``x0`` (n, nx), ``y``, ``r`` (steps + 1, n, ny), ``each`` (n,).
     """
 
     x0: np.ndarray

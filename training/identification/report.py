@@ -15,17 +15,7 @@ SHOWN = 3  # records that took no part
 def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
     """Correlation of residuals with those of so many samples before.
 
-    Parameters
-    ----------
-    residuals : ndarray, shape (steps + 1, n)
-        Of some windows; NaN where nothing was measured.
-    lags : int
-        The largest distance.
-
-    Returns
-    -------
-    ndarray, shape (lags,)
-        From a distance of one sample on.
+    Shapes: ``residuals`` (steps + 1, n); returns (lags,).
     """
     r = residuals - np.nanmean(residuals)
     products = [np.nanmean(r[lag:] * r[:-lag]) for lag in range(1, min(lags, len(r) - 1) + 1)]
@@ -33,15 +23,7 @@ def autocorrelation(residuals: np.ndarray, lags: int) -> np.ndarray:
 
 
 def write_report(path: Path, found: Identified) -> None:
-    """Draw the course of the parameters, if a network found them first, predictions of records left out, and residuals.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    found : Identified
-        What was identified.
-    """
+    """Draw the parameters over the fit, if a network started it, predictions of held-out records, and residuals."""
     shown = found.predictions[:SHOWN]
     with drawing(path, 12, 3.2 + 2.2 * len(shown)) as figure:
         grid = figure.add_gridspec(1 + len(shown), 2)

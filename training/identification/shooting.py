@@ -34,34 +34,8 @@ class UnexplainedError(ValueError):
 class Fit:
     """What shooting found.
 
-    Parameters
-    ----------
-    parameters : dict of str to float
-        The parameters that were unknown.
-    windows : Windows
-        With the starts found.
-    residuals : ndarray, shape (steps + 1, n, ny)
-        Measured minus predicted outputs; NaN where one is missing or a motion left the bounds.
-    noise : ndarray, shape (ny,)
-        Their standard deviations.
-    information : ndarray, shape (p, p)
-        Fisher information of the parameters in units of ``unit``, where starts are unknown.
-    unit : ndarray, shape (p,)
-        Of each parameter.
-    curvature, white, scattered : ndarray, shape (p, p)
-        What a covariance of the parameters is made of, in the same units: the second derivative of the squares that
-        were minimised, and the covariance of their gradient, as white noise makes it and as windows show it.
-    used : ndarray of bool, shape (n,)
-        Windows that the model explains; the others count little or nothing.
-    cost : float
-        Mean square of the residuals of those windows, over each output's variance.
-    left : float
-        Length of the step to the least squares that is still to be made, in standard errors for white noise; chaos,
-        and what rounding makes of it, may stand in its way.
-    starts_by_parameters : ndarray, shape (number used, nx, p)
-        How the starts that fit best, over X's half-widths, follow the parameters, over their units.
-    claims : int
-        Windows used that tell more of a parameter than all ordinary ones together, or seem to.
+    Shapes: ``residuals`` (steps + 1, n, ny), ``noise`` (ny,), ``information`` (p, p), ``unit`` (p,), ``curvature``,
+    ``white``, ``scattered`` (p, p), ``used`` (n,), ``starts_by_parameters`` (number used, nx, p).
     """
 
     parameters: dict[str, float]
@@ -86,17 +60,7 @@ class Fit:
         the same size do. The gradients of windows, each with a start of its own, show by how much (the sandwich
         estimator for clustered data). Those of few windows would show too little, and are left out.
 
-        Parameters
-        ----------
-        directions : ndarray, shape (p, k)
-            In units of ``unit``.
-        known : ndarray, shape (p, m)
-            A basis of what the outputs tell, likewise.
-
-        Returns
-        -------
-        ndarray, shape (k,)
-            The standard errors; what the outputs do not tell of a direction counts nothing.
+        Shapes: ``directions`` (p, k), ``known`` (p, m); returns (k,).
         """
         kinds = [self.white, self.scattered] if self.used.sum() >= CLUSTERS else [self.white]
         return np.max([self._errors(directions, known, kind) for kind in kinds], axis=0)
@@ -139,19 +103,7 @@ def predictable(shooting: Shooting, fit: Fit, windows: Windows) -> np.ndarray:
 
     Beyond that, chaos makes least squares blind: they have many minima, and their curvature says nothing of errors.
 
-    Parameters
-    ----------
-    shooting : Shooting
-        The problem.
-    fit : Fit
-        What is known of the parameters, from shorter windows.
-    windows : Windows
-        Longer ones.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        False where a change by a standard error is off by more than a part of the noise.
+    Shapes: returns (n,).
     """
     theta, problem = np.array(list(fit.parameters.values())), Problem(shooting, windows)
     at = problem.follow(theta, settled(shooting, theta, windows), problem.rows)
@@ -219,32 +171,7 @@ def shoot(
     for others, as of friction, tell the ``noise`` instead. All windows count then, by the share 1 / (1 + mean square of
     their residuals over the noise's): the less, the worse they are explained.
 
-    Parameters
-    ----------
-    shooting : Shooting
-        The problem.
-    theta : ndarray, shape (p,)
-        Parameters to begin with.
-    windows : Windows
-        The data, with starts to begin with.
-    precision : float
-        Size of a step, in standard errors of the parameters, from which on they are good enough.
-    rounds : int
-        Most steps.
-    noise : sequence of float, length ny, optional
-        Standard deviation of each output's residuals where the model is good.
-
-    Returns
-    -------
-    Fit
-        What was found.
-
-    Raises
-    ------
-    UnexplainedError
-        If the motions of all windows leave the system's bounds.
-    ValueError
-        If ``noise`` is not a positive number for each output.
+    Shapes: ``theta`` (p,), ``noise`` of length ny.
     """
     deviations = None if noise is None else np.asarray(noise, dtype=float)
     if deviations is not None and (deviations.shape != windows.y.shape[-1:] or not (deviations > 0).all()):
@@ -380,23 +307,8 @@ def _fit(problem: Problem, theta: np.ndarray, at: Motions, used: np.ndarray) -> 
 def _beyond_starts(J: np.ndarray, weight: np.ndarray, nx: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What parameters change in the outputs beyond what starts make up for.
 
-    Parameters
-    ----------
-    J : ndarray, shape (steps + 1, n, ny, nx + p)
-        Derivatives of the outputs by starts and parameters.
-    weight : ndarray, shape (ny,)
-        Of the squares of each output.
-    nx : int
-        Number of states.
-
-    Returns
-    -------
-    curvature : ndarray, shape (n, p, p)
-        Of half the sum of squares of each window by the parameters, with the best start for each.
-    beyond : ndarray, shape (steps + 1, n, ny, p)
-        Derivatives of the outputs by the parameters, likewise.
-    by_parameters : ndarray, shape (n, nx, p)
-        Those of the best starts.
+    Shapes: ``J`` (steps + 1, n, ny, nx + p), ``weight`` (ny,); returns ``curvature`` (n, p, p), ``beyond`` (steps + 1,
+    n, ny, p), ``by_parameters`` (n, nx, p).
     """
     H = np.einsum("knya,knyb,y->nab", J, J, weight, optimize=True)
     by_parameters = -np.linalg.pinv(H[:, :nx, :nx], rcond=1e-13, hermitian=True) @ H[:, :nx, nx:]

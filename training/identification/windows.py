@@ -47,30 +47,7 @@ def fit_windows(
     scatter of windows fall no further. Chaos also makes many minima. So longer windows are fitted from two sides, a
     standard error of the shorter ones away, and count only if both fits come to rest, and in one place.
 
-    Parameters
-    ----------
-    shooting : Shooting
-        The problem.
-    guesses : sequence of ndarray, shape (p,) each
-        Parameters to begin with, one after the other until windows of a length can be explained from one.
-    records : sequence of Record
-        Without gaps, on the grid of the shooting.
-    guess : callable
-        Record and samples in, estimates of the states there, (n, nx), out.
-    first : int
-        The first sample of each record for which there is a guess.
-    report : callable, optional
-        Told what was found at each length.
-
-    Returns
-    -------
-    Fit
-        At the length that says most.
-
-    Raises
-    ------
-    UnexplainedError
-        If no window of any length can be explained.
+    Shapes: ``guesses`` (p,) each.
     """
     longest = min(max(len(record.y) for record in records) - 1 - first, MOST_SAMPLES)
     best, starts, length = _first_fit(shooting, guesses, records, guess, first=first, longest=longest)
@@ -176,19 +153,7 @@ def _unsettled(fit: Fit) -> tuple[bool, float]:
 def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarray], length: int) -> Windows:
     """Cut windows of one length out of records.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        Without gaps.
-    starts : mapping of (int, int) to ndarray
-        Estimates of the state by record and first sample of each window.
-    length : int
-        Samples from a window's first to its last.
-
-    Returns
-    -------
-    Windows
-        In the order of the starts.
+    Shapes: ``length`` of length : int.
     """
 
     def cut(values: Sequence[np.ndarray], samples: int) -> np.ndarray:
@@ -202,16 +167,7 @@ def windows(records: Sequence[Record], starts: Mapping[tuple[int, int], np.ndarr
 class Prediction:
     """Outputs of a window of a record that took no part in the fit, predicted from the window's first half.
 
-    Parameters
-    ----------
-    record : Record
-        Of which it is a part.
-    first : int
-        The window's first sample.
-    y : ndarray, shape (steps + 1, ny)
-        Predicted outputs.
-    fitted : int
-        Samples from which the start of the motion was found; the others are foretold.
+    Shapes: ``y`` (steps + 1, ny).
     """
 
     record: Record
@@ -230,25 +186,7 @@ def predict(
 ) -> list[Prediction]:
     """Predict the outputs of records from half of a window at their beginning.
 
-    Parameters
-    ----------
-    shooting : Shooting
-        The problem.
-    theta : ndarray, shape (p,)
-        Parameters found.
-    records : sequence of Record
-        Any that took no part.
-    guess : callable
-        As for :func:`fit_windows`.
-    first : int
-        As there.
-    length : int
-        Samples of a window.
-
-    Returns
-    -------
-    list of Prediction
-        One for each record that is long enough.
+    Shapes: ``theta`` (p,), ``length`` of length : int.
     """
     chosen = [record for record in records if len(record.y) > first + length]
     if not chosen:

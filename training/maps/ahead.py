@@ -29,12 +29,7 @@ JUDGED = 1000  # courses that are not learned from
 class Courses:
     """Motions from many states, over up to ``SAMPLES`` samples, each under an input that is held.
 
-    Parameters
-    ----------
-    x : ndarray, shape (samples + 1, n, nx)
-        States.
-    u : ndarray, shape (n, nu)
-        Inputs.
+    Shapes: ``x`` (samples + 1, n, nx), ``u`` (n, nu).
     """
 
     x: np.ndarray
@@ -44,23 +39,7 @@ class Courses:
 def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float, *, samples: int = SAMPLES) -> Courses:
     """Simulate motions.
 
-    Parameters
-    ----------
-    system : System
-        What moves.
-    x : ndarray, shape (n, nx)
-        Where it starts; the first ``COURSES`` are taken.
-    u : ndarray, shape (n, nu)
-        The input of each, or of no columns where none acts.
-    dt : float
-        Sampling interval in seconds.
-    samples : int
-        How long they are, ``SAMPLES`` at most.
-
-    Returns
-    -------
-    Courses
-        Those that stay within the system's bounds; none of a system that becomes too fast to be simulated on the way.
+    Shapes: ``x`` (n, nx), ``u`` (n, nu).
     """
     x, u, samples = x[:COURSES], u[:COURSES], min(samples, SAMPLES)
     try:
@@ -74,29 +53,7 @@ def draw_courses(system: System, x: np.ndarray, u: np.ndarray, dt: float, *, sam
 def learn_ahead(
     flow: Flow, courses: Courses, *, steps: int, seed: int, progress: ProgressBars, device: torch.device | None = None
 ) -> Flow:
-    """Teach a flow that knows single samples what many of them add up to.
-
-    Parameters
-    ----------
-    flow : Flow
-        What is known.
-    courses : Courses
-        Motions of the same sampling interval.
-    steps : int
-        Batches, one at least.
-    seed : int
-        Of the batches.
-    progress : ProgressBars
-        Where a bar is shown.
-    device : torch.device, optional
-        Where it is trained; by default on the CPU.
-
-    Returns
-    -------
-    Flow
-        One that is off by less, in the median, on courses that were not learned from. The same flow where it is hardly
-        ever late, nothing is gained, or there are too few courses to judge by.
-    """
+    """Teach a flow that knows single samples what many of them add up to."""
     if courses.x.shape[1] < 2 * JUDGED:
         return flow
     problem = AheadProblem(flow, courses, device=device or torch.device("cpu"))
@@ -118,20 +75,6 @@ class AheadProblem(nn.Module):
 
     The network is trained, and the polynomial: its terms that are 0 stay so. Both in double precision, as rounding adds
     up too.
-
-    Parameters
-    ----------
-    flow : Flow
-        Where to begin.
-    courses : Courses
-        What it is to follow, more than ``JUDGED``.
-    device : torch.device
-        Where it is trained.
-
-    Attributes
-    ----------
-    before : float
-        What :meth:`judged` said of that flow.
     """
 
     def __init__(self, flow: Flow, courses: Courses, *, device: torch.device) -> None:
@@ -164,18 +107,7 @@ class AheadProblem(nn.Module):
             return float(self._squares(torch.arange(JUDGED, device=self._s.device)).median().sqrt())
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean logarithm of the squared errors of a batch, which large ones hardly move.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss", and "error", the root of the median squared error.
-        """
+        """Mean logarithm of the squared errors of a batch, which large ones hardly move."""
         rows = torch.randint(JUDGED, self._s.shape[1], (BATCH,), generator=generator, device=self._s.device)
         squares = self._squares(rows)
         loss = torch.log1p(squares / (TAIL * self.before**2)).mean()

@@ -19,14 +19,7 @@ class Coordinates:
     The components of z are nearly collinear, with variances that spread over ten orders of magnitude; a network
     in float32 cannot read them unless they are whitened.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (size,)
-        What is subtracted from z.
-    whiten : ndarray, shape (modes, size)
-        What the rest is multiplied by; rows are sorted by falling ratio of signal to noise.
-    noise_gain : ndarray, shape (modes,)
-        Standard deviation of each coordinate's noise where that of y is 1.
+    Shapes: ``offset`` (size,), ``whiten`` (modes, size), ``noise_gain`` (modes,).
     """
 
     offset: np.ndarray
@@ -41,19 +34,7 @@ class Coordinates:
 def coordinates(z: np.ndarray, noise: np.ndarray, silent: np.ndarray | None = None) -> Coordinates:
     """Find the coordinates for a filter's states.
 
-    Parameters
-    ----------
-    z : ndarray, shape (n, size)
-        Samples without noise.
-    noise : ndarray, shape (size, size)
-        Covariance of the noise in z where the standard deviation of that on y is 1.
-    silent : ndarray, shape (size, k), optional
-        Directions in which z says nothing: coordinates do not change along them.
-
-    Returns
-    -------
-    Coordinates
-        Without the directions that hold rounding errors only.
+    Shapes: ``z`` (n, size), ``noise`` (size, size), ``silent`` (size, k).
     """
     if silent is not None and silent.size:
         telling = np.eye(len(silent)) - silent @ np.linalg.pinv(silent)

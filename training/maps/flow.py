@@ -52,12 +52,7 @@ LEAST = 0.01  # of the mean square of scaled increments, added to it: errors of 
 class Increments:
     """States, inputs, and how states change over a sample.
 
-    Parameters
-    ----------
-    x, u, change : ndarray, shapes (n, nx), (n, nu) and (n, nx)
-        In their own units.
-    x_offset, x_scale : ndarray, shape (nx,)
-        Mean and standard deviation of the states along the motions that these lie about.
+    Shapes: ``x``, ``u``, ``change`` (n, nx), (n, nu) and (n, nx), ``x_offset``, ``x_scale`` (nx,).
     """
 
     x: np.ndarray
@@ -80,28 +75,7 @@ def draw_increments(
     rng: np.random.Generator,
     policy: Controller | None = None,
 ) -> Increments:
-    """Simulate motions, and from states about them one sample further.
-
-    Parameters
-    ----------
-    system : System
-        What moves.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length of the motions in seconds.
-    nu : int
-        Number of inputs that the observer knows of: the system's, or 0, which then do not act.
-    rng : numpy.random.Generator
-        Of everything random.
-    policy : callable, optional
-        Acts on the motions in place of random inputs, where the observer knows of inputs.
-
-    Returns
-    -------
-    Increments
-        Up to ``PAIRS`` of them; those that leave the system's bounds are left out.
-    """
+    """Simulate motions, and from states about them one sample further."""
     steps = round(duration / dt)
     kinds: list[Motions] = [] if policy and nu else [Motions(box_factor=REACH)]
     if nu:
@@ -136,26 +110,7 @@ def _log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> np.ndar
 class FlowProblem(nn.Module):
     """The network of :class:`observers.Flow`, on what a polynomial leaves of the increments.
 
-    Parameters
-    ----------
-    increments : Increments
-        What it is fitted to.
-    u_scale : ndarray, shape (nu,)
-        Of the inputs.
-    degrees : sequence of int
-        Of the polynomials that are tried, of which the first is taken that leaves little; else its degree is 1. Of all
-        but the first, terms that hardly matter are left out.
-    small : bool
-        Whether terms of the polynomial that hardly matter are always left out, and the network is smaller.
-    device : torch.device
-        Where the network is trained.
-
-    Attributes
-    ----------
-    polynomial : ndarray, shape (nx, terms)
-        The polynomial, of scaled increments, by least squares.
-    gain : ndarray, shape (nx,)
-        Scale of what it leaves.
+    Shapes: ``u_scale`` (nu,), ``polynomial`` (nx, terms), ``gain`` (nx,).
     """
 
     def __init__(
@@ -191,18 +146,7 @@ class FlowProblem(nn.Module):
         self._weight = tensor(1.0 / ((left**2).mean(-1) + LEAST), device)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, relative to what the polynomial leaves of each sample.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss", and "error", its root.
-        """
+        """Mean square error of a batch, relative to what the polynomial leaves of each sample."""
         rows = torch.randint(len(self._inputs), (BATCH,), generator=generator, device=self._inputs.device)
         square = (self.network(self._inputs[rows]) - self._left[rows]).square().mean(-1)
         loss = (self._weight[rows] * square).mean()
@@ -241,19 +185,7 @@ def _thinned(
 
 
 def possible_degrees(variables: int) -> list[int]:
-    """Find the degrees of polynomials that are tried, one after the other.
-
-    Parameters
-    ----------
-    variables : int
-        States and inputs.
-
-    Returns
-    -------
-    list of int
-        The highest up to 5 of which there are at most 60 terms, or 1 where there is none; then all higher ones up to 7
-        of at most 120 terms.
-    """
+    """Find the degrees of polynomials that are tried, one after the other."""
     usual = max(k for k in range(1, HIGHEST_DEGREE + 1) if k == 1 or count(variables, k) <= MOST_TERMS)
     return [usual, *(k for k in range(usual + 1, HIGHEST + 1) if count(variables, k) <= MOST_OF_HIGHER)]
 
@@ -278,31 +210,7 @@ def fit_flow(
 ) -> Flow:
     """Fit a flow.
 
-    Parameters
-    ----------
-    increments : Increments
-        What it is fitted to.
-    u_scale : ndarray, shape (nu,)
-        Of the inputs.
-    degrees : sequence of int
-        As :class:`FlowProblem` has them.
-    steps : int
-        Batches.
-    seed : int
-        Of the batches; the network begins with torch's own random numbers.
-    progress : ProgressBars
-        Where a bar is shown.
-    small : bool
-        As :class:`FlowProblem` has it.
-    device : torch.device, optional
-        Where the network is trained; by default on the CPU.
-    **of_plant : object
-        Of :class:`observers.Flow`, what no fit says: bounds, noise and window.
-
-    Returns
-    -------
-    Flow
-        One that has no error, and no factors yet.
+    Shapes: ``u_scale`` (nu,).
     """
     device = device or torch.device("cpu")
     problem = FlowProblem(increments, u_scale, degrees=degrees, small=small, device=device)
@@ -325,19 +233,7 @@ def fit_flow(
 def usual_error(flow: Flow, increments: Increments) -> np.ndarray:
     """Find what a flow is usually off by after a sample.
 
-    Parameters
-    ----------
-    flow : Flow
-        The flow.
-    increments : Increments
-        That it was not fitted to.
-
-    Returns
-    -------
-    ndarray, shape (nx,)
-        Standard deviations in scaled states, from medians: a few states that are far off, or jumps that a plant makes
-        now and then, do not count. For a tracker that trusts the flow less everywhere would be worse than to be lost
-        there.
+    Shapes: returns (nx,).
     """
     return np.asarray(OF_MEDIAN * np.median(_missed(flow, increments), axis=0))
 
@@ -350,18 +246,7 @@ def _missed(flow: Flow, increments: Increments) -> np.ndarray:
 def usual_bend(flow: Flow, increments: Increments) -> np.ndarray | None:
     """Find what a flow is usually off by where states move far within a sample.
 
-    Parameters
-    ----------
-    flow : Flow
-        The flow.
-    increments : Increments
-        That it was not fitted to.
-
-    Returns
-    -------
-    ndarray, shape (nx,), or None
-        Standard deviations in scaled states, in multiples of the squared distance of scaled states, as
-        :func:`usual_error` finds them; None where they are too small to matter.
+    Shapes: returns (nx,), or None.
     """
     moved = ((increments.change / flow.x_scale) ** 2).sum(-1)
     far = moved >= np.quantile(moved, 1 - FARTHEST)

@@ -26,20 +26,6 @@ def truncation_time(linear: LinearFilter, z0_norm: float, epsilon: float) -> flo
 
     t* = ln(cond(V) |z0| / epsilon) / min |Re lambda| (paper, sec. 5.2, where the logarithm's argument is
     printed upside down).
-
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    z0_norm : float
-        Norm of the start.
-    epsilon : float
-        What may be left, in units of z.
-
-    Returns
-    -------
-    float
-        t* in seconds.
     """
     poles, V = np.linalg.eig(linear.A)
     return float(max(0.0, np.log(np.linalg.cond(V) * z0_norm / epsilon)) / np.abs(poles.real).min())
@@ -53,30 +39,7 @@ class ForwardProblem(nn.Module):
     speed of the scaled motion plus the rate of its mode, so that fast regions do not drown the rest (the authors'
     released code weights by the speed as well).
 
-    Parameters
-    ----------
-    network : Network
-        From nx scaled states to nz scaled values, the map to be trained.
-    system : System
-        Its equations.
-    linear : LinearFilter
-        The filter.
-    pairs : tuple of ndarray, shapes (n, nx) and (n, nz)
-        States, and the filter's beside them.
-    points : ndarray, shape (m, nx)
-        States at which the equation is asked to hold.
-    scale : StateScale
-        Of the states that the network sees.
-    physics_weight : float
-        Weight nu of the residual.
-    batch : int
-        Number of pairs, and of collocation points, in a batch.
-    device : torch.device
-        Where the network is trained.
-    adaptive : bool, default False
-        Whether points are drawn in proportion to the residual plus its median, instead of alike. This is RAD (Wu et
-        al., Comput. Methods Appl. Mech. Eng. 403, 115671, 2023) with k = c = 1, the residual cut, and the median in
-        place of the mean.
+    Shapes: ``pairs`` (n, nx) and (n, nz), ``points`` (m, nx).
     """
 
     def __init__(
@@ -114,19 +77,7 @@ class ForwardProblem(nn.Module):
         self.cumulative: torch.Tensor
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """The risk on a batch of pairs and as many collocation points.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss", its parts "data" and "physics", and "error", the root mean square of z - T(x) in standard deviations
-            of z.
-        """
+        """The risk on a batch of pairs and as many collocation points."""
         device = self._x.device
         rows = torch.randint(len(self._x), (self._batch,), generator=generator, device=device)
         data = ((self.network(self._x[rows]) - self._z[rows]) ** 2).mean()
@@ -171,13 +122,6 @@ class ForwardProblem(nn.Module):
         """Put the output layer where it minimises the risk for the features that the other layers have learned.
 
         That is linear least squares, in float64 and on more samples than a batch has; gradients come close to it.
-
-        Parameters
-        ----------
-        rng : Generator
-            Of the samples.
-        report : callable, optional
-            Told the number of modes that are solved for.
         """
         *hidden, last = self.network.to(device="cpu", dtype=torch.float64)
         assert isinstance(last, nn.Linear)
@@ -210,31 +154,7 @@ class ForwardProblem(nn.Module):
 
 
 def truncation_step(system: System, linear: LinearFilter, *, steps: int, epsilon: float, box_factor: float) -> int:
-    """First sample k* by which the filter has forgotten its start along every trajectory.
-
-    Parameters
-    ----------
-    system : System
-        What the filter observes.
-    linear : LinearFilter
-        The filter.
-    steps : int
-        Length of the trajectories in sampling intervals.
-    epsilon : float
-        What may be left of the start, in units of z.
-    box_factor : float
-        Trajectories start in this multiple of X.
-
-    Returns
-    -------
-    int
-        k*.
-
-    Raises
-    ------
-    ValueError
-        If the trajectories end before.
-    """
+    """First sample k* by which the filter has forgotten its start along every trajectory."""
     x0 = system.draw_starts(np.random.default_rng(0), 10_000, box_factor)
     z0 = float(np.linalg.norm(linear.start(system.output(x0)), axis=-1).max())
     t = truncation_time(linear, z0, epsilon)
@@ -251,21 +171,7 @@ def transients(T: np.ndarray, z0: np.ndarray, *, linear: LinearFilter, ages: np.
 
     For an exact T this is the filter's own state at every age, so that none needs to be simulated (paper, sec. 3).
 
-    Parameters
-    ----------
-    T : ndarray, shape (m, n, nz)
-        T(x) at each age; the first age is 0.
-    z0 : ndarray, shape (n, nz)
-        Where the filter starts.
-    linear : LinearFilter
-        The filter.
-    ages : ndarray of int, shape (m,)
-        Samples since the start, sorted.
-
-    Returns
-    -------
-    ndarray, shape (m, n, nz)
-        z.
+    Shapes: ``T`` (m, n, nz), ``z0`` (n, nz), ``ages`` (m,); returns (m, n, nz).
     """
     poles, V = np.linalg.eig(linear.A)
     left = np.exp(ages[:, None] * linear.dt * poles)  # of each mode

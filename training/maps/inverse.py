@@ -8,25 +8,7 @@ from training.maps.samplers import Sampler
 
 
 class InverseProblem(nn.Module):
-    """The inverse network with the running mean square error of each cell.
-
-    Parameters
-    ----------
-    network : Network
-        From a batch's inputs to scaled states, and parameters where some are estimated.
-    sampler : Sampler
-        Where batches are from.
-    device : torch.device
-        Where the network is trained.
-    lipschitz_penalty : float, default 0
-        What the logarithm of a bound of T_inv's Lipschitz constant costs, in parts of the mean square error.
-
-    Notes
-    -----
-    The bound is the product of the layers' spectral norms, the first one's with respect to z without noise. A penalty
-    on such a product is that of Liu et al. (arXiv:2202.08345), with spectral norms by power iteration (Yoshida and
-    Miyato, arXiv:1705.10941). The loss being relative, its weight means the same on every system.
-    """
+    """The inverse network with the running mean square error of each cell."""
 
     def __init__(
         self, network: Network, sampler: Sampler, device: torch.device, *, lipschitz_penalty: float = 0.0
@@ -47,19 +29,7 @@ class InverseProblem(nn.Module):
                 self.register_buffer(f"direction{i}", start)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean square error of a batch, each cell relative to its own running error.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss", which stays near one while all cells improve, and "error", the geometric mean of the cells' root
-            mean square errors in scaled states, which falls.
-        """
+        """Mean square error of a batch, each cell relative to its own running error."""
         inputs, x, weight, cell = self.sampler(generator)
         apart, nx = (self.network(inputs) - x) ** 2, x.shape[1] - self.sampler.parameters
         square = weight * apart[:, :nx].mean(-1)

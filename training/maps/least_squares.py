@@ -33,25 +33,8 @@ def output_layer(
     :class:`training.maps.forward.ForwardProblem`, the equation's rows are divided by the local speed plus the rate of
     the mode.
 
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    equation : tuple of ndarray, shapes (m, features), (m, features) and (m, ny)
-        At collocation points: the features, their derivatives along f, and h.
-    speed : ndarray, shape (m,)
-        Of the scaled motion there.
-    pairs : tuple of ndarray, shapes (n, features) and (n, nz), optional
-        The features at states of which the filter's state is known, and that.
-    physics_weight : float
-        Weight of the equation where there are pairs.
-    report : callable, optional
-        Told the number of modes that are solved for.
-
-    Returns
-    -------
-    ndarray, shape (nz, features + 1)
-        W; the last column is the bias.
+    Shapes: ``equation`` (m, features), (m, features) and (m, ny), ``speed`` (m,), ``pairs`` (n, features) and (n, nz);
+    returns (nz, features + 1).
     """
     value, derivative, h = equation
     phi, phi_along = np.column_stack([value, np.ones(len(value))]), np.column_stack([derivative, np.zeros(len(value))])
@@ -87,25 +70,7 @@ def solve_forward(
     Collocation points should lie along motions, because the equation transports T along them: a box that motions leave
     and enter holds T only up to what came in, and its corners are where it then goes wrong.
 
-    Parameters
-    ----------
-    system : System
-        The system.
-    linear : LinearFilter
-        Its filter.
-    features : int
-        Number of tanh units; the time grows with their cube, a minute for 1,500.
-    points : ndarray, shape (n, nx)
-        States from which collocation points are taken.
-    rng : Generator
-        Of features and points.
-    report : callable, optional
-        Told the number of modes that are solved for.
-
-    Returns
-    -------
-    ForwardMap
-        T.
+    Shapes: ``points`` (n, nx).
     """
     x = points[rng.permutation(len(points))[: POINTS * features]]
     offset, scale = x.mean(0), np.where(x.std(0) > 0, x.std(0), 1.0)

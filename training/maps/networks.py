@@ -14,21 +14,7 @@ ACTIVATIONS: dict[str, type[nn.Module]] = {"tanh": nn.Tanh, "silu": nn.SiLU}
 
 
 class Network(nn.Sequential):
-    """A multilayer perceptron that begins with Glorot's normal weights and no biases.
-
-    Parameters
-    ----------
-    inputs : int
-        Width of the input.
-    outputs : int
-        Width of the output.
-    width : int
-        Neurons in each hidden layer.
-    depth : int
-        Number of hidden layers.
-    activation : {"tanh", "silu"}
-        Of the hidden layers.
-    """
+    """A multilayer perceptron that begins with Glorot's normal weights and no biases."""
 
     def __init__(self, inputs: int, outputs: int, *, width: int, depth: int, activation: str) -> None:
         widths = [inputs] + [width] * depth
@@ -67,18 +53,7 @@ class Network(nn.Sequential):
 
 
 def averaged(networks: Sequence[Network]) -> MLP:
-    """The mean of some networks of one shape, as one network: their hidden layers stand side by side.
-
-    Parameters
-    ----------
-    networks : sequence of Network
-        With the same inputs, outputs, depth and activation.
-
-    Returns
-    -------
-    MLP
-        As wide as all of them together.
-    """
+    """The mean of some networks of one shape, as one network: their hidden layers stand side by side."""
     members = [network.export() for network in networks]
     first, *hidden, last = zip(*(member.weights for member in members), strict=True)
     *biases, offsets = zip(*(member.biases for member in members), strict=True)
@@ -95,22 +70,7 @@ def tensor(x: np.ndarray, device: torch.device) -> torch.Tensor:
 
 
 def from_mlp(mlp: MLP, *, device: torch.device | None = None, dtype: torch.dtype = torch.float32) -> nn.Sequential:
-    """Put a multilayer perceptron for NumPy into torch, not to be trained further.
-
-    Parameters
-    ----------
-    mlp : MLP
-        The network.
-    device : torch.device, optional
-        Where it is to live.
-    dtype : torch.dtype, default torch.float32
-        Of its weights.
-
-    Returns
-    -------
-    Sequential
-        The same network.
-    """
+    """Put a multilayer perceptron for NumPy into torch, not to be trained further."""
     layers: list[nn.Module] = []
     for weight, bias in zip(mlp.weights, mlp.biases, strict=True):
         layer = nn.Linear(weight.shape[1], weight.shape[0], device=device, dtype=dtype)

@@ -30,28 +30,7 @@ Log = Callable[[str, float, int], object]
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """One optimisation within a run.
-
-    Parameters
-    ----------
-    name : str
-        Name of its checkpoint and its scalars.
-    steps : int
-        Number of batches.
-    learning_rate : float
-        Highest learning rate; it decays to zero along a cosine after a short linear warm-up.
-    folder : Path
-        Where its checkpoint goes.
-    fingerprint : str
-        What identifies the run's configuration; a checkpoint of another one is refused.
-    seed : int
-        Seed of the batches.
-    cpu_seconds : float
-        CPU time after which the stage ends if its steps are not done; the learning rate then follows the clock.
-    optimiser : {"adam", "soap"}
-        SOAP is Adam in the eigenbasis of Shampoo's preconditioner (Vyas et al., arXiv:2409.11321). For networks as
-        small as these, on batches as large, it takes about as long a step, and far fewer of them.
-    """
+    """One optimisation within a run."""
 
     name: str
     steps: int
@@ -83,33 +62,6 @@ def optimise(
     """Minimise a loss over the parameters of a module, with checkpoints.
 
     Every tensor in ``module.state_dict()`` is part of the checkpoint, buffers included.
-
-    Parameters
-    ----------
-    stage : Stage
-        How, for how long, and where the checkpoint is.
-    module : torch.nn.Module
-        What is trained.
-    loss : callable
-        Takes a generator, draws a batch with it, and returns scalars by name; the one named "loss" is minimised.
-    progress : rich.progress.Progress
-        Where to show how far it is.
-    log : callable, optional
-        Takes the name of a scalar, its value and the number of the batch.
-    resume : bool
-        Whether to go on from the checkpoint, if there is one.
-
-    Returns
-    -------
-    list of (int, float)
-        The course of the scalar named "error", else of the loss: its mean over ``LOG_EVERY`` batches, by batch.
-
-    Raises
-    ------
-    FloatingPointError
-        If the loss stops being a number; the last checkpoint then remains.
-    ValueError
-        If the checkpoint to go on from is damaged or of another configuration.
     """
     device = next(module.parameters()).device
     generator = torch.Generator(device).manual_seed(stage.seed)
@@ -163,22 +115,7 @@ def optimise(
 def optimise_at_once(
     name: str, module: nn.Module, loss: Loss, progress: Progress, *, steps: int, learning_rate: float, seed: int
 ) -> None:
-    """Minimise a loss by SOAP in a minute or so, of which no checkpoint is kept.
-
-    Parameters
-    ----------
-    name : str
-        On the bar.
-    module, loss, progress
-        As :func:`optimise` takes them.
-    steps, learning_rate, seed
-        As of :class:`Stage`.
-
-    Raises
-    ------
-    FloatingPointError
-        If the loss stops being a number.
-    """
+    """Minimise a loss by SOAP in a minute or so, of which no checkpoint is kept."""
     with tempfile.TemporaryDirectory() as folder:
         stage = Stage(
             name=name,

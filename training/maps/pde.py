@@ -19,21 +19,7 @@ def on_tensors(equations: Callable[[Components], Components], x: torch.Tensor) -
 def along(T: TensorMap, x: torch.Tensor, f: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Values of a map and its derivatives along a vector field.
 
-    Parameters
-    ----------
-    T : callable
-        The map, (n, nx) to (n, nz), each row by itself.
-    x : Tensor, shape (n, nx)
-        Where.
-    f : Tensor, shape (n, nx)
-        The vector field there.
-
-    Returns
-    -------
-    value : Tensor, shape (n, nz)
-        T(x).
-    derivative : Tensor, shape (n, nz)
-        dT/dx f.
+    Shapes: ``x`` (n, nx), ``f`` (n, nx); returns ``value`` (n, nz), ``derivative`` (n, nz).
     """
     value, derivative = torch.func.jvp(T, (x,), (f,))  # type: ignore[misc]
     return value, derivative
@@ -44,25 +30,7 @@ def residual(
 ) -> torch.Tensor:
     """How far a map is from solving the equation, P(x) = dT/dx f - A T - B h.
 
-    Parameters
-    ----------
-    T : callable
-        The map, (n, nx) to (n, nz), each row by itself.
-    x : Tensor, shape (n, nx)
-        Where.
-    f : Tensor, shape (n, nx)
-        The system's drift there.
-    h : Tensor, shape (n, ny)
-        Its output there.
-    A : Tensor, shape (nz, nz)
-        Of the filter.
-    B : Tensor, shape (nz, ny)
-        Of the filter.
-
-    Returns
-    -------
-    Tensor, shape (n, nz)
-        In units of z per second.
+    Shapes: ``x`` (n, nx), ``f`` (n, nx), ``h`` (n, ny), ``A`` (nz, nz), ``B`` (nz, ny); returns (n, nz).
     """
     value, derivative = along(T, x, f)
     return derivative - value @ A.T - h @ B.T

@@ -26,12 +26,7 @@ PER_AGE = 6  # samples of each run about each age: at a single one all motions m
 class Errors:
     """Errors of an observer that tracks, and what it says of them.
 
-    Parameters
-    ----------
-    error : ndarray, shape (ages, n, nx)
-        States less estimates.
-    covariance, in_doubt : ndarray, shape (ages, n, nx, nx)
-        Its covariances with a doubt of 0 and of 1, as :class:`observers.tracker.Tracker` has it.
+    Shapes: ``error`` (ages, n, nx), ``covariance``, ``in_doubt`` (ages, n, nx, nx).
     """
 
     error: np.ndarray
@@ -43,14 +38,7 @@ class Errors:
 class Regions:
     """Where along runs errors are looked at.
 
-    Parameters
-    ----------
-    knots : ndarray of int, shape (m,)
-        Ages in samples at which there are factors, rising from 0.
-    steps : int
-        Length of the runs in samples.
-    nx : int
-        Number of states.
+    Shapes: ``knots`` (m,).
     """
 
     knots: np.ndarray
@@ -79,22 +67,7 @@ class Regions:
     def factors(self, distances: list[np.ndarray], group: np.ndarray) -> np.ndarray:
         """Find factors from errors.
 
-        Parameters
-        ----------
-        distances : list of ndarray, shape (ages, n) each
-            Squared distances of errors in units of their covariance, for each of ``LEVELS``, at :attr:`ages`.
-        group : ndarray of bool, shape (ages, n)
-            Which of them count.
-
-        Returns
-        -------
-        ndarray, shape (levels, knots)
-            The factors.
-
-        Raises
-        ------
-        ValueError
-            If hardly any count.
+        Shapes: ``distances`` (ages, n) each, ``group`` (ages, n); returns (levels, knots).
         """
         return self._table(group, lambda i, cell: [self._factor(distances[i][cell], COVERAGE)])[..., 0]
 
@@ -105,22 +78,7 @@ class Regions:
         A tracker's errors have longer tails than a normal distribution's. So the mean is what a hundred motions usually
         show: a few that are lost would make up most of the mean of all.
 
-        Parameters
-        ----------
-        errors : list of Errors
-            For each of ``LEVELS``, at :attr:`ages`.
-        group : ndarray of bool, shape (ages, n)
-            Which of them count.
-
-        Returns
-        -------
-        factors, doubts : ndarray, shape (levels, knots)
-            Of both.
-
-        Raises
-        ------
-        ValueError
-            If hardly any count.
+        Shapes: ``group`` (ages, n); returns ``factors, doubts`` (levels, knots).
         """
         found = self._table(group, lambda i, cell: self._likeliest(errors[i], cell))
         return found[..., 0], found[..., 1]
@@ -171,17 +129,7 @@ class Regions:
 def usual_mean(values: np.ndarray, motion: np.ndarray) -> float:
     """Return the mean of values along motions, as ``RUNS`` motions usually show it: the median of such means.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        The values.
-    motion : ndarray of int, shape (n,)
-        Which motion each is of.
-
-    Returns
-    -------
-    float
-        The mean; of all, where there are fewer than twice as many motions.
+    Shapes: ``values`` (n,), ``motion`` (n,).
     """
     motions, motion = np.unique(motion, return_inverse=True)
     groups = max(1, len(motions) // RUNS)
@@ -206,23 +154,8 @@ def distances_along(
 ) -> np.ndarray:
     """Run an observer from its reset on, and compare its errors with its own covariances.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with error bars.
-    x, y : ndarray, shapes (steps + 1, n, nx) and (steps + 1, n, ny)
-        States, NaN where they are not known, and samples.
-    u : ndarray, shape (steps, n, nu)
-        Inputs.
-    level : float or tuple of float, length ny
-        Of the noise on the samples, as the observer is told it.
-    ages : ndarray of int, shape (m,)
-        Samples since the reset at which they are compared, sorted.
-
-    Returns
-    -------
-    ndarray, shape (m, n)
-        Squared distances of the errors in units of the covariance.
+    Shapes: ``x``, ``y`` (steps + 1, n, nx) and (steps + 1, n, ny), ``u`` (steps, n, nu), ``level`` of length ny,
+    ``ages`` (m,); returns (m, n).
     """
     observer = KKLObserver(artifact, level)
     return np.array(
@@ -240,20 +173,7 @@ def errors_along(
     process_noise: float | None = None,
     ages: np.ndarray,
 ) -> Errors:
-    """Run an observer that tracks, with factors of 1, from its reset on.
-
-    Parameters
-    ----------
-    artifact, x, y, u, level, ages
-        As for :func:`distances_along`.
-    process_noise : float, optional
-        Level that the observer is told of the motion; by default what it assumes.
-
-    Returns
-    -------
-    Errors
-        At these ages.
-    """
+    """Run an observer that tracks, with factors of 1, from its reset on."""
     observer, doubting = KKLObserver(artifact, level, process_noise=process_noise), _in_doubt(artifact)
     found = []
     for k in _at(observer, y, u, ages):
@@ -287,17 +207,7 @@ def _at(observer: KKLObserver, y: np.ndarray, u: np.ndarray, ages: np.ndarray) -
 def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distance e^T P^-1 e: of Gaussian errors it has the chi-square distribution with nx degrees.
 
-    Parameters
-    ----------
-    error : ndarray, shape (..., nx)
-        What estimates are off by.
-    covariance : ndarray, shape (..., nx, nx)
-        What is said of it.
-
-    Returns
-    -------
-    ndarray, shape (...,)
-        The distance.
+    Shapes: ``error`` (..., nx), ``covariance`` (..., nx, nx); returns (...,).
     """
     scale = np.sqrt(covariance.diagonal(axis1=-2, axis2=-1))  # units may differ by orders of magnitude
     scaled = error / scale
@@ -306,18 +216,5 @@ def squared_distance(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def chi_square(shares: float | Sequence[float], degrees: int) -> np.ndarray:
-    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import.
-
-    Parameters
-    ----------
-    shares : float or sequence of float
-        Probabilities of lying below.
-    degrees : int
-        Degrees of freedom.
-
-    Returns
-    -------
-    ndarray
-        A quantile for each.
-    """
+    """Quantiles of the chi-square distribution, of which scipy.stats has more and takes longer to import."""
     return np.asarray(2 * gammaincinv(degrees / 2, shares))

@@ -14,16 +14,7 @@ LEAST = 0.1  # of the mean square of a scaled state, added to it: errors of smal
 class StateScale:
     """Scaled states are (x - offset) / scale.
 
-    Parameters
-    ----------
-    offset : ndarray, shape (nx,)
-        Mean of the states, or the middle of their range.
-    scale : ndarray, shape (nx,)
-        Their standard deviation, or half their range; 1 where that is 0.
-    relative : bool
-        Whether errors count relative to the state's size.
-    nx : int, optional
-        How many of the values are of the state, which come first; by default all.
+    Shapes: ``offset`` (nx,), ``scale`` (nx,).
     """
 
     offset: np.ndarray
@@ -35,19 +26,7 @@ class StateScale:
     def of(cls, x: np.ndarray, scaling: Scaling, *, nx: int | None = None) -> Self:
         """Find the scale of some states.
 
-        Parameters
-        ----------
-        x : ndarray, shape (..., nx)
-            The states.
-        scaling : {"relative", "range"}
-            As in a configuration.
-        nx : int, optional
-            As for the class.
-
-        Returns
-        -------
-        StateScale
-            Theirs.
+        Shapes: ``x`` (..., nx).
         """
         axes = tuple(range(x.ndim - 1))
         if scaling == "relative":

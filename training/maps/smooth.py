@@ -12,13 +12,7 @@ CHUNK = 4096  # points whose Jacobians are taken at once
 
 
 class Smooth:
-    """A multilayer perceptron between physical units, in float64 and differentiable.
-
-    Parameters
-    ----------
-    mlp : MLP
-        The network, scalings being part of its first and last layer. Weights in float64 lose nothing.
-    """
+    """A multilayer perceptron between physical units, in float64 and differentiable."""
 
     def __init__(self, mlp: MLP) -> None:
         weights, biases = ([np.asarray(values, float) for values in part] for part in (mlp.weights, mlp.biases))
@@ -40,19 +34,7 @@ class Smooth:
 def decoder(artifact: Artifact, measurement_noise: float | tuple[float, ...], process_noise: float = 0.0) -> Smooth:
     """T_inv of free motion long after reset, in physical units.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of v that the map is told, of all outputs or each.
-    process_noise : float, default 0
-        Level of w that the map is told, in multiples of the system's scale per second.
-
-    Returns
-    -------
-    Smooth
-        Filter states, (n, size), to estimates, (n, nx).
+    Shapes: ``measurement_noise`` of length ny.
     """
     inverse = (artifact.free_inverse or artifact.inverse).part(slice(artifact.nx))
     whiten = inverse.gain(measurement_noise)[:, None] * inverse.whiten
@@ -83,24 +65,7 @@ def _scaled(mlp: MLP, first: np.ndarray, bias: np.ndarray, *, scale: np.ndarray,
 def residual(artifact: Artifact, system: System, x: np.ndarray) -> np.ndarray:
     """How far a learned T is from solving its equation, P(x) = dT/dx f(x) - A T(x) - B h(x).
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer that holds it.
-    system : System
-        What it was made for.
-    x : ndarray, shape (n, nx)
-        Where.
-
-    Returns
-    -------
-    ndarray, shape (n, nz)
-        P in units of z per second.
-
-    Raises
-    ------
-    ValueError
-        If the observer holds no T.
+    Shapes: ``x`` (n, nx); returns (n, nz).
     """
     if artifact.forward is None:
         raise ValueError("this observer holds no forward map T")

@@ -17,21 +17,7 @@ WIDTH, DEPTH, LEARNING_RATE = 32, 1, 3e-3
 
 
 class SpreadProblem(nn.Module):
-    """The network of :class:`observers.Spread`, fitted by Gaussian likelihood to the errors of a map that stays.
-
-    Parameters
-    ----------
-    inverse : InverseMap
-        The map.
-    sampler : TrajectorySampler
-        Where batches are from, in the map's own coordinates.
-    nx : int
-        Number of states, the first of the map's outputs.
-    width, depth : int
-        Neurons in each hidden layer, and number of these.
-    device : torch.device
-        Where the network is trained.
-    """
+    """The network of :class:`observers.Spread`, fitted by Gaussian likelihood to the errors of a map that stays."""
 
     def __init__(
         self, inverse: InverseMap, sampler: TrajectorySampler, nx: int, *, width: int, depth: int, device: torch.device
@@ -56,18 +42,7 @@ class SpreadProblem(nn.Module):
             return inputs, x[:, : self._nx] - self._mean(inputs)
 
     def loss(self, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        """Mean negative logarithm of the errors' likelihood in a batch, but for a constant.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of the batch.
-
-        Returns
-        -------
-        dict of str to Tensor
-            "loss".
-        """
+        """Mean negative logarithm of the errors' likelihood in a batch, but for a constant."""
         inputs, error = self._errors(generator)
         out, nx = self.network(inputs), self._nx
         log, lower = out[:, :nx], out[:, nx:]
@@ -95,27 +70,7 @@ def with_spread(
 ) -> InverseMap:
     """Give a map a network of its errors.
 
-    Parameters
-    ----------
-    inverse, sampler, nx, device
-        As :class:`SpreadProblem` takes them.
-    ages : ndarray, shape (m,)
-        Seconds since reset at which there are to be factors.
-    tables : int
-        Of factors: 2 where there is one for the highest level of process noise as well.
-    name : str
-        On the bar.
-    steps : int
-        Batches.
-    seed : int
-        Of the batches; the network begins with torch's own random numbers.
-    progress : ProgressBars
-        Where a bar is shown.
-
-    Returns
-    -------
-    InverseMap
-        The same with error bars, whose factors are ones.
+    Shapes: ``ages`` (m,).
     """
     problem = SpreadProblem(inverse, sampler, nx, width=WIDTH, depth=DEPTH, device=device)
     optimise_at_once(name, problem.network, problem.loss, progress, steps=steps, learning_rate=LEARNING_RATE, seed=seed)

@@ -80,23 +80,7 @@ AS_SHIPPED: dict[str, type[Method[Any]]] = {cls.name: cls for cls in (Shipped, S
 
 
 def get_method(name: str) -> Method[Any]:
-    """Find a method of the benchmark.
-
-    Parameters
-    ----------
-    name : str
-        Of a shipped one, or a class of the user's as ``"module:Class"`` or ``"path/to/script.py:Class"``.
-
-    Returns
-    -------
-    Method
-        The class is given no arguments.
-
-    Raises
-    ------
-    ValueError
-        If there is none, or the class lacks something or takes a shipped method's name.
-    """
+    """Find a method of the benchmark."""
     shipped = METHODS | ABLATION | AS_SHIPPED
     if name in shipped:
         return shipped[name]()

@@ -37,18 +37,7 @@ class Ablation(KKLMethod):
     pipeline: ClassVar[Pipeline] = "input-aware"
 
     def changes(self, task: Task) -> Mapping[str, Any]:
-        """Say which settings differ from the preset's: the spectrum, which is the paper's unless another is the point.
-
-        Parameters
-        ----------
-        task : Task
-            The training.
-
-        Returns
-        -------
-        mapping
-            Settings of a :class:`training.config.Config` by name.
-        """
+        """Settings that differ from the preset's: the paper's spectrum, unless another one is compared."""
         return {"eigenvalues": papers_spectrum(task.system), "pairs": ()}
 
     def train(self, task: Task, configuration: Configuration) -> Artifact:
@@ -226,20 +215,5 @@ class Tuned(Ablation):
 
 @cache
 def tuned_spectrum(system: System, dt: float, duration: float) -> Spectrum:
-    """Choose modes for a system's own level of noise; systems are tuned once.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length of the runs in seconds.
-
-    Returns
-    -------
-    Spectrum
-        The last one of the choice, which is made anew.
-    """
+    """Choose modes for a system's own level of noise; systems are tuned once."""
     return Probe(system, dt, duration).choose(multiple(system, 1.0))[-1].spectrum

@@ -37,59 +37,21 @@ class CausalObserver(Protocol):
     def reset(self, y0: np.ndarray) -> np.ndarray:
         """Forget the past and take in the first sample.
 
-        Parameters
-        ----------
-        y0 : ndarray, shape (n, ny)
-            Outputs at the start.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            The first estimate.
+        Shapes: ``y0`` (n, ny); returns (n, nx).
         """
         ...
 
     def step(self, y: np.ndarray) -> np.ndarray:
         """Take in the next sample.
 
-        Parameters
-        ----------
-        y : ndarray, shape (n, ny)
-            Outputs dt later.
-
-        Returns
-        -------
-        ndarray, shape (n, nx)
-            The next estimate.
+        Shapes: ``y`` (n, ny); returns (n, nx).
         """
         ...
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What every method is given for a training.
-
-    Parameters
-    ----------
-    name : str
-        Identifies it.
-    trajectories : int
-        Number of noise-free trajectories from starts in X.
-    duration : float
-        Their length in seconds.
-    samples : int
-        Points along each at which the state is recorded. The output is recorded at every step.
-    cpu_seconds : float
-        CPU time of the optimisation.
-    width, depth : int
-        Hidden layers of every multilayer perceptron.
-    activation : {"tanh", "silu"}
-        Their activation.
-    dt : float
-        Sampling interval in seconds.
-    steps : int
-        Batches after which a training ends in any case.
-    """
+    """What every method is given for a training."""
 
     name: str
     trajectories: int
@@ -107,14 +69,7 @@ class Budget:
 class Data:
     """Noise-free training trajectories.
 
-    Parameters
-    ----------
-    ages : ndarray of int, shape (m,)
-        Samples since the start at which x is recorded, sorted.
-    x : ndarray, shape (m, n, nx)
-        States at ``ages``.
-    y : ndarray of float32, shape (steps + 1, n, ny)
-        Outputs at every step.
+    Shapes: ``ages`` (m,), ``x`` (m, n, nx), ``y`` (steps + 1, n, ny).
     """
 
     ages: np.ndarray
@@ -124,28 +79,7 @@ class Data:
 
 @lru_cache(maxsize=1)
 def simulated(system: System, n: int, *, duration: float, samples: int, dt: float, seed: int) -> Data:
-    """Simulate the training data of a system; the same for every method.
-
-    Parameters
-    ----------
-    system : System
-        Any system; its input is zero.
-    n : int
-        Number of trajectories.
-    duration : float
-        Their length in seconds.
-    samples : int
-        Points along each at which the state is recorded.
-    dt : float
-        Sampling interval in seconds.
-    seed : int
-        Of the starts.
-
-    Returns
-    -------
-    Data
-        The last one is kept, so that methods on one system share it.
-    """
+    """Simulate the training data of a system; the same for every method."""
     rng = generator(Stream.TRAINING, seed)
     steps = max(1, round(duration / dt))
     ages = recording_ages(steps, samples)
@@ -158,21 +92,7 @@ def simulated(system: System, n: int, *, duration: float, samples: int, dt: floa
 
 @dataclass(frozen=True)
 class Task:
-    """One training.
-
-    Parameters
-    ----------
-    system : System
-        To be observed.
-    budget : Budget
-        What may be spent.
-    folder : Path
-        Receives checkpoints.
-    seed : int
-        Of everything random.
-    device : torch.device
-        Where networks are trained.
-    """
+    """One training."""
 
     system: System
     budget: Budget
@@ -199,26 +119,7 @@ class Task:
         return generator(Stream.TRAINING, self.seed, 1)
 
     def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
-        """Minimise a loss by Adam; goes on from a checkpoint if there is one.
-
-        Parameters
-        ----------
-        name : str
-            Of this stage of the training, for its checkpoint.
-        module : torch.nn.Module
-            What is trained, in place.
-        loss : callable
-            Draws a batch with the torch.Generator it is given, and returns a scalar tensor.
-        learning_rate : float
-            The highest.
-        share : float
-            Of the budget's CPU time.
-
-        Raises
-        ------
-        FloatingPointError
-            If the loss stops being a number.
-        """
+        """Minimise a loss by Adam; goes on from a checkpoint if there is one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
         stage = Stage(

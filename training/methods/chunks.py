@@ -18,18 +18,8 @@ ROUNDING = 1e-3  # of a state's standard deviation: below it the length of an er
 class Chunk(NamedTuple):
     """The next samples of every row.
 
-    Attributes
-    ----------
-    fresh : Tensor of bool, shape (rows,)
-        Rows that begin a trajectory here; the others go on.
-    y : Tensor, shape (samples, rows, ny)
-        Outputs with noise.
-    told : Tensor, shape (rows, ny)
-        What :func:`told` makes of the levels of noise.
-    recorded : Tensor of bool, shape (samples, rows)
-        Where the state is known.
-    x : Tensor, shape (number recorded, nx)
-        The scaled states there, sample by sample.
+    Shapes: ``fresh`` (rows,), ``y`` (samples, rows, ny), ``told`` (rows, ny), ``recorded`` (samples, rows), ``x``
+    (number recorded, nx).
     """
 
     fresh: torch.Tensor
@@ -46,25 +36,7 @@ class Chunks(nn.Module):
     trajectories carry no noise, the others a level up to the system's own. How far the rows have come is part of a
     checkpoint.
 
-    Parameters
-    ----------
-    data : Data
-        Training trajectories.
-    measurement_noise : float or tuple of float, length ny
-        The system's own level, of all outputs or each.
-    samples : int
-        Length of a chunk; that of the trajectories if they are shorter.
-    rows : int
-        Number of trajectories followed at once.
-    device : torch.device, optional
-        Where batches are made; by default the CPU.
-
-    Attributes
-    ----------
-    x_offset, x_scale : ndarray, shape (nx,)
-        Mean and standard deviation of the states.
-    y_offset, y_scale : ndarray, shape (ny,)
-        Those of the outputs.
+    Shapes: ``measurement_noise`` of length ny, ``x_offset``, ``x_scale`` (nx,), ``y_offset``, ``y_scale`` (ny,).
     """
 
     def __init__(
@@ -92,18 +64,7 @@ class Chunks(nn.Module):
         self.level: torch.Tensor
 
     def draw(self, generator: torch.Generator) -> Chunk:
-        """Go on by one chunk.
-
-        Parameters
-        ----------
-        generator : torch.Generator
-            Of trajectories and noise.
-
-        Returns
-        -------
-        Chunk
-            On the device.
-        """
+        """Go on by one chunk."""
         (length, trajectories, _), rows, device = self._y.shape, len(self.age), self._y.device
         drawn = torch.randint(trajectories, (rows,), generator=generator, device=device)
         end = torch.randint(1, length + 1, (rows,), generator=generator, device=device)

@@ -151,15 +151,7 @@ def _unpack(arrays: Arrays, name: str) -> MLP:
 
 
 class Switching:
-    """Both observers side by side; the estimate is that of the smaller filtered innovation.
-
-    Parameters
-    ----------
-    arrays : dict of str to ndarray
-        What :meth:`DMF.train` returned.
-    system : System
-        Whose h the innovations take.
-    """
+    """Both observers side by side; the estimate is that of the smaller filtered innovation."""
 
     def __init__(self, arrays: Arrays, system: System) -> None:
         self._system = system

@@ -99,13 +99,7 @@ class _Problem(nn.Module):
 
 
 class Recurrent:
-    """The trained network as an observer.
-
-    Parameters
-    ----------
-    arrays : dict of str to ndarray
-        What :meth:`GRU.train` returned.
-    """
+    """The trained network as an observer."""
 
     def __init__(self, arrays: Arrays) -> None:
         hidden, ny = arrays["gru.weight_hh_l0"].shape[1], arrays["gru.weight_ih_l0"].shape[1]

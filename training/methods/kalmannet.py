@@ -26,18 +26,7 @@ STEEPEST = 1e3  # gradient that is led back through a sample; errors that explod
 class State(NamedTuple):
     """What goes from one sample to the next.
 
-    Attributes
-    ----------
-    x : Tensor of float64, shape (n, nx)
-        Estimates.
-    prior : Tensor of float64, shape (n, nx)
-        What they were before the last sample corrected them.
-    before : Tensor of float64, shape (n, nx)
-        Estimates one sample earlier.
-    y : Tensor of float64, shape (n, ny)
-        The last sample.
-    hidden : Tensor, shape (n, hidden)
-        The network's.
+    Shapes: ``x`` (n, nx), ``prior`` (n, nx), ``before`` (n, nx), ``y`` (n, ny), ``hidden`` (n, hidden).
     """
 
     x: torch.Tensor
@@ -90,15 +79,7 @@ class KalmanNet(Method[Arrays]):
 
 
 class Motion:
-    """The exact model over one sample, within the system's declared bounds.
-
-    Parameters
-    ----------
-    system : System
-        The model.
-    dt : float
-        Sampling interval in seconds.
-    """
+    """The exact model over one sample, within the system's declared bounds."""
 
     def __init__(self, system: System, dt: float) -> None:
         self._system, self._dt = system, dt
@@ -146,17 +127,7 @@ class _Advance(torch.autograd.Function):
 
 
 class Gain(nn.Module):
-    """The filter: prediction by the model, correction by the network's gain.
-
-    Parameters
-    ----------
-    system : System
-        The model.
-    dt : float
-        Sampling interval in seconds.
-    hidden : int
-        Size of the network's layers.
-    """
+    """The filter: prediction by the model, correction by the network's gain."""
 
     def __init__(self, system: System, dt: float, *, hidden: int) -> None:
         super().__init__()
@@ -263,16 +234,7 @@ class _Problem(nn.Module):
 class KalmanNetFilter:
     """The trained filter as an observer. Rows that are no longer finite begin anew with the next sample.
 
-    Parameters
-    ----------
-    arrays : dict of str to ndarray
-        What :meth:`KalmanNet.train` returned.
-    system : System
-        The model.
-    dt : float
-        Sampling interval in seconds.
-    noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample, of all outputs or each.
+    Shapes: ``noise`` of length ny.
     """
 
     def __init__(self, arrays: Arrays, system: System, dt: float, noise: Level) -> None:

@@ -22,20 +22,7 @@ SMOOTH_SPECTRA = ((-3.0, -1.5), (-20.0, -2.0), (-40.0, -6.0))
 
 
 def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
-    """Space 2 nx + 1 eigenvalues for each output evenly in the logarithm.
-
-    Parameters
-    ----------
-    system : System
-        With nx states.
-    fastest, slowest : float
-        The ends, negative and in 1/s for a system of the pace of those that ship.
-
-    Returns
-    -------
-    tuple of float
-        From the slowest on.
-    """
+    """Space 2 nx + 1 eigenvalues for each output evenly in the logarithm."""
     return evenly_spaced(2 * system.nx + 1, slowest / system.pace, fastest / system.pace)
 
 
@@ -56,22 +43,7 @@ class KKLMethod(Method[Artifact]):
 
 
 def within(config: Config, budget: Budget, seed: int) -> Config:
-    """Give a configuration of the package the benchmark's data, networks and limit of CPU time.
-
-    Parameters
-    ----------
-    config : Config
-        Any.
-    budget : Budget
-        Of the benchmark.
-    seed : int
-        Of the training.
-
-    Returns
-    -------
-    Config
-        The rest is as it was.
-    """
+    """Give a configuration of the package the benchmark's data, networks and limit of CPU time."""
     return replace(
         config,
         dt=budget.dt,

@@ -40,23 +40,8 @@ def rollout(
     Between two ages the filter moves in one jump, by powers of the transition, so that fifty seconds of samples cost
     no more operations than there are ages.
 
-    Parameters
-    ----------
-    transition : Tensor, shape (nz, nz)
-        Of the state.
-    early, late : Tensor, shape (nz, ny)
-        Of the sample before and the one after.
-    z0 : Tensor, shape (n, nz)
-        Starts.
-    y : Tensor, shape (n, steps + 1, ny)
-        Outputs at every sample.
-    ages : ndarray of int, shape (m,)
-        Samples since the start, sorted, not negative.
-
-    Returns
-    -------
-    Tensor, shape (m, n, nz)
-        States.
+    Shapes: ``transition`` (nz, nz), ``early``, ``late`` (nz, ny), ``z0`` (n, nz), ``y`` (n, steps + 1, ny), ``ages``
+    (m,); returns (m, n, nz).
     """
     gaps = np.diff(ages, prepend=0)
     powers = torch.eye(len(transition), dtype=transition.dtype, device=transition.device)[None]
@@ -81,17 +66,6 @@ class Decoder(nn.Module):
 
     The components of z are nearly collinear. Its principal directions are scaled to unit variance down to
     ``SOFT_FLOOR`` of the largest: full whitening would have to follow the spectrum as it is learned.
-
-    Parameters
-    ----------
-    network : Network
-        From nz coordinates to nx scaled states.
-    linear : LinearFilter
-        The filter with the initial spectrum.
-    data : Data
-        Training trajectories.
-    device : torch.device
-        Where the network is trained.
     """
 
     def __init__(self, network: Network, linear: LinearFilter, data: Data, *, device: torch.device) -> None:
@@ -120,16 +94,7 @@ class Decoder(nn.Module):
 class Batches:
     """Random trajectories at random ages.
 
-    Parameters
-    ----------
-    data : Data
-        Training trajectories.
-    decoder : Decoder
-        Whose scaling of the states is taken.
-    noise : float or tuple of float, length ny
-        Standard deviation of the noise that is added to y, of all outputs or each.
-    device : torch.device
-        Where batches are made.
+    Shapes: ``noise`` of length ny.
     """
 
     def __init__(self, data: Data, decoder: Decoder, *, noise: Level, device: torch.device) -> None:

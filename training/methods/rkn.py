@@ -28,14 +28,7 @@ LARGEST = 1e3  # latent state, so that an unstable transition yields a large err
 class Belief(NamedTuple):
     """A Gaussian in the latent space, of an upper and a lower half that covary component by component.
 
-    Attributes
-    ----------
-    mean : Tensor, shape (n, 2, m)
-        Of the upper and the lower half.
-    variance : Tensor, shape (n, 2, m)
-        Of the same.
-    side : Tensor, shape (n, m)
-        Covariance of each upper component with its lower one; all others are zero.
+    Shapes: ``mean`` (n, 2, m), ``variance`` (n, 2, m), ``side`` (n, m).
     """
 
     mean: torch.Tensor
@@ -46,20 +39,7 @@ class Belief(NamedTuple):
 def predict(belief: Belief, transition: torch.Tensor, noise: torch.Tensor) -> Belief:
     """Move a Gaussian by a linear transition, of whose covariance only the kept entries are computed.
 
-    Parameters
-    ----------
-    belief : Belief
-        One sample earlier.
-    transition : Tensor, shape (n, 2, 2, 2 band + 1, m)
-        To the halves on the second axis from those on the third one, by diagonals: [..., j, i] belongs to component
-        i - band + j, and counts nothing where there is none.
-    noise : Tensor, shape (2, m)
-        Variances that are added.
-
-    Returns
-    -------
-    Belief
-        The prediction.
+    Shapes: ``transition`` (n, 2, 2, 2 band + 1, m), ``noise`` (2, m).
     """
     width = transition.shape[-2]
     held = torch.cat([belief.mean, belief.variance, belief.side[:, None]], 1)
@@ -80,19 +60,7 @@ def predict(belief: Belief, transition: torch.Tensor, noise: torch.Tensor) -> Be
 def update(belief: Belief, w: torch.Tensor, variance: torch.Tensor) -> Belief:
     """Condition a Gaussian on an observation of its upper half.
 
-    Parameters
-    ----------
-    belief : Belief
-        Before the sample.
-    w : Tensor, shape (n, m)
-        The observation.
-    variance : Tensor, shape (n, m)
-        Of its noise.
-
-    Returns
-    -------
-    Belief
-        The posterior.
+    Shapes: ``w`` (n, m), ``variance`` (n, m).
     """
     upper, lower = belief.variance.unbind(1)
     total = upper + variance
@@ -140,15 +108,7 @@ class RKN(Method[Arrays]):
 
 
 class Cell(nn.Module):
-    """Encoder, transition and decoder.
-
-    Parameters
-    ----------
-    ny, nx : int
-        Numbers of outputs and states.
-    latent : int
-        m, half of the latent state.
-    """
+    """Encoder, transition and decoder."""
 
     def __init__(self, ny: int, nx: int, latent: int) -> None:
         super().__init__()
@@ -238,12 +198,7 @@ class _Problem(nn.Module):
 class RKNObserver:
     """The trained networks as an observer. Rows that are no longer finite begin anew with the next sample.
 
-    Parameters
-    ----------
-    arrays : dict of str to ndarray
-        What :meth:`RKN.train` returned.
-    told : Tensor, shape (ny,)
-        What :func:`training.methods.chunks.told_of` makes of the noise level.
+    Shapes: ``told`` (ny,).
     """
 
     def __init__(self, arrays: Arrays, told: torch.Tensor) -> None:

@@ -13,21 +13,7 @@ SEEN = 0.1  # of the error of a signal: that of its change at most, where it is 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What is said of one hidden signal.
-
-    Parameters
-    ----------
-    signal : str
-        Its name.
-    verdict : str
-        ``determined``, ``up to a constant``, ``partly (20 % left)``, ``not determined`` or ``never moves``.
-    window : int or None
-        Steps back from which on that is so; None where nothing is told.
-    errors : tuple of float
-        Predicted error at each level of noise, in standard deviations of the signal.
-    linear : float
-        What the best linear function leaves without noise.
-    """
+    """What is said of one hidden signal."""
 
     signal: str
     verdict: str

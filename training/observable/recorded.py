@@ -40,30 +40,6 @@ def of_records(
     The filter that a training on the records would take is switched on at any sample. So many steps later its state z
     is compared with that of like samples in other records (:mod:`training.neighbours`). Noise is added to z with the
     covariance that it has there, and coordinates of z count as far as they are signal.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns, hidden states among them.
-    measurement_noise : sequence of (float or tuple of float), optional
-        Standard deviations on each sample of y, of all outputs or each, beside 0; by default 1 % and 10 % of those of
-        the outputs.
-    linear : LinearFilter, optional
-        In place of that filter.
-    seed : int, default 0
-        Of the choice of records whose samples are compared with those of the others, and of noise.
-    report : callable, optional
-        Told the share of the work that is done.
-
-    Returns
-    -------
-    Observability
-        What was found.
-
-    Raises
-    ------
-    ValueError
-        If no states were recorded, a level is none, or there are too few samples to say anything.
     """
     integer("seed", seed, 0)
     check_signals(records)

@@ -18,20 +18,7 @@ LEAST_SHOWN = 1e-4  # in the figure
 
 
 def table(found: Observability, title: str) -> Table:
-    """What is said of each hidden signal, for people.
-
-    Parameters
-    ----------
-    found : Observability
-        To be shown.
-    title : str
-        What was looked at.
-
-    Returns
-    -------
-    Table
-        A row for each signal.
-    """
+    """What is said of each hidden signal, for people."""
     given = " and ".join(", ".join(names) for names in (found.measured, found.inputs) if names)
     out = Table(
         "signal",
@@ -77,17 +64,7 @@ def _percent(share: float) -> str:
 
 
 def save(found: Observability, folder: Path, title: str) -> None:
-    """Write observability.csv and observability.png.
-
-    Parameters
-    ----------
-    found : Observability
-        To be written.
-    folder : Path
-        Where; created if missing.
-    title : str
-        What was looked at.
-    """
+    """Write observability.csv and observability.png."""
     rows = [
         (name, as_cell(level), window, window * found.dt, found.errors[k, m, i])
         + ((found.linear[m, i], found.changes[m, i]) if k == 0 else (np.nan, np.nan))

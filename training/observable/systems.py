@@ -41,29 +41,6 @@ def of_system(
     that an input-aware training takes by default. Whether states that are far apart have the same outputs they do not
     say. So motions from X are compared as records are, too (:func:`training.observable.of_records`): windows are from
     there, and errors of states of which that is so.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt, duration : float, optional
-        Sampling interval and length of motions in seconds; by default the system's own.
-    measurement_noise : sequence of (float or tuple of float), optional
-        Standard deviations on each sample of y, of all outputs or each, beside 0; by default the system's own.
-    seed : int, default 0
-        Of starts, of the comparison and of noise.
-    report : callable, optional
-        Told the share of the work that is done.
-
-    Returns
-    -------
-    Observability
-        What was found.
-
-    Raises
-    ------
-    ValueError
-        If an argument makes no sense, or the system's motions cannot be followed.
     """
     dt = system.dt if dt is None else dt
     duration = system.duration if duration is None else duration

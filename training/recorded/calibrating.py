@@ -20,29 +20,7 @@ MEMORIES = 2.0  # of the filter's memory, that stretches are long at most
 def parted(
     artifact: Artifact, records: Sequence[Record], held_out: Sequence[Record] | None
 ) -> tuple[list[Record], list[Record]]:
-    """Part records as in an observer's training, on its grid.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        From recorded states.
-    records : sequence of Record
-        All that it was trained on or that were held out, in any order; those that it was trained on, and on its grid,
-        if the others are given.
-    held_out : sequence of Record or None
-        Those that were not trained on, if that is known.
-
-    Returns
-    -------
-    train, held_out : list of Record
-        Both have states.
-
-    Raises
-    ------
-    ValueError
-        If the records are others than those of the training, of other signals or without states, or nothing is held
-        out.
-    """
+    """Part records as in an observer's training, on its grid."""
     config = config_of(artifact)
     check_signals([*records, *(held_out or ())])
     check_plant(artifact, records[0])
@@ -82,10 +60,7 @@ Found = TypeVar("Found")
 class Stretches:
     """Parts of records side by side, each from a sample at which the filter may be switched on.
 
-    Parameters
-    ----------
-    x, y, u : ndarray, shapes (steps + 1, n, nx), (steps + 1, n, ny) and (steps, n, nu)
-        Behind the end of a record x is NaN, and the others stay.
+    Shapes: ``x``, ``y``, ``u`` (steps + 1, n, nx), (steps + 1, n, ny) and (steps, n, nu).
     """
 
     x: np.ndarray
@@ -99,25 +74,7 @@ class Stretches:
 
 
 def stretches(artifact: Artifact, records: Sequence[Record]) -> Stretches:
-    """Take parts of records that begin all over them.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer for them.
-    records : sequence of Record
-        On its grid.
-
-    Returns
-    -------
-    Stretches
-        As long as the filter's memory twice, or as the longest record.
-
-    Raises
-    ------
-    ValueError
-        If there are too few samples to begin at.
-    """
+    """Take parts of records that begin all over them."""
     whole, owner, first = _begins(records)
     memory = artifact.inverse.age_max / artifact.filter.dt
     steps = max(2, min(round(MEMORIES * memory), max(len(piece.t) for piece in whole) - 1))
@@ -138,18 +95,7 @@ def stretches(artifact: Artifact, records: Sequence[Record]) -> Stretches:
 
 
 def require_enough(records: Sequence[Record]) -> None:
-    """See that error bars can be calibrated on records.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        That were held out, on an observer's grid.
-
-    Raises
-    ------
-    ValueError
-        If there are too few samples to begin at.
-    """
+    """See that error bars can be calibrated on records."""
     _begins(records)
 
 
@@ -182,28 +128,7 @@ def factors_along(
 ) -> np.ndarray:
     """Find factors for an observer's covariances.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with factors of 1.
-    runs : Stretches
-        That it was not trained on.
-    regions : Regions
-        Where they are looked at.
-    rng : numpy.random.Generator
-        Of the noise that is added to the samples.
-    report : callable, optional
-        Told which share is done.
-
-    Returns
-    -------
-    ndarray, shape (levels, knots)
-        The factors.
-
-    Raises
-    ------
-    ValueError
-        If there are too few errors.
+    Shapes: returns (levels, knots).
     """
     return regions.factors(_along(distances_along, artifact, runs, regions, rng, report), _known(runs, regions))
 
@@ -218,20 +143,7 @@ def factors_and_doubts_along(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find factors and doubts for the covariances of an observer that tracks.
 
-    Parameters
-    ----------
-    artifact, runs, regions, rng, report
-        As for :func:`factors_along`.
-
-    Returns
-    -------
-    factors, doubts : ndarray, shape (levels, knots)
-        Of both.
-
-    Raises
-    ------
-    ValueError
-        As there.
+    Shapes: returns ``factors, doubts`` (levels, knots).
     """
     return regions.factors_and_doubts(_along(errors_along, artifact, runs, regions, rng, report), _known(runs, regions))
 

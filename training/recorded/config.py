@@ -31,11 +31,6 @@ class RecordedConfig:
 
     Settings that :class:`training.config.Config` has as well are explained there. :func:`recorded_config` chooses those
     that have no default from the records.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        A ValueError that names every setting that makes no sense, its value, and what it should be.
     """
 
     eigenvalues: tuple[Annotated[float, Field(lt=0)], ...]
@@ -94,23 +89,6 @@ def recorded_config(records: Sequence[Record], changes: Mapping[str, Any] | None
     dt is the median step, rounded where steps are uneven. The eigenvalues follow from the rate of the signals,
     :func:`signal_rate`, and from the length of the records; those of rollouts from dt and the length of episodes. The
     largest noise is a tenth of the standard deviation of each output.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns.
-    changes : mapping of str to object, optional
-        Settings that are to differ; those that are None are left out.
-
-    Returns
-    -------
-    RecordedConfig
-        For :func:`training.recorded.train_recorded`.
-
-    Raises
-    ------
-    ValueError
-        If a setting makes no sense.
     """
     given = {name: value for name, value in (changes or {}).items() if value is not None}
     chosen: dict[str, Any] = {"dt": sampling_interval(*records)} | given
@@ -145,25 +123,7 @@ OF_THE_MAPS = tuple(field.name for field in fields(RecordedConfig) if field.name
 
 
 def config_of(artifact: Artifact, changes: Mapping[str, Any] | None = None) -> RecordedConfig:
-    """Read how an observer was learned.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        From recorded states.
-    changes : mapping of str to object, optional
-        Settings that are to differ.
-
-    Returns
-    -------
-    RecordedConfig
-        For another training.
-
-    Raises
-    ------
-    ValueError
-        If it was not learned from recorded states, or a setting makes no sense.
-    """
+    """Read how an observer was learned."""
     if artifact.training.get("pipeline") != "recorded":
         raise ValueError(f"the observer {artifact.system!r} was not learned from recorded states")
     names = (*OF_THE_MAPS, *OF_THE_FILTER)
@@ -177,23 +137,7 @@ def _tuples(value: Any) -> Any:
 
 
 def signal_rate(records: Sequence[Record]) -> float:
-    """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns. Missing samples are left out.
-
-    Returns
-    -------
-    float
-        About the angular frequency of what oscillates.
-
-    Raises
-    ------
-    ValueError
-        If each signal stands still in each record.
-    """
+    """How fast signals change, in 1/s: rms of the derivative over standard deviation, the median of those that move."""
     rates = list[float]()
     for letter in "yx":
         columns = [getattr(record, letter) for record in records if getattr(record, letter) is not None]

@@ -32,35 +32,6 @@ def learn_recorded_error_bars(
     A small network is fitted to what T_inv is off by along the records that it was trained on, at every age and level
     of noise. There it errs less than elsewhere. Factors from the records that were held out make up for that, so that
     regions of 90 % hold 90 % of the errors.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer. Error bars that it has are replaced.
-    records : sequence of Record
-        With states: those of its training.
-    held_out : sequence of Record, optional
-        Others, on the observer's grid; ``records`` are then trained on, and on that grid too. By default the records
-        are parted as in the training.
-    steps : int
-        Batches.
-    seed : int
-        Of everything random.
-    device : torch.device, optional
-        Where the network is trained; by default on the CPU.
-    console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere.
-
-    Returns
-    -------
-    Artifact
-        The same with error bars.
-
-    Raises
-    ------
-    ValueError
-        If the observer was not learned from recorded states or tracks, the records are not those of the training or
-        without states, nothing was held out, or too little to calibrate on.
     """
     if artifact.flow is not None:
         raise ValueError(

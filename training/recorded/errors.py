@@ -12,17 +12,7 @@ from training.records import Record, pieces
 
 @dataclass(frozen=True)
 class RecordedErrors:
-    """Errors on recorded states, relative to their standard deviations.
-
-    Parameters
-    ----------
-    relative : dict of str to float
-        For each hidden signal, the root mean square error over the signal's standard deviation, all samples together.
-    after : float
-        Seconds after the start of a record, or of a gap, that were left out.
-    seconds : float
-        Length of what was compared.
-    """
+    """Errors on recorded states, relative to their standard deviations."""
 
     relative: dict[str, float]
     after: float
@@ -43,23 +33,7 @@ def recorded_errors(
 ) -> RecordedErrors:
     """Run an observer along records and compare its estimates with the recorded states.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer from recorded states.
-    records : sequence of Record
-        With states, on the observer's grid (:func:`training.records.resampled`); filters begin anew after gaps.
-    after : float, optional
-        Seconds for which each transient is left out; by default until the filter has forgotten its start to one part
-        in a thousand.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of noise that is added to the records' outputs, of all or each; the observer is told of it.
-        It is the same at each call.
-
-    Returns
-    -------
-    RecordedErrors
-        NaN where nothing is left to compare, and of what stands still in all of these records.
+    Shapes: ``measurement_noise`` of length ny.
     """
     after = settling_time(artifact.filter) if after is None else after
     first = int(np.ceil(after / artifact.filter.dt - 1e-6))  # times are rounded

@@ -35,19 +35,7 @@ from training.trajectories.record import recording_ages
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a training on recorded states leaves behind.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer; nothing has written it to a file.
-    losses : dict of str to list of (int, float)
-        For each network, its error after so many batches.
-    held_out : list of Record
-        What was not trained on, on the observer's grid.
-    errors : RecordedErrors
-        On that.
-    """
+    """What a training on recorded states leaves behind."""
 
     artifact: Artifact
     losses: dict[str, list[tuple[int, float]]]
@@ -71,36 +59,6 @@ def train_recorded(
     2. The filter runs along them. Any sample may be its start: states are paired with what it holds at every age.
     3. Networks are fitted to these pairs, with noise of every level added to z, as for simulated ones. Their mean is
        T_inv.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns, hidden states among them.
-    config : RecordedConfig
-        How.
-    folder : Path
-        Where checkpoints and TensorBoard scalars go; created if missing.
-    name : str
-        Of the plant, for the artifact.
-    resume : bool
-        Whether to go on from the checkpoints in ``folder`` if there are any; without it they are an error.
-    device : torch.device, optional
-        Where networks are trained; by default on a GPU if there is one.
-    console : rich.console.Console or ProgressBars, optional
-        Where progress is shown. By default it is shown nowhere, but for log.txt in ``folder``.
-
-    Returns
-    -------
-    Recorded
-        The observer, and what was held out. Its artifact assumes the noise of the records where it is told no other.
-
-    Raises
-    ------
-    ValueError
-        If no states were recorded, a signal of ``config`` is not measured, all records are shorter than the filter
-        remembers, or there are checkpoints, but not ``resume`` or not of this configuration and these records.
-    FloatingPointError
-        If the loss stops being a number.
     """
     if not records or any(record.x is None for record in records):
         raise ValueError("no hidden states were recorded; name their columns (--hidden), or give equations to simulate")
@@ -164,26 +122,7 @@ def sampler_of(
     device: torch.device,
     like: InverseMap | None = None,
 ) -> TrajectorySampler:
-    """Make what draws batches of recorded states and filter states, with noise added to that of the records.
-
-    Parameters
-    ----------
-    config : RecordedConfig
-        Of a training.
-    records : sequence of Record
-        That are trained on, on the grid.
-    linear : LinearFilter
-        The filter.
-    device : torch.device
-        Where batches are made.
-    like : InverseMap, optional
-        A map to whose network they are to be given.
-
-    Returns
-    -------
-    TrajectorySampler
-        What draws them.
-    """
+    """Make what draws batches of recorded states and filter states, with noise added to that of the records."""
     ages = recording_ages(math.ceil(settling_time(linear) / config.dt), config.samples)
     measured = records[0].signals.measured
     untold = config.untold_noise * np.broadcast_to(np.asarray(config.measurement_noise_max), linear.B.shape[1])

@@ -23,22 +23,7 @@ def filter_of(config: RecordedConfig, signals: Signals) -> LinearFilter:
 
 
 def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Record], list[Record]]:
-    """Hold a share of the records out: whole ones drawn by the seed, or the end of each where there are few.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        All of them.
-    share : float
-        From 0 to 1; if it is positive, something is held out.
-    seed : int
-        Of the drawing.
-
-    Returns
-    -------
-    kept, held_out : list of Record
-        One at least is kept.
-    """
+    """Hold a share of the records out: whole ones drawn by the seed, or the end of each where there are few."""
     if not share:
         return list(records), []
     if len(records) >= FEW:
@@ -53,20 +38,7 @@ def split(records: Sequence[Record], share: float, seed: int) -> tuple[list[Reco
 
 
 def check_plant(artifact: Artifact, record: Record) -> None:
-    """Raise ValueError unless a record is of an observer's environment and signals, states among them.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, from recorded states.
-    record : Record
-        Of the plant, perhaps.
-
-    Raises
-    ------
-    ValueError
-        If it is not.
-    """
+    """Raise ValueError unless a record is of an observer's environment and signals, states among them."""
     signals, names = record.signals, artifact.signals or {}
     if record.x is None:
         raise ValueError(f"{record.name}: no hidden states were recorded; name them (--hidden)")
@@ -80,18 +52,7 @@ def check_plant(artifact: Artifact, record: Record) -> None:
 
 
 def fingerprints(records: Sequence[Record]) -> dict[str, str]:
-    """What identifies each file, or all episodes of a data set together, by its name.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        As they were read.
-
-    Returns
-    -------
-    dict of str to str
-        In the order in which they come.
-    """
+    """What identifies each file, or all episodes of a data set together, by its name."""
     found = dict[str, list[str]]()
     for record in records:
         found.setdefault(file_of(record), []).append(record.fingerprint)
@@ -107,22 +68,7 @@ def file_of(record: Record) -> str:
 
 
 def described(records: Sequence[Record], config: RecordedConfig, name: str) -> list[str]:
-    """What is going to be done.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        As they were read.
-    config : RecordedConfig
-        Of the run.
-    name : str
-        Of the plant.
-
-    Returns
-    -------
-    list of str
-        Lines for people.
-    """
+    """What is going to be done."""
     signals = records[0].signals
     given = " and ".join(", ".join(names) for names in (signals.measured, signals.inputs) if names)
     uneven, seconds = max(map(jitter, records)), sum(record.duration for record in records)

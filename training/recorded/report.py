@@ -16,15 +16,7 @@ SHOWN = 3  # records in the picture
 
 
 def write_recorded_report(path: Path, result: Recorded) -> None:
-    """Draw the errors in training, and estimates against the states of records that were held out.
-
-    Parameters
-    ----------
-    path : Path
-        Of the figure.
-    result : Recorded
-        What the training made.
-    """
+    """Draw the errors in training, and estimates against the states of records that were held out."""
     artifact = result.artifact
     shown = sorted(
         (piece for piece in pieces(result.held_out) if piece.x is not None), key=lambda piece: -piece.duration

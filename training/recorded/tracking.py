@@ -51,38 +51,6 @@ def learn_recorded_tracking(
 
     A tracker compares each sample with what it expects. So the measured signals have to be among the hidden ones, or
     be sums of them; an artifact that says so already, by its C, is taken at its word.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with error bars. A flow that it has is replaced.
-    records : sequence of Record
-        With states: those of its training.
-    held_out : sequence of Record, optional
-        Others, on the observer's grid; ``records`` are then trained on, and on that grid too. By default the records
-        are parted as in the training.
-    steps : int
-        Batches for the network.
-    small : bool
-        Whether network and polynomial are smaller than usual, for small maps.
-    seed : int
-        Of everything random.
-    device : torch.device, optional
-        Where the network is trained; by default on the CPU.
-    console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere.
-
-    Returns
-    -------
-    Artifact
-        The same with a flow.
-
-    Raises
-    ------
-    ValueError
-        If the observer was not learned from recorded states or has no error bars, a measured signal is no sum of hidden
-        ones or its zero is arbitrary, the records are not those of the training or without states, nothing was held
-        out, or too little to calibrate on.
     """
     integer("steps", steps, 1)
     integer("seed", seed, 0)
@@ -128,27 +96,7 @@ def learn_recorded_tracking(
 
 
 def increments_of(artifact: Artifact, records: Sequence[Record], rng: np.random.Generator) -> Increments:
-    """How states change from each recorded sample to the next.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        An observer for the records.
-    records : sequence of Record
-        On its grid.
-    rng : numpy.random.Generator
-        Draws some where there are too many.
-
-    Returns
-    -------
-    Increments
-        Those between two samples of which both are known.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """How states change from each recorded sample to the next."""
     found = list[tuple[np.ndarray, ...]]()
     for record in pieces(records):
         if record.x is not None:
@@ -168,18 +116,7 @@ def increments_of(artifact: Artifact, records: Sequence[Record], rng: np.random.
 
 
 def check_trackable(config: RecordedConfig) -> None:
-    """See that an observer that is learned so can be taught to track.
-
-    Parameters
-    ----------
-    config : RecordedConfig
-        Of its training.
-
-    Raises
-    ------
-    ValueError
-        If it cannot.
-    """
+    """See that an observer that is learned so can be taught to track."""
     if config.arbitrary_zero:
         raise ValueError(
             f"an observer that tracks compares {', '.join(config.arbitrary_zero)} with what it expects, and cannot do "
@@ -190,25 +127,7 @@ def check_trackable(config: RecordedConfig) -> None:
 def linear_output(records: Sequence[Record], known: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find C with y = C x.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        With states.
-    known : ndarray, shape (ny, nx), optional
-        C, where it is known already.
-
-    Returns
-    -------
-    C : ndarray, shape (ny, nx)
-        Entries that are rounding are 0.
-    left : ndarray, shape (ny,)
-        What is assumed of the noise of outputs at least: what is usually left of y - C x, which is noise of the
-        records, or a ten-thousandth of the output's standard deviation.
-
-    Raises
-    ------
-    ValueError
-        If what is left of an output is not noise, or states and outputs are never known together.
+    Shapes: ``known`` (ny, nx); returns ``C`` (ny, nx), ``left`` (ny,).
     """
     y, x = (np.concatenate([getattr(record, name) for record in records if record.x is not None]) for name in "yx")
     both = np.isfinite(np.column_stack([x, y])).all(-1)

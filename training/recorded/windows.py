@@ -15,28 +15,7 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
     The filter is linear. One that starts at sample k therefore differs from one that has run since the record's
     beginning by transition^age times their difference at k, and no window is filtered by itself.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        On a uniform grid with the filter's dt, with states, and with inputs if the filter takes any. No output is
-        missing in them; samples that lack a state are left out.
-    linear : LinearFilter
-        The filter.
-    ages : ndarray of int, shape (m,)
-        Samples since the start, sorted.
-    n : int
-        Pairs of each age, spread evenly over all samples that are as old in their records; samples are taken again
-        where there are fewer.
-
-    Returns
-    -------
-    Trajectories
-        The columns of x and z are not trajectories: from age to age they belong to different samples.
-
-    Raises
-    ------
-    ValueError
-        If no sample with a state is as old as the greatest age.
+    Shapes: ``ages`` (m,).
     """
     z = [along(linear, record) for record in records]
     xs, zs = [], []
@@ -57,17 +36,7 @@ def windows(records: Sequence[Record], linear: LinearFilter, *, ages: np.ndarray
 def samples_as_old(records: Sequence[Record], age: int) -> tuple[np.ndarray, np.ndarray]:
     """Find the samples with a state that have so many before them.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        As :func:`windows` takes them.
-    age : int
-        How many.
-
-    Returns
-    -------
-    owner, sample : ndarray of int, shape (n,)
-        The record of each, in order, and its row there; those that lack a state are left out.
+    Shapes: returns ``owner, sample`` (n,).
     """
     found = [
         np.zeros(0, int) if record.x is None else age + np.flatnonzero(~np.isnan(record.x[age:]).any(-1))
@@ -92,23 +61,7 @@ def restarted(
 ) -> np.ndarray:
     """What the filter holds at some samples if it was switched on ``age`` samples before each.
 
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    records : sequence of Record
-        As :func:`windows` takes them.
-    z : sequence of ndarray, shape (n, size)
-        What the filter holds :func:`along` each.
-    owner, sample : ndarray of int, shape (m,)
-        As of :func:`samples_as_old`.
-    age : int
-        Samples since the start.
-
-    Returns
-    -------
-    ndarray, shape (m, size)
-        Its states.
+    Shapes: ``z`` (n, size), ``owner``, ``sample`` (m,); returns (m, size).
     """
     began = sample - age
     start = linear.start(taken([record.y for record in records], owner, began))

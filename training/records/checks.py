@@ -18,20 +18,7 @@ WHOLE_TURN = 0.9 * 2 * np.pi  # jumps from here to a whole turn are those of a w
 
 
 def check_signals(records: Sequence[Record], system: System | None = None) -> None:
-    """See that there are records, with the same columns, and as many of them as a system has signals.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Of one plant.
-    system : System, optional
-        The plant, where that is known.
-
-    Raises
-    ------
-    ValueError
-        If there is none, columns differ, or a number of columns, or they are of different environments.
-    """
+    """See that there are records, with the same columns, and as many of them as a system has signals."""
     if not records:
         raise ValueError("there is no record")
     first = records[0]
@@ -63,20 +50,7 @@ def _of(record: Record) -> str:
 
 
 def check_between_records(records: Sequence[Record], warn: Warn) -> None:
-    """See that no record seems to be in other units than the others.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns.
-    warn : callable
-        Told of spreads that differ.
-
-    Raises
-    ------
-    ValueError
-        If sampling intervals differ by a factor of 30.
-    """
+    """See that no record seems to be in other units than the others."""
     steps = np.array([median_step(record) for record in records])
     for record, step in zip(records, steps):
         if not 1 / OTHER_CLOCK < step / np.median(steps) < OTHER_CLOCK:
@@ -105,21 +79,7 @@ def _spread(record: Record, letter: str, j: int) -> float:
 
 
 def check_motion(records: Sequence[Record], warn: Warn) -> None:
-    """See that signals move, and that no angle jumps by whole turns.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the same columns.
-    warn : callable
-        Told of an output that stands still in one record, and of jumps.
-
-    Raises
-    ------
-    ValueError
-        If an output or a hidden state is the same in all rows of all records. One that stands still in each, such as a
-        target that is drawn once an episode, may differ between them.
-    """
+    """See that signals move, and that no angle jumps by whole turns."""
     for letter, role in (("y", "measured"), ("x", "hidden")):
         for j, column in enumerate(getattr(records[0].signals, role)):
             moves = any(_spread(record, letter, j) for record in records)
@@ -154,24 +114,7 @@ def _warn_of(found: Sequence[str], warn: Warn) -> None:
 
 
 def check_against_system(records: Sequence[Record], system: System, warn: Warn) -> None:
-    """See that records are of sizes that a system may reach.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        With the system's numbers of columns.
-    system : System
-        What was recorded.
-    warn : callable
-        Told of outputs and states that are a hundred times smaller than expected, of steps of time that are a hundred
-        times shorter, and of inputs that were not recorded.
-
-    Raises
-    ------
-    ValueError
-        If a signal is a hundred times larger than the system's declarations allow, or a step of time a hundred times
-        as long as its dt.
-    """
+    """See that records are of sizes that a system may reach."""
     if system.nu and not records[0].signals.inputs:
         warn(f"{records[0].name}: no column of inputs, which are taken for zero")
     for record in records:
@@ -204,22 +147,7 @@ def check_against_system(records: Sequence[Record], system: System, warn: Warn) 
 
 
 def check_memory(records: Sequence[Record], seconds: float, warn: Warn) -> None:
-    """See that records are longer than what a filter remembers.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Any.
-    seconds : float
-        The filter's memory.
-    warn : callable
-        Told of records that are shorter where others are not.
-
-    Raises
-    ------
-    ValueError
-        If all records are shorter.
-    """
+    """See that records are longer than what a filter remembers."""
     short = [record for record in records if record.duration < seconds]
     told = [
         f"{record.name}: column {record.signals.time}, row {len(record.t)}: the record ends after "
@@ -232,20 +160,7 @@ def check_memory(records: Sequence[Record], seconds: float, warn: Warn) -> None:
 
 
 def check_dt(records: Sequence[Record], dt: float) -> None:
-    """See that records were sampled often enough for a sampling interval.
-
-    Parameters
-    ----------
-    records : sequence of Record
-        Any.
-    dt : float
-        Sampling interval in seconds of an observer, to which they are to be resampled.
-
-    Raises
-    ------
-    ValueError
-        If the median step of a record is more than 3 dt, or less than a thirtieth of it.
-    """
+    """See that records were sampled often enough for a sampling interval."""
     for record in records:
         step = median_step(record)
         if not dt / OTHER_CLOCK < step <= LONGEST_GAP * dt:

@@ -16,18 +16,7 @@ from training.records.signals import Signals
 class Episode:
     """What happened from a reset to the end.
 
-    Parameters
-    ----------
-    observations : object
-        n + 1 values of the observation space, as :func:`gymnasium.vector.utils.concatenate` stacks them.
-    actions : object
-        n values of the action space, each applied from its observation to the next.
-    rewards : ndarray, shape (n,)
-        Rewards.
-    terminated : bool
-        Whether the environment ended it, rather than a limit of time or the end of the recording.
-    infos : mapping of str to ndarray, shape (n + 1, ...)
-        What ``info`` held beside the observations.
+    Shapes: ``rewards`` (n,), ``infos`` (n + 1, ...).
     """
 
     observations: Any
@@ -39,23 +28,7 @@ class Episode:
 
 @dataclass(frozen=True)
 class Rollouts:
-    """Episodes of one environment, and what it is.
-
-    Parameters
-    ----------
-    name : str
-        Of the data set, for messages.
-    environment : mapping of str to object or None
-        Id and arguments, as :func:`kkl_gym.identity.identity` finds them; None if nobody knows.
-    dt : float
-        Sampling interval in seconds.
-    observation_space, action_space : gymnasium.Space
-        Of the environment.
-    episodes : sequence of Episode
-        One at least.
-    signals : Signals
-        What counts as measured and as hidden where nobody says it.
-    """
+    """Episodes of one environment, and what it is."""
 
     name: str
     environment: Mapping[str, Any] | None
@@ -66,26 +39,7 @@ class Rollouts:
     signals: Signals = Signals()  # noqa: RUF009 - it is frozen
 
     def records(self, wanted: Signals | None = None) -> list[Record]:
-        """Read the episodes.
-
-        Parameters
-        ----------
-        wanted : Signals, optional
-            What is measured and hidden, as :func:`kkl_gym.named.resolved` takes names; what is left empty is that of
-            the rollouts, and of inputs all actions.
-
-        Returns
-        -------
-        list of Record
-            One of each episode with two observations or more. The input of the last sample, which leads nowhere, is
-            the one before.
-
-        Raises
-        ------
-        ValueError
-            If nobody says what is measured, there is no such signal, it holds no numbers, or a reset does not say
-            what is measured.
-        """
+        """Read the episodes."""
         source = self.name if self.environment is None else self.environment["id"]
         wanted = wanted or Signals()
         if wanted.time:

@@ -21,28 +21,7 @@ Choose = Callable[[Sequence[str]], Sequence[str]]  # from the names of all colum
 def read_columns(path: Path, choose: Choose) -> tuple[tuple[str, ...], Columns]:
     """Read some columns of a file.
 
-    Parameters
-    ----------
-    path : Path
-        An .npz, .csv or .parquet file. Arrays of one dimension in an NPZ file are columns; those of two are columns
-        that are numbered from 1, such as y1 and y2, or bear the array's name where there is a single one.
-    choose : callable
-        Told the names of all columns, returns those that are wanted.
-
-    Returns
-    -------
-    names : tuple of str
-        Names of all columns.
-    columns : dict of str to ndarray, shape (n,)
-        Those that are wanted, as floats; NaN where there is no number.
-
-    Raises
-    ------
-    ValueError
-        If the file is of another kind or damaged, a row has too many or too few cells, a cell holds no number, or
-        arrays differ in length. The message names file, column and row; rows are counted from 1, without the header.
-    OSError
-        If it cannot be read.
+    Shapes: returns ``columns`` (n,).
     """
     readers = {".npz": _npz, ".csv": _csv, ".parquet": _parquet}
     if path.suffix.lower() not in readers:

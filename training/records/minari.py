@@ -32,27 +32,7 @@ def is_dataset(name: str | Path) -> bool:
 
 
 def read_dataset(name: str | Path, warn: Callable[[str], object]) -> Rollouts:
-    """Read a Minari data set.
-
-    Parameters
-    ----------
-    name : str or Path
-        ``minari:ID`` of one that Minari finds, or its folder.
-    warn : callable
-        Told of a sampling interval that nobody knows.
-
-    Returns
-    -------
-    Rollouts
-        All of its episodes.
-
-    Raises
-    ------
-    ValueError
-        If there is no such data set, it is damaged, or of a version that Minari does not read.
-    ModuleNotFoundError
-        Without Minari, which the extra ``envs`` brings.
-    """
+    """Read a Minari data set."""
     _require()
     try:
         dataset = _found(str(name))
@@ -85,27 +65,6 @@ def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | Non
     """Write a Minari data set, whole or not at all.
 
     What a process left beside it that was killed is removed, see :func:`observers.storage.clear_unfinished`.
-
-    Parameters
-    ----------
-    rollouts : Rollouts
-        The episodes; their name is the ID of the data set.
-    spec : gymnasium.envs.registration.EnvSpec or None
-        Of their environment.
-    policy : str
-        Who acted.
-
-    Returns
-    -------
-    Path
-        The folder of the data set.
-
-    Raises
-    ------
-    ValueError
-        If there is such a data set already, or its ID makes none.
-    OSError
-        If it cannot be written.
     """
     folder = dataset_folder(rollouts.name)
     from minari import __version__
@@ -158,27 +117,7 @@ def write_dataset(rollouts: Rollouts, spec: "gym.envs.registration.EnvSpec | Non
 
 
 def dataset_folder(name: str) -> Path:
-    """The folder of a data set that is to be written.
-
-    Parameters
-    ----------
-    name : str
-        Its ID.
-
-    Returns
-    -------
-    Path
-        Which does not exist.
-
-    Raises
-    ------
-    ValueError
-        If there is such a data set already, or the ID makes none.
-    OSError
-        If nothing can be written there.
-    ModuleNotFoundError
-        Without Minari.
-    """
+    """The folder of a data set that is to be written."""
     _require()
     from minari.dataset.minari_dataset import parse_dataset_id
     from minari.storage.datasets_root_dir import get_dataset_path

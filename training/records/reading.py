@@ -21,37 +21,7 @@ def read_records(
     system: System | None = None,
     warn: Callable[[str], object] | None = None,
 ) -> list[Record]:
-    """Read records, one from each file or episode, and check them.
-
-    Parameters
-    ----------
-    files : iterable of str or Path
-        NPZ, CSV or Parquet files, see :func:`training.records.files.read_columns`; Minari data sets of rollouts,
-        ``minari:ID`` or their folders.
-    signals : Signals, optional
-        Which columns are what; by default they are found by their names. Of rollouts they are entries of observations,
-        see :func:`kkl_gym.named.resolved`.
-    system : System, optional
-        What was recorded: numbers of outputs, inputs and states have to fit it, and so do their sizes.
-    warn : callable, optional
-        Told what is odd where one can go on; by default a UserWarning.
-
-    Returns
-    -------
-    list of Record
-        In the order of the files.
-
-    Raises
-    ------
-    ValueError
-        If there is no file, one is named twice or cannot be read, or its samples make no record; the message names
-        file, column and row. Rows are counted from 1, without the header.
-    OSError
-        If a file cannot be read.
-    ModuleNotFoundError
-        For a Parquet file without pyarrow, which the extra ``parquet`` brings, or a Minari data set without the extra
-        ``envs``.
-    """
+    """Read records, one from each file or episode, and check them."""
     paths = [Path(path) for path in files]
     if not paths:
         raise ValueError("name a file of recorded data, .npz, .csv or .parquet, or a data set, minari:ID (--data)")

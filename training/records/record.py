@@ -18,31 +18,7 @@ LARGEST = 1e100  # of a sample; sums of squares are finite up to there
 class Record:
     """Samples from one run of a plant.
 
-    Parameters
-    ----------
-    name : str
-        The file, for messages and figures.
-    t : ndarray, shape (n,)
-        Times in seconds, increasing; their steps may differ.
-    y : ndarray, shape (n, ny)
-        Outputs, NaN where a sample is missing.
-    u : ndarray, shape (n, nu), optional
-        Inputs, each held from its sample to the next.
-    x : ndarray, shape (n, nx), optional
-        States, NaN where one is missing.
-    signals : Signals, optional
-        Names of the columns; by default y1, y2, ..., u1, ..., x1, ....
-    source : str, default ""
-        The data set of which this is an episode; empty where the record is a file of its own.
-    environment : mapping of str to object, optional
-        Id and arguments of the environment of which this is an episode.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, there are fewer than two samples, time does not increase, a signal is missing in all of
-        them, an input in any, something is no real number or masked, or a number is infinite or beyond 1e100. The
-        message names column and row, counted from 1.
+    Shapes: ``t`` (n,), ``y`` (n, ny), ``u`` (n, nu), ``x`` (n, nx).
     """
 
     name: str

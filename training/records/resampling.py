@@ -18,36 +18,14 @@ def median_step(*records: Record) -> float:
 
 
 def sampling_interval(*records: Record) -> float:
-    """The median step in seconds, of no more digits than the times agree on, two at least.
-
-    Parameters
-    ----------
-    *records : Record
-        Of one sensor.
-
-    Returns
-    -------
-    float
-        0.01 also where times were written in single precision, whose steps are a little off.
-    """
+    """The median step in seconds, of no more digits than the times agree on, two at least."""
     uneven = max(map(jitter, records))
     digits = 12 if uneven < 1e-12 else int(np.clip(-np.log10(uneven), 2, 12))
     return float(f"{median_step(*records):.{digits}g}")
 
 
 def jitter(record: Record) -> float:
-    """How uneven the steps are: their largest deviation from the median step over it, gaps of samples aside.
-
-    Parameters
-    ----------
-    record : Record
-        Any.
-
-    Returns
-    -------
-    float
-        0 of a uniform grid, also where samples are left out.
-    """
+    """How uneven the steps are: their largest deviation from the median step over it, gaps of samples aside."""
     steps = np.diff(record.t) / median_step(record)
     return float(np.max(abs(steps - np.maximum(steps.round(), 1.0))))
 
@@ -59,23 +37,6 @@ def resampled(record: Record, dt: float | None = None) -> Record:
     sample later at most. States, which no observer sees, follow a monotone cubic (PCHIP). Both are NaN between samples
     of their own column that are more than 3 dt apart. An input is the mean over each interval of the grid of what was
     held. On a record that has this grid nothing but rounding changes.
-
-    Parameters
-    ----------
-    record : Record
-        Any.
-    dt : float, optional
-        Sampling interval in seconds; by default the median step.
-
-    Returns
-    -------
-    Record
-        With t = t_0, t_0 + dt, ....
-
-    Raises
-    ------
-    ValueError
-        If dt is not positive, or so large or small that nothing of an output is left.
     """
     dt = median_step(record) if dt is None else dt
     if not 0 < dt <= record.duration * (1 + ROUNDING):
@@ -116,18 +77,7 @@ def _held(record: Record, t: np.ndarray, dt: float) -> np.ndarray | None:
 
 
 def pieces(records: Iterable[Record]) -> list[Record]:
-    """Split records where a row lacks an output: no filter runs across a gap.
-
-    Parameters
-    ----------
-    records : iterable of Record
-        Resampled ones.
-
-    Returns
-    -------
-    list of Record
-        Of two samples or more each, with no output missing. States may be, and are left out where no row has all.
-    """
+    """Split records where a row lacks an output: no filter runs across a gap."""
     found = []
     for record in records:
         whole = ~np.isnan(record.y).any(-1)

@@ -18,21 +18,8 @@ class Signals:
     A measured, an input or a hidden signal is the name of a column, or ``cos(column)`` or ``sin(column)`` of an angle
     in rad.
 
-    Parameters
-    ----------
-    time : str, default ""
-        Column of the time in seconds; by default ``t`` or ``time``.
-    measured : tuple of str, length ny, default ()
-        Outputs y; by default ``y``, or ``y1``, ``y2`` and so on.
-    inputs : tuple of str, length nu, default ()
-        Inputs u, each held from its sample to the next; by default ``u``, or ``u1``, ``u2``, ..., where there are any.
-    hidden : tuple of str, length nx, default ()
-        States x; by default ``x``, or ``x1``, ``x2``, ..., where there are any.
-
-    Raises
-    ------
-    ValueError
-        If a name is empty, or one signal is named twice.
+    Shapes: ``measured`` of length ny, default (), ``inputs`` of length nu, default (), ``hidden`` of length nx, default
+    ().
     """
 
     time: str = ""
@@ -56,26 +43,7 @@ class Signals:
         return self.measured + self.inputs + self.hidden
 
     def found_in(self, path: object, columns: Sequence[str]) -> "Signals":
-        """Find in a file's columns what nobody has named, and see that all others are there.
-
-        Parameters
-        ----------
-        path : object
-            The file, for messages.
-        columns : sequence of str
-            Names of its columns.
-
-        Returns
-        -------
-        Signals
-            Nothing empty in it but inputs and hidden states that the file does not have.
-
-        Raises
-        ------
-        ValueError
-            If a column is missing, or the time is a signal as well. The message names it, and the columns that there
-            are.
-        """
+        """Find in a file's columns what nobody has named, and see that all others are there."""
         found = replace(
             self,
             time=self.time or next((name for name in TIMES if name in columns), TIMES[0]),

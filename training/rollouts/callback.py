@@ -37,22 +37,7 @@ QUICK_ERROR_BARS, QUICK_FLOW = 1000, 5000  # batches
 
 @dataclass(frozen=True)
 class Refit:
-    """What came of a refit.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer that is in use from here on.
-    taken : bool
-        Whether it is the new one, which had to be as good as the one before.
-    before, error : float
-        Errors on held-out episodes, of the observer that was in use and of the one that is: root mean square over
-        standard deviation, of all hidden signals together. NaN where no episode that is long enough was held out.
-    steps : int
-        Environment steps so far.
-    seconds : float
-        That it took.
-    """
+    """What came of a refit."""
 
     artifact: Artifact
     taken: bool
@@ -302,22 +287,7 @@ class KKLTrainingCallback(BaseCallback):
 
 
 def rehearsed(model: BaseAlgorithm, steps: int) -> Iterator[tuple[Sequence[dict[str, Any]], np.ndarray]]:
-    """Play an agent as it will act, without exploration, in the environments in which it has learned.
-
-    Parameters
-    ----------
-    model : stable_baselines3 algorithm
-        The agent. What scales its observations learns nothing.
-    steps : int
-        Of all environments together, at least.
-
-    Yields
-    ------
-    infos : sequence of dict
-        Of each environment, after each step; none after the reset.
-    dones : ndarray of bool
-        Whose episodes have ended; all after the reset.
-    """
+    """Play an agent as it will act, without exploration, in the environments in which it has learned."""
     env: Any = model.get_env()
     with _as_it_is(model.get_vec_normalize_env()):
         observations, state, dones = env.reset(), None, np.ones(env.num_envs, dtype=bool)

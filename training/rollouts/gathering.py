@@ -26,32 +26,7 @@ class _Piece:
 
 
 class Gathering:
-    """What an observer and who knows the hidden signals have seen, as far as it is kept.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, from rollouts of an environment.
-    keep : int
-        Steps that are kept at most; the oldest are forgotten.
-    held_out : float
-        Share of the pieces that is held out. Each has its role for good.
-    outputs : str
-        What of ``info`` is recorded as outputs.
-    before : sequence of Record
-        Episodes from before, the oldest first, of any dt. None of them is held out: the observer may know them.
-
-    Attributes
-    ----------
-    steps : int
-        Steps that were taken in so far, forgotten ones included, without those from before.
-
-    Raises
-    ------
-    ValueError
-        If an episode from before is of other signals or another environment than the observer, without hidden signals,
-        or of steps that do not fit its dt.
-    """
+    """What an observer and who knows the hidden signals have seen, as far as it is kept."""
 
     def __init__(
         self, artifact: Artifact, *, keep: int, held_out: float, outputs: str = "y", before: Sequence[Record] = ()
@@ -70,37 +45,14 @@ class Gathering:
             self._take_before(resampled(record, self._dt))
 
     def begin(self, row: int, info: Mapping[str, Any], *, goes_on: bool = False) -> None:
-        """Take in the first sample of an episode.
-
-        Parameters
-        ----------
-        row : int
-            Which environment.
-        info : mapping
-            Of the reset. Without outputs the episode begins with the sample after it.
-        goes_on : bool
-            Whether the episode may be further than that already.
-        """
+        """Take in the first sample of an episode."""
         self._close(row)
         piece = self._open[row] = _Piece(goes_on=goes_on)
         if self._outputs in info:
             piece.y, piece.x = [np.array(info[self._outputs])], [info.get("x", np.full(self._nx, np.nan))]
 
     def add(self, row: int, info: Mapping[str, Any]) -> None:
-        """Take in the sample after a step.
-
-        Parameters
-        ----------
-        row : int
-            Which environment.
-        info : mapping
-            Of the step.
-
-        Raises
-        ------
-        ValueError
-            If it lacks something, or a sample was skipped.
-        """
+        """Take in the sample after a step."""
         if missing := [key for key in (self._outputs, "u", "x", "sample") if key not in info]:
             raise ValueError(
                 f"info of environment {row} has no {', '.join(map(repr, missing))}: KKLObservation tells the true "
@@ -126,13 +78,7 @@ class Gathering:
             self._cut(row)
 
     def records(self) -> tuple[list[Record], list[Record]]:
-        """What is kept, with the episodes that are under way as far as they have come.
-
-        Returns
-        -------
-        train, held_out : list of Record
-            Pieces of two samples or more.
-        """
+        """What is kept, with the episodes that are under way as far as they have come."""
         for row, piece in self._open.items():
             if piece.u:
                 self._cut(row)

@@ -18,25 +18,7 @@ from training.rollouts.policies import Policy
 
 
 def make(env_id: str, kwargs: Mapping[str, Any] | None = None) -> gym.Env[Any, Any]:
-    """Make an environment.
-
-    Parameters
-    ----------
-    env_id : str
-        As ``gym.make`` takes it.
-    kwargs : mapping of str to object, optional
-        Its arguments.
-
-    Returns
-    -------
-    gymnasium.Env
-        The environment.
-
-    Raises
-    ------
-    ValueError
-        If there is none of that name, something that it needs is missing, or it does not take the arguments.
-    """
+    """Make an environment."""
     try:
         return gym.make(env_id, **(kwargs or {}))
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
@@ -55,36 +37,7 @@ def roll_out(
     name: str = "",
     report: Callable[[float], object] | None = None,
 ) -> Rollouts:
-    """Play episodes and keep observations, actions and what is asked of ``info``.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        The environment, made by ``gym.make``.
-    policy : callable
-        From an observation to an action.
-    measured, hidden : sequence of str or int
-        Signals, as :func:`kkl_gym.named.resolved` takes them.
-    episodes, steps : int, optional
-        Where to stop, at whichever comes first; one of them is needed. An episode that ``steps`` ends counts as far as
-        it got.
-    seed : int
-        Of the environment and of random actions.
-    name : str
-        Of the rollouts.
-    report : callable, optional
-        Told how many episodes there are, or steps if ``steps`` is given.
-
-    Returns
-    -------
-    Rollouts
-        What happened.
-
-    Raises
-    ------
-    ValueError
-        If a number or a signal makes no sense, or observations or actions are of a kind that is not recorded.
-    """
+    """Play episodes and keep observations, actions and what is asked of ``info``."""
     if episodes is None and steps is None:
         raise ValueError("say how much to record: episodes or steps")
     for what, count in (("episodes", episodes), ("steps", steps)):
@@ -110,24 +63,7 @@ def roll_out(
 
 
 class Recorder(gym.Wrapper[Any, Any, Any, Any]):
-    """Keeps the episodes that are played in an environment: observations, actions and what is asked of ``info``.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        The environment, made by ``gym.make``.
-    measured, hidden : sequence of str or int
-        Signals, as :func:`kkl_gym.named.resolved` takes them.
-    name : str
-        Of the rollouts.
-    keep : int, optional
-        An episode is forgotten once the later ones have so many steps together. By default all are kept.
-
-    Raises
-    ------
-    ValueError
-        If a signal makes no sense, or observations or actions are of a kind that is not recorded.
-    """
+    """Keeps the episodes that are played in an environment: observations, actions and what is asked of ``info``."""
 
     def __init__(
         self,
@@ -173,23 +109,7 @@ class Recorder(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(reward), self._terminated, truncated, info
 
     def rollouts(self, *, going_on: bool = False) -> Rollouts:
-        """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with.
-
-        Parameters
-        ----------
-        going_on : bool
-            Whether it is to be gone on with.
-
-        Returns
-        -------
-        Rollouts
-            All episodes that are kept.
-
-        Raises
-        ------
-        ValueError
-            If ``info`` does not hold what is asked of it.
-        """
+        """Hand out what was played; the episode that is going on counts as far as it got, and is not gone on with."""
         if not going_on:
             self._end()
         under_way = [self._episode()] if self._rewards else []

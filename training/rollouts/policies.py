@@ -16,31 +16,7 @@ LONGEST_HELD = 30  # steps, of the mean for which an action is held
 
 
 def policy_of(policy: str | Policy, env: gym.Env[Any, Any]) -> Policy:
-    """Find who acts.
-
-    Parameters
-    ----------
-    policy : str or callable
-        ``random``: actions drawn from their space. ``wandering``: the same, each held for a while, for one to thirty
-        steps in the mean, which changes with every hundred steps, so that what is slow is moved too.
-        ``script.py:function`` or ``module:function``: a function from an observation to an action. ``ppo:FILE.zip``, or
-        another algorithm of stable-baselines3 or sb3-contrib: an agent that it saved, of which loading may run what is
-        in the file.
-    env : gymnasium.Env
-        Where it acts.
-
-    Returns
-    -------
-    callable
-        From an observation to an action.
-
-    Raises
-    ------
-    ValueError
-        If it is none of these, or acts on other observations.
-    OSError
-        If a file cannot be read.
-    """
+    """Find who acts."""
     if callable(policy):
         return policy
     if policy == RANDOM:

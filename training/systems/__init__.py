@@ -22,18 +22,7 @@ PROFILES: dict[str, Profile] = {
 
 
 def profile(system: System) -> Profile:
-    """What is known of a system.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-
-    Returns
-    -------
-    Profile
-        The one that ships under the system's name; the defaults if there is none.
-    """
+    """What is known of a system."""
     return PROFILES.get(system.name, Profile())
 
 
@@ -41,23 +30,6 @@ def controller(system: System) -> Controller:
     """A feedback that brings a system to its target.
 
     It is the saturated linear-quadratic regulator, or the law that the system's profile names.
-
-    Parameters
-    ----------
-    system : System
-        A system with inputs.
-
-    Returns
-    -------
-    callable
-        States, of shape (n, nx), in; actions in [-1, 1], of shape (n, nu), out.
-
-    Raises
-    ------
-    ValueError
-        If the system has no inputs.
-    numpy.linalg.LinAlgError
-        If its linearisation at the target cannot be stabilised, for the regulator.
     """
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs to control it by")
@@ -65,27 +37,7 @@ def controller(system: System) -> Controller:
 
 
 def named_policy(system: System, name: str) -> Controller:
-    """A policy under which motions of a system are simulated.
-
-    Parameters
-    ----------
-    system : System
-        A system with inputs.
-    name : str
-        "controller" for what :func:`controller` returns, or where a function of the user's is written, as
-        ``"module:function"`` or ``"script.py:function"``: states, of shape (n, nx), in; actions in [-1, 1], of shape
-        (n, nu), out.
-
-    Returns
-    -------
-    callable
-        The policy, tried on some states.
-
-    Raises
-    ------
-    ValueError
-        If it cannot be found or is none, or if the system has no inputs or its linearisation cannot be stabilised.
-    """
+    """A policy under which motions of a system are simulated."""
     if name != "controller":
         return checked_policy(load_function(name), system, name)
     try:

@@ -17,16 +17,6 @@ def homogeneous(system: System) -> Controller:
 
     The linearisation at the origin cannot be stabilised, so there is no linear law. With the drift's -b x1 cancelled,
     x2 follows -cbrt(a x1), on which x1' = -a^2 x1.
-
-    Parameters
-    ----------
-    system : System
-        Reverse Duffing.
-
-    Returns
-    -------
-    callable
-        States, of shape (n, 2), in; actions in [-1, 1], of shape (n, 1), out.
     """
     (u_max,) = system.u_max
     a, b = (system.parameters[name] for name in ("a", "b"))

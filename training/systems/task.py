@@ -18,27 +18,7 @@ MOST_SAMPLES = 100_000  # of an episode: all of them are kept while it is played
 class ControlTask:
     """Bring a system to its target and hold it there.
 
-    Parameters
-    ----------
-    system : str or System
-        A shipped name, "module:Class" or "script.py:Class", or the system itself. Agents can be saved with a name only.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y.
-    period : float
-        Seconds for which an action is held; the observer sees every sample within.
-    duration : float
-        Length of an episode in seconds, at most 100,000 sampling intervals.
-    start_box : tuple of (float, float), optional
-        Low and high end of each state, where episodes start; by default the training box.
-    tolerance : float
-        An episode succeeds if |(x - target) / scale| stays within this throughout its last fifth.
-    dt : float
-        Sampling interval in seconds.
-
-    Raises
-    ------
-    ValueError
-        If a number makes no sense, or a time is no whole multiple of the next shorter one.
+    Shapes: ``measurement_noise`` of length ny.
     """
 
     system: str | System
@@ -89,22 +69,6 @@ class ControlTask:
         wrap: Callable[[VectorEnv], VectorEnv] | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.SAME_STEP,
     ) -> VectorEnv:
-        """The task as a vector environment that acts once a period.
-
-        Parameters
-        ----------
-        num_envs : int
-            Number of rows.
-        wrap : callable, optional
-            Makes what goes around the environment at its own sampling interval, such as
-            :class:`kkl_gym.KKLVectorObservation`; by default the state is shown.
-        autoreset_mode : str or gymnasium.vector.AutoresetMode
-            As for :class:`kkl_gym.VectorActionRepeat`.
-
-        Returns
-        -------
-        kkl_gym.VectorActionRepeat
-            The environment.
-        """
+        """The task as a vector environment that acts once a period."""
         env: VectorEnv = KKLVectorEnv(self.system, num_envs, **self.options, autoreset_mode=AutoresetMode.DISABLED)
         return VectorActionRepeat(env if wrap is None else wrap(env), self.repeat, autoreset_mode)

@@ -42,37 +42,6 @@ def learn_error_bars(
     90 % hold 90 % of the errors at each age and level of noise, on free and on driven motions. Where parameters are
     uncertain that is so over plants as :func:`training.trajectories.parameters.uncertain_plant` draws them, and less at
     the ends of the ranges.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, whose maps are told measurement noise and age. Error bars that it has are replaced.
-    system : System
-        What it was made for.
-    steps : int
-        Batches for the network, or each of the two where free motions have a map of their own.
-    trajectories : int
-        Number of motions to learn from, and twice as many to calibrate on.
-    seed : int
-        Of everything random; no seed gives the motions of a training, or of an evaluation.
-    policy : callable, optional
-        Acts on the system, for maps that were trained under one.
-    device : torch.device, optional
-        Where networks are trained; by default on the CPU.
-    console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere.
-
-    Returns
-    -------
-    Artifact
-        The same with error bars.
-
-    Raises
-    ------
-    ValueError
-        If a number makes no sense, the observer does not say how it was trained, is not told what it takes, or most
-        motions leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if it was made for another
-        system.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     if artifact.flow is not None:

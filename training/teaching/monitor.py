@@ -120,36 +120,7 @@ def sound_trajectories(
 
     Those that leave the system's bounds are drawn anew.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        Observer, which gives the sampling interval.
-    system : System
-        What moves, from starts uniform in X, with its own level of process noise.
-    n : int
-        Number of trajectories.
-    duration : float
-        Length of each in seconds.
-    rng : numpy.random.Generator
-        From which starts, inputs and process noise are drawn.
-    policy : callable, optional
-        Acts on the system in place of random inputs; every other trajectory is its own, without errors and exploration.
-    process_noise : float, optional
-        Its level, in multiples of the system's scale per second; by default the system's own.
-    kinds : tuple of str
-        Of random inputs, see :func:`training.trajectories.signals.random_inputs`.
-
-    Returns
-    -------
-    x : ndarray, shape (steps + 1, n, nx)
-        States.
-    u : ndarray, shape (steps, n, nu)
-        Inputs.
-
-    Raises
-    ------
-    ValueError
-        If most trajectories leave the bounds.
+    Shapes: returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
     dt = artifact.filter.dt
     check_duration(duration, dt)

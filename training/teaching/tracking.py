@@ -49,39 +49,6 @@ def learn_tracking(
     Kalman filter on that flow is what :class:`observers.KKLObserver` then runs beside z. Its covariances are calibrated
     on further motions, so that regions of 90 % hold 90 % of the errors, or up to 91 % where a few are far off, and so
     are the limits of the monitor, if there are any.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer, with error bars. A flow that it has is replaced.
-    system : System
-        What it was made for.
-    steps : int
-        Batches for the network. An eighth as many follow, of many samples in a row each.
-    small : bool
-        Whether network and polynomial are smaller than usual, for small maps.
-    trajectories : int
-        Number of motions to calibrate on.
-    seed : int
-        Of everything random; no seed gives the motions of a training, or of an evaluation.
-    policy : callable, optional
-        Acts on the system, for maps that were trained under one.
-    device : torch.device, optional
-        Where the network is trained; by default on the CPU.
-    console : Console or ProgressBars, optional
-        Where progress is shown; by default nowhere.
-
-    Returns
-    -------
-    Artifact
-        The same with a flow.
-
-    Raises
-    ------
-    ValueError
-        If a number makes no sense, the observer has no error bars or serves a range of plants, its output cannot be
-        written down, or most motions leave the system's bounds; :class:`observers.ArtifactError` (a ValueError) if it
-        was made for another system.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
     artifact.require_spread()

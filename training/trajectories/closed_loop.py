@@ -21,11 +21,7 @@ GROUPS = 50  # of closed-loop trajectories with a noise level and a time for whi
 class ClosedLoop(Trajectories):
     """Trajectories under a controller that acts on an observer's estimate; z holds the noise that the observer saw.
 
-    Parameters
-    ----------
-    measurement_noise : ndarray, shape (n, ny)
-        Its standard deviation along each trajectory. The other parameters are those of
-        :class:`training.trajectories.record.Trajectories`.
+    Shapes: ``measurement_noise`` (n, ny).
     """
 
     measurement_noise: np.ndarray
@@ -52,41 +48,7 @@ def record_closed_loop(
     controller saw. Groups of trajectories differ in noise level, in how long an action is held, and in the level of
     process noise if the observer is told it. Trajectories of a group differ in how much is added to an action.
 
-    Parameters
-    ----------
-    system : System
-        What is simulated.
-    artifact : Artifact
-        The observer.
-    controller : callable
-        Estimates (n, nx) to actions (n, nu) in [-1, 1].
-    n : int
-        Number of trajectories.
-    steps : int
-        Their length in sampling intervals of the observer.
-    ages : ndarray of int, shape (m,)
-        Samples at which to record, sorted.
-    rng : Generator
-        Of everything random.
-    noise_free_share : float, default 0.2
-        Share of the groups without measurement noise, as in :class:`training.config.Config`. The maps that ship were
-        made with the defaults of this and the next.
-    high_noise_emphasis : float, default 2
-        How often levels of measurement noise are high, as there.
-    process_noise_share : float, default 0
-        Share of the groups with process noise, as there, if the observer is told its level.
-    report : callable, optional
-        Told the number of trajectories that are there so far.
-
-    Returns
-    -------
-    ClosedLoop
-        The trajectories that stayed within the system's bounds, perhaps fewer than n.
-
-    Raises
-    ------
-    ValueError
-        If more than half of them leave the bounds.
+    Shapes: ``ages`` (m,).
     """
     dt = artifact.filter.dt
     low, high = (np.array(bound)[:, None] for bound in zip(*system.bounds, strict=True))

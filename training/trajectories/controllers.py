@@ -18,21 +18,6 @@ def linear_quadratic(system: System) -> Controller:
     """Linear-quadratic regulator of the linearisation at the target, u = -K (x - target) cut at the input bounds.
 
     Its weights are 1/scale^2 on the state and INPUT_WEIGHT/u_max^2 on the input, on each step in discrete time.
-
-    Parameters
-    ----------
-    system : System
-        What is to be held at its target.
-
-    Returns
-    -------
-    Controller
-        The regulator.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        If the linearisation cannot be stabilised.
     """
     target, u_max = np.array(system.target), np.array(system.u_max)
     A, B, _ = linearised(system, system.target)

@@ -25,25 +25,6 @@ def jacobian(equations: Callable[[Components], Components], nx: int) -> list[dic
 
     At a kink, as of ``abs`` or ``maximum``, a derivative is the mean of those on both sides; at a jump it is that
     beside it.
-
-    Parameters
-    ----------
-    equations : callable
-        A system's f or h.
-    nx : int
-        Number of states.
-
-    Returns
-    -------
-    list of dict
-        For each component the derivatives that are not zero, as functions of the states by index of the state.
-
-    Raises
-    ------
-    EquationError
-        If the equations do not take sympy symbols.
-    ValueError
-        If sympy cannot differentiate them.
     """
     import sympy  # here, because it takes half a second that other commands need not wait for
 
@@ -117,23 +98,6 @@ def with_sensitivity(system: System, driven: bool = True) -> System:
     """Put a system beside its variational equation, x' = f(x) + g(x) u and Phi' = d(f + g u)/dx Phi.
 
     In discrete time the next Phi is that of the step, d step/dx Phi. A motion whose Phi grows beyond LARGEST is lost.
-
-    Parameters
-    ----------
-    system : System
-        The system.
-    driven : bool, default True
-        Whether it keeps its inputs.
-
-    Returns
-    -------
-    System
-        One whose states are x and then Phi row by row.
-
-    Raises
-    ------
-    ValueError
-        If the equations do not take sympy symbols.
     """
     nx, nu = system.nx, system.nu if driven else 0
     low, high = system.box()

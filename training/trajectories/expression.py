@@ -30,24 +30,7 @@ _NAMES = {
 
 
 def output_expression(system: System) -> Expression:
-    """Write a system's output as an expression.
-
-    Parameters
-    ----------
-    system : System
-        Any system whose h takes sympy symbols.
-
-    Returns
-    -------
-    Expression
-        Of the states, with the system's parameters as numbers.
-
-    Raises
-    ------
-    ValueError
-        If h does not take symbols, is beyond what expressions can say, or is not the same on symbols as on arrays. The
-        message says what follows, and what to write instead.
-    """
+    """Write a system's output as an expression."""
     import sympy  # here, because it takes half a second that other commands need not wait for
 
     x = list(sympy.symbols(f"x:{system.nx}", real=True))

@@ -22,23 +22,7 @@ def draw_process_noise(
 ) -> np.ndarray:
     """Draw process noise, uniform in a box and held over each sampling interval.
 
-    Parameters
-    ----------
-    system : System
-        What it is to disturb.
-    level : float or ndarray, shape (n,)
-        Largest magnitude in multiples of the system's scale per second, for all trajectories or each of them.
-    n : int
-        Number of trajectories.
-    steps : int
-        Number of sampling intervals.
-    rng : Generator
-        Of everything random.
-
-    Returns
-    -------
-    ndarray, shape (steps, n, nx)
-        w in units of the states per second.
+    Shapes: ``level`` (n,); returns (steps, n, nx).
     """
     bound = np.multiply.outer(level, system.scale)
     return np.asarray(bound * rng.uniform(-1.0, 1.0, (steps, n, system.nx)))

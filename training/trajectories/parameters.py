@@ -20,46 +20,14 @@ ROOM = 1e6  # half-widths of its range that a parameter may lie from the middle
 
 
 def with_values(system: System, values: Mapping[str, Any]) -> System:
-    """A system with parameters that need not be numbers.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    values : mapping of str to array, tensor or symbol
-        Parameters by name.
-
-    Returns
-    -------
-    System
-        One whose equations work with these values. It is good for nothing else.
-    """
+    """A system with parameters that need not be numbers."""
     changed = object.__new__(type(system))  # past the class's own check, which asks for floats
     changed.__dict__.update(system.__dict__, **values)
     return changed
 
 
 def relative_ranges(system: System, half_widths: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Ranges about the values that a system's parameters have.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    half_widths : mapping of str to float
-        By the parameter's name, how far it may be from its value, as a part of that. "all" stands for each parameter
-        that is not named.
-
-    Returns
-    -------
-    dict of str to (float, float)
-        Low and high end of each parameter, in the system's own order.
-
-    Raises
-    ------
-    ValueError
-        If the system lacks a parameter, or one of them is 0 or has no room.
-    """
+    """Ranges about the values that a system's parameters have."""
     known = system.parameters
     for name in half_widths:
         if name not in known and name != EVERY:
@@ -87,18 +55,6 @@ def uncertain_plant(system: System, ranges: Mapping[str, tuple[float, float]]) -
 
     Some motions have the system's own parameters, which are the likeliest: two in three where one parameter is
     uncertain. In the others parameters lie more often near the ends of their ranges, where plants are hardest to serve.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    ranges : mapping of str to (float, float)
-        Low and high end of each uncertain parameter.
-
-    Returns
-    -------
-    System
-        As :func:`with_parameters` returns it; the same system if there are no ranges.
     """
     return with_parameters(system, ranges, nominal_share(ranges), at_ends=True)
 
@@ -115,28 +71,6 @@ def with_parameters(
 
     An observer of such a system estimates parameters, a motion of it has parameters of its own, and derivatives by its
     states are derivatives by parameters as well.
-
-    Parameters
-    ----------
-    system : System
-        Any system.
-    ranges : mapping of str to (float, float)
-        Low and high end of each parameter that becomes a state, in this order.
-    nominal_share : float, default 0
-        Share of the starts that have the system's own parameters; the others draw theirs from the ranges.
-    at_ends : bool, default False
-        Whether these lie more often near the ends of their ranges, as the sine of an angle that is drawn evenly, or
-        anywhere alike.
-
-    Returns
-    -------
-    System
-        Of the same name, dt, noise and inputs; the same system if there are no ranges.
-
-    Raises
-    ------
-    ValueError
-        If the system lacks a parameter, or a range is empty.
     """
     for name, (low, high) in ranges.items():
         if name not in system.parameters:

@@ -36,40 +36,7 @@ def under_policy(
     itself. So each trajectory has an error of its own, which is added to the state before the policy sees it, and
     something of its own is added to the action. Both are held or swing, at random sizes and rates.
 
-    Parameters
-    ----------
-    system : System
-        What is simulated, unless a plant is; how large errors are and how fast they change is that of the system.
-    policy : callable
-        States (n, nx) to actions (n, nu) in [-1, 1].
-    x0 : ndarray, shape (n, nx)
-        Starts.
-    steps : int
-        Number of sampling intervals.
-    dt : float
-        Their length in seconds; actions are held over each.
-    rng : Generator
-        Of errors and exploration.
-    own : ndarray of bool, shape (n,)
-        Which of the trajectories are the policy's own, without either.
-    w : ndarray, shape (steps, n, nx), optional
-        Process noise, held over each interval.
-    report : callable, optional
-        Told now and then the number of intervals that are done.
-    plant : System, optional
-        What is simulated in the place of the system, with the same states and inputs.
-
-    Returns
-    -------
-    x : ndarray, shape (steps + 1, n, nx)
-        States, NaN from where a trajectory has left the system's bounds.
-    u : ndarray, shape (steps, n, nu)
-        Inputs in their own units.
-
-    Raises
-    ------
-    ValueError
-        If the policy gives an action that is no number.
+    Shapes: ``x0`` (n, nx), ``own`` (n,), ``w`` (steps, n, nx); returns ``x`` (steps + 1, n, nx), ``u`` (steps, n, nu).
     """
     n, u_max = len(x0), np.array(system.u_max)
     error = random_signals(system.scale, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=SIGNALS)
@@ -93,27 +60,7 @@ def under_policy(
 
 
 def checked_policy(policy: Controller, system: System, name: str) -> Controller:
-    """Raise an error unless a policy does on some states what a policy should, and wherever it fails later.
-
-    Parameters
-    ----------
-    policy : callable
-        States (n, nx) to actions (n, nu) in [-1, 1].
-    system : System
-        What it is to act on.
-    name : str
-        For messages.
-
-    Returns
-    -------
-    callable
-        The same, whose errors are ValueErrors that say where in the user's code they come from.
-
-    Raises
-    ------
-    ValueError
-        If the system has no inputs, or the policy fails on states, or returns something else.
-    """
+    """Raise an error unless a policy does on some states what a policy should, and wherever it fails later."""
     if not system.nu:
         raise ValueError(f"{system.name} has no inputs for the policy {name!r} to act by")
 

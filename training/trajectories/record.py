@@ -31,18 +31,7 @@ NEAR = 0.4  # share of the trajectories that start in X itself where others star
 class Trajectories:
     """Trajectories of a system, measured without noise, with the filter running beside them from its own start.
 
-    Parameters
-    ----------
-    ages : ndarray of int, shape (m,)
-        Samples since reset at which they were recorded, sorted.
-    x : ndarray, shape (m, n, nx)
-        States.
-    z : ndarray, shape (m, n, size)
-        The filter's.
-    process_noise : ndarray, shape (n,)
-        Its level along each trajectory, in multiples of the system's scale per second.
-    nominal : ndarray of bool, shape (n,), optional
-        Where parameters differ from trajectory to trajectory, which of these have the system's own.
+    Shapes: ``ages`` (m,), ``x`` (m, n, nx), ``z`` (m, n, size), ``process_noise`` (n,), ``nominal`` (n,).
     """
 
     ages: np.ndarray
@@ -54,24 +43,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class Motions:
-    """What trajectories are drawn from, beside uniform starts in the training box.
-
-    Parameters
-    ----------
-    kinds : tuple of str
-        Of random inputs, see :func:`training.trajectories.signals.random_inputs`; without any there are no inputs.
-    lead_in_share : float, default 0
-        Share of the trajectories that start where inputs have led from X, if the system has any: beyond X.
-    lead_in_input : float, default 0
-        If positive, these inputs are constant, up to so many times their bounds, for CONSTANT_LEAD_IN seconds. If 0,
-        they are random within their bounds, for RANDOM_LEAD_IN seconds.
-    process_noise_share : float, default 0
-        Share of the trajectories with process noise, at any level up to the system's own, high ones more often.
-    box_factor : float, default 1
-        If larger, most trajectories start in this multiple of X.
-    policy : callable, optional
-        Acts on all trajectories in place of random inputs, see :func:`training.trajectories.policy.under_policy`.
-    """
+    """What trajectories are drawn from, beside uniform starts in the training box."""
 
     kinds: tuple[str, ...] = ()
     lead_in_share: float = 0.0
@@ -84,17 +56,7 @@ class Motions:
 def recording_ages(steps: int, n: int) -> np.ndarray:
     """Ages at which to record trajectories: half of them even in the logarithm, which catches the transient.
 
-    Parameters
-    ----------
-    steps : int
-        The greatest age.
-    n : int
-        How many ages at most, 2 or more.
-
-    Returns
-    -------
-    ndarray of int, shape (at most n,)
-        Samples since reset, sorted, from 0 to the greatest; the other half is even in time.
+    Shapes: returns (at most n,).
     """
     late = max(2, n - n // 2)  # the first and the greatest age at least
     even = np.linspace(0, steps, late).round()
@@ -115,34 +77,7 @@ def record(
 ) -> Trajectories:
     """Simulate trajectories and run the filter beside them.
 
-    Parameters
-    ----------
-    system : System
-        What is simulated.
-    linear : LinearFilter
-        The filter.
-    n : int
-        Number of trajectories.
-    steps : int
-        Their length in sampling intervals of the filter.
-    ages : ndarray of int, shape (m,)
-        Samples at which to record, sorted.
-    rng : Generator
-        Of everything random.
-    motions : Motions, optional
-        What to draw from, undriven if the filter takes no inputs; by default all kinds of inputs.
-    report : callable, optional
-        Told the number of trajectories that are there so far, parts of those under way included.
-
-    Returns
-    -------
-    Trajectories
-        What was recorded.
-
-    Raises
-    ------
-    ValueError
-        If hardly any trajectory stays within the system's bounds.
+    Shapes: ``ages`` (m,).
     """
     motions = motions or Motions(kinds=KINDS)
     if not linear.nu:
@@ -173,36 +108,7 @@ def trajectories(
     Those that leave the system's bounds are replaced by new ones of the same kind: driven alike, and led from X or not.
     Starts and process noise are drawn anew.
 
-    Parameters
-    ----------
-    system : System
-        What is simulated.
-    n : int
-        Number of trajectories.
-    steps : int
-        Their length in sampling intervals.
-    dt : float
-        Sampling interval in seconds.
-    rng : Generator
-        Of everything random.
-    motions : Motions, optional
-        What to draw from; by default there are no inputs and no process noise, and starts lie in X.
-    report : callable, optional
-        As for :func:`record`.
-
-    Yields
-    ------
-    x : ndarray, shape (steps + 1, at most CHUNK, nx)
-        States.
-    u : ndarray, shape (steps, at most CHUNK, nu)
-        Inputs, without columns if there are none.
-    level : ndarray, shape (at most CHUNK,)
-        Levels of process noise, in multiples of the system's scale per second.
-
-    Raises
-    ------
-    ValueError
-        If hardly any trajectory stays within the bounds.
+    Shapes: returns ``x`` (steps + 1, at most CHUNK, nx), ``u`` (steps, at most CHUNK, nu), ``level`` (at most CHUNK,).
     """
     motions = motions or Motions()
     tried, pending = 0, []

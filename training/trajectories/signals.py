@@ -15,25 +15,7 @@ def random_inputs(
 ) -> np.ndarray:
     """Draw random inputs, held over each sampling interval.
 
-    Parameters
-    ----------
-    system : System
-        What they are to drive, within its input bounds and at its pace.
-    n : int
-        Number of trajectories.
-    steps : int
-        Number of sampling intervals.
-    dt : float
-        Their length in seconds.
-    rng : Generator
-        Of everything random.
-    kinds : tuple of str
-        As of :func:`random_signals`; by default "zero" twice as often as each of the others.
-
-    Returns
-    -------
-    ndarray, shape (steps, n, nu)
-        The inputs, in their own units.
+    Shapes: returns (steps, n, nu).
     """
     return random_signals(system.u_max, n, steps, dt=dt, pace=system.pace, rng=rng, kinds=kinds)
 
@@ -50,33 +32,7 @@ def random_signals(
 ) -> np.ndarray:
     """Draw random bounded signals, held over each sampling interval.
 
-    Parameters
-    ----------
-    bounds : sequence of float, length k
-        Largest magnitude of each component.
-    n : int
-        Number of signals.
-    steps : int
-        Number of sampling intervals.
-    dt : float
-        Their length in seconds.
-    pace : float
-        Seconds that are to the system what one second is to those that ship, see :attr:`kkl_gym.System.pace`.
-    rng : Generator
-        Of everything random.
-    kinds : tuple of str
-        The signals are of these in turn:
-
-        - "zero": nothing;
-        - "steps": values uniform within the bounds, held for times that are log-uniform in 0.05 to 5 s at that pace;
-        - "pulses": the same up to a time uniform within the record, and nothing from there on;
-        - "sine": amplitudes uniform up to the bounds, angular frequencies log-uniform in 0.2 to 20 rad/s
-          at that pace.
-
-    Returns
-    -------
-    ndarray, shape (steps, n, k)
-        The signals, in units of the bounds.
+    Shapes: ``bounds`` of length k; returns (steps, n, k).
     """
     out = np.zeros((steps, n, len(bounds)))
     t = np.arange(steps) * dt

@@ -35,19 +35,7 @@ RUNS = 50  # on which its observer is measured
 def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> dict[str, Any]:
     """Find the settings of a :class:`training.config.Config` that make an observer for some noise.
 
-    Parameters
-    ----------
-    system : System
-        To be observed.
-    spectrum : Spectrum
-        Of its filter.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation that is expected on each sample of y, of all outputs or each.
-
-    Returns
-    -------
-    dict
-        Settings by name; the others are the preset's.
+    Shapes: ``measurement_noise`` of length ny.
     """
     largest = np.maximum(HEADROOM * np.asarray(measurement_noise), multiple(system, LEAST_NOISE))
     return {
@@ -63,24 +51,7 @@ def settings(system: System, spectrum: Spectrum, measurement_noise: Level) -> di
 class Trial:
     """An observer of free motion, trained for a spectrum: a job.
 
-    Parameters
-    ----------
-    system : str
-        As for :func:`kkl_gym.systems.get_system`.
-    parameters : mapping of str to float
-        Physical parameters that differ from its defaults.
-    spectrum : Spectrum
-        Of the filter.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seconds : float
-        CPU time of the training.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length of each run in seconds.
-    out : Path
-        Has a folder for it, which receives error.json.
+    Shapes: ``measurement_noise`` of length ny.
     """
 
     system: str
@@ -123,20 +94,7 @@ class Trial:
 
 
 def run_trial(trial: Trial) -> None:
-    """Train an observer and measure what it leaves, unless that is done; goes on where an earlier run stopped.
-
-    Parameters
-    ----------
-    trial : Trial
-        What is to be trained.
-
-    Raises
-    ------
-    ValueError
-        If another process is at work on it.
-    FloatingPointError
-        If its training blows up.
-    """
+    """Train an observer and measure what it leaves, unless that is done; goes on where an earlier run stopped."""
     torch.set_num_threads(1)
     system = get_system(trial.system, trial.parameters)
     config = replace(
@@ -161,16 +119,5 @@ def run_trial(trial: Trial) -> None:
 
 
 def rank_correlation(predicted: Sequence[float], measured: Sequence[float]) -> float:
-    """Spearman's rank correlation.
-
-    Parameters
-    ----------
-    predicted, measured : sequences of float
-        As many of each.
-
-    Returns
-    -------
-    float
-        NaN for fewer than three pairs, which tell nothing.
-    """
+    """Spearman's rank correlation."""
     return float(spearmanr(predicted, measured).statistic) if len(predicted) > 2 else np.nan

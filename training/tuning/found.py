@@ -26,20 +26,7 @@ EXTENDED = "default's real ones and more"
 class Found:
     """What tuning found for a system.
 
-    Parameters
-    ----------
-    system : System
-        That is to be observed.
-    noise : float or tuple of float, length ny
-        Standard deviation of the measurement noise to tune for, of all outputs or each.
-    fronts : dict of levels of noise to list of Choice
-        Spectra of more and more modes by level of noise.
-    others : list of Choice
-        To compare with, at ``noise``.
-    best : Choice
-        One of them.
-    least : float or None
-        Error in percent of whoever knows the equations; None where an output is without noise.
+    Shapes: ``noise`` of length ny.
     """
 
     system: System

@@ -20,15 +20,7 @@ CANDIDATE, PAPERS = "interval", "paper's"
 
 @dataclass(frozen=True)
 class Judged:
-    """Spectra of real eigenvalues with what is known of them before training.
-
-    Parameters
-    ----------
-    choices : list of Choice
-        The intervals to choose from, slow ones first, and the paper's for comparison.
-    smoothness : list of Smoothness
-        Of each.
-    """
+    """Spectra of real eigenvalues with what is known of them before training."""
 
     choices: list[Choice]
     smoothness: list[Smoothness]
@@ -88,30 +80,7 @@ def judge(
 ) -> Judged:
     """Judge the intervals of :mod:`training.smoothness` and the paper's.
 
-    Parameters
-    ----------
-    system : System
-        Any system.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length in seconds of the runs over which errors are predicted.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y, of all outputs or each.
-    seed : int, default 0
-        Of the motions' starts.
-    report : callable, optional
-        Told the share of the work that is done.
-
-    Returns
-    -------
-    Judged
-        What was found.
-
-    Raises
-    ------
-    ValueError
-        If the system's motions cannot be followed.
+    Shapes: ``measurement_noise`` of length ny.
     """
     probe = Probe(system, dt, duration, seed=seed)
     candidates, papers = intervals(system, dt), Spectrum(papers_spectrum(system))

@@ -33,17 +33,7 @@ MIXED = 10.0  # largest half-width of X, in the smallest, beyond which states ar
 
 @dataclass(frozen=True)
 class Choice:
-    """A spectrum with the error that is predicted for it.
-
-    Parameters
-    ----------
-    spectrum : Spectrum
-        Modes for each output.
-    error : float
-        In percent.
-    kind : str
-        How it was found, for tables.
-    """
+    """A spectrum with the error that is predicted for it."""
 
     spectrum: Spectrum
     error: float
@@ -64,31 +54,6 @@ class Probe:
 
     Where X's half-widths differ by more than MIXED, states are taken in units of them. |x| is the distance from
     ``system.X_centre``.
-
-    Parameters
-    ----------
-    system : System
-        Any system; without a policy its input is zero here.
-    dt : float
-        Sampling interval in seconds.
-    duration : float
-        Length in seconds of the runs over which the error is averaged.
-    motions : int
-        Number of motions that are followed.
-    seed : int
-        Of their starts.
-    start : Spectrum
-        Modes to choose more to, beside the library.
-    step : callable, optional
-        Takes the steps of the motions alone; NumPy's if it is left out.
-    policy : callable, optional
-        States (n, nx) to actions (n, nu) in [-1, 1]: what acts on the motions, as in training; nothing does if it is
-        left out. The inputs count as known, and so they tell nothing of the start.
-
-    Raises
-    ------
-    ValueError
-        If hardly any motion stays within the system's bounds, or none can be followed for long.
     """
 
     system: System
@@ -174,19 +139,7 @@ class Probe:
     def response(self, spectrum: Spectrum) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Run the filter with some spectrum along the motions.
 
-        Parameters
-        ----------
-        spectrum : Spectrum
-            Modes for each output.
-
-        Returns
-        -------
-        ndarray, shape (ages, motions, size)
-            What it makes of the outputs: z.
-        ndarray, shape (ages, motions, nx, size)
-            Of errors in the starts, to first order.
-        ndarray, shape (ages, size, size)
-            Of noise on the outputs: its covariance in z for a standard deviation of 1.
+        Shapes: returns (ages, motions, size), (ages, motions, nx, size), (ages, size, size).
         """
         linear = spectrum.filter(self.system.ny, self.dt)
         steps, n, ny, nx = self.signal.shape
@@ -198,64 +151,21 @@ class Probe:
     def error(self, spectrum: Spectrum, measurement_noise: Level) -> float:
         """Predict the error of the best decoder.
 
-        Parameters
-        ----------
-        spectrum : Spectrum
-            Modes for each output.
-        measurement_noise : float or sequence of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-
-        Returns
-        -------
-        float
-            |x_hat - x|/|x| in percent: root mean square, mean over runs.
-
-        Raises
-        ------
-        FloatingPointError
-            If it is no number.
+        Shapes: ``measurement_noise`` of length ny.
         """
         return self._relative(self._information(*self.response(spectrum), measurement_noise))
 
     def least(self, measurement_noise: Level) -> float:
         """Predict the error of whoever knows the equations and remembers every sample of y.
 
-        Parameters
-        ----------
-        measurement_noise : float or sequence of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-
-        Returns
-        -------
-        float
-            As of :meth:`error`.
-
-        Raises
-        ------
-        ValueError
-            If an output is without noise.
+        Shapes: ``measurement_noise`` of length ny.
         """
         return self._relative(self._all_information(measurement_noise))
 
     def error_of_states(self, spectrum: Spectrum | None, measurement_noise: Level) -> np.ndarray:
         """Predict the error of the best decoder, or the least possible, for each state.
 
-        Parameters
-        ----------
-        spectrum : Spectrum or None
-            Modes for each output. None is for whoever knows the equations and remembers every sample of y.
-        measurement_noise : float or sequence of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-
-        Returns
-        -------
-        ndarray, shape (nx,)
-            Root mean square errors in the units of the states, mean over runs and time.
-
-        Raises
-        ------
-        ValueError
-            With neither spectrum nor noise.
+        Shapes: ``measurement_noise`` of length ny; returns (nx,).
         """
         if spectrum is None:
             information = self._all_information(measurement_noise)
@@ -266,21 +176,7 @@ class Probe:
     def unknown_of_starts(self, measurement_noise: Level) -> np.ndarray:
         """Predict what all of y leaves unknown of where a run started.
 
-        Parameters
-        ----------
-        measurement_noise : float or sequence of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-
-        Returns
-        -------
-        ndarray, shape (nx, nx)
-            Covariance, mean over runs, in units in which that of a start uniform in X is the identity. A direction in
-            which it is 1 cannot be told from y.
-
-        Raises
-        ------
-        ValueError
-            Without noise.
+        Shapes: ``measurement_noise`` of length ny; returns (nx, nx).
         """
         known = np.linalg.cholesky(self._known).T
         root = known @ _inverse_root(self._all_information(measurement_noise)[-1] + self._known)
@@ -320,19 +216,7 @@ class Probe:
     def choose(self, measurement_noise: Level, most: int = 21, anew: bool = False) -> list[Choice]:
         """Choose spectra of more and more modes, each the one before and the mode, or pair, that helps most.
 
-        Parameters
-        ----------
-        measurement_noise : float or tuple of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-        most : int
-            Modes for each output at which it ends. It also ends where none lowers the error by LEAST_GAIN.
-        anew : bool
-            Begin with a mode of the library. Otherwise the first spectrum is ``start``, if there is one.
-
-        Returns
-        -------
-        list of Choice
-            At least one. With several outputs, each has all modes.
+        Shapes: ``measurement_noise`` of length ny.
         """
         z, Z, P = self._of_library
         ny, everything = self.system.ny, self.start + self.library
@@ -373,19 +257,7 @@ class Probe:
     def bessel(self, measurement_noise: Level, orders: Sequence[int], cutoffs: Iterable[float]) -> list[Choice]:
         """Find Bessel filters to compare with.
 
-        Parameters
-        ----------
-        measurement_noise : float or tuple of float, length ny
-            Standard deviation of the noise on each sample of y, of all outputs or each.
-        orders : sequence of int
-            Of the filters: their numbers of modes.
-        cutoffs : iterable of float
-            In rad/s, to choose the best from.
-
-        Returns
-        -------
-        list of Choice
-            One for each order.
+        Shapes: ``measurement_noise`` of length ny.
         """
         found, cutoffs = [], list(cutoffs)
         for order in orders:

@@ -32,25 +32,7 @@ MANY = 100  # seeds, more than anyone trains
 
 @dataclass(frozen=True)
 class Case:
-    """One agent: trained, then played on the evaluation's episodes.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Where it acts.
-    kind : {"random", "state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
-        What it is shown; of "random" nobody learns.
-    seed : int
-        The agent's.
-    episodes : int
-        Number of episodes that it is played on.
-    timesteps : int or None
-        Steps to learn from, those of an observer included; None takes what the hyperparameters say.
-    aggregate : int
-        How many times an observer is fitted again while the agent learns.
-    folder : Path
-        Receives job.json, result.json, the learning curve and the agent.
-    """
+    """One agent: trained, then played on the evaluation's episodes."""
 
     task: HiddenTask
     kind: Kind
@@ -116,18 +98,7 @@ class Case:
 
 
 def run_case(case: Case) -> None:
-    """Train and evaluate an agent, unless that is done.
-
-    Parameters
-    ----------
-    case : Case
-        The agent.
-
-    Raises
-    ------
-    ValueError
-        If another process is at work on it, or its folder holds an agent of another comparison.
-    """
+    """Train and evaluate an agent, unless that is done."""
     with claimed_job(case.folder, case.identity, OTHER):
         if not case.done:
             write(case.folder / RESULT, json.dumps(_run(case)) + "\n")
@@ -206,30 +177,7 @@ def planned(
     timesteps: int | None = None,
     aggregate: int = 0,
 ) -> list[Case]:
-    """All agents of a comparison, the first seed of each first.
-
-    Parameters
-    ----------
-    tasks : sequence of HiddenTask
-        Where they act.
-    out : Path
-        Folder of the comparison, under which each agent has one.
-    kinds : sequence of str
-        What agents are shown.
-    seeds : int
-        Agents of each kind.
-    episodes : int
-        Number of episodes that each is played on.
-    timesteps : int, optional
-        Steps to learn from; by default what the hyperparameters say.
-    aggregate : int
-        As for :class:`Case`.
-
-    Returns
-    -------
-    list of Case
-        What is to be done. The full state is without noise, so that tasks that differ in noise alone share its agents.
-    """
+    """All agents of a comparison, the first seed of each first."""
     found: dict[Path, Case] = {}
     for seed in range(seeds):
         for task in tasks:
@@ -241,23 +189,7 @@ def planned(
 
 
 def collect(cases: Sequence[Case]) -> "pd.DataFrame":
-    """Results of the agents that are done.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-        Those of the comparison that are done.
-
-    Returns
-    -------
-    DataFrame
-        One row for each agent: environment, noise, shown, seed, return (the mean of its episodes), seconds.
-
-    Raises
-    ------
-    ValueError
-        If a result is damaged.
-    """
+    """Results of the agents that are done."""
     import pandas as pd
 
     rows = []

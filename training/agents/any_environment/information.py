@@ -27,34 +27,7 @@ ESTIMATES: tuple[Shown, ...] = ("x_hat", "stacked_x_hat")  # what is learned fro
 def show(
     task: HiddenTask, information: Shown, observer: str | None = None, *, keep: int | None = None
 ) -> gym.Env[np.ndarray, Any]:
-    """Make a task's environment in which an agent sees what ``information`` says.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        The environment, what is measured and how well.
-    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
-        "state": the whole observation without noise. The others see what is measured, y, with its noise. "x_hat": y,
-        and what an observer that was learned from rollouts estimates; under noise the estimates alone, of what is
-        measured too. "stacked_x_hat": the same, estimated by a network from what "stacked" shows. "z": y and the memory
-        of :class:`kkl_gym.KKLMemory`. "stacked": the last y, as many as the task says, each with the action before it.
-        "recurrent": y with the action before it, for a policy that remembers by itself. "y": y alone. The task says
-        whether "z" and "stacked" hold past actions, and which entries are angles there.
-    observer : str, optional
-        File of the observer, for "x_hat", or of a :class:`WindowEstimator`, for "stacked_x_hat".
-    keep : int, optional
-        Of "stacked_x_hat", how many steps are kept to fit the estimator again; by default none.
-
-    Returns
-    -------
-    gymnasium.Env
-        The environment.
-
-    Raises
-    ------
-    ValueError
-        If the task makes no sense, the information is unknown or the observer is missing or another environment's.
-    """
+    """Make a task's environment in which an agent sees what ``information`` says."""
     if information not in SHOWN:
         raise ValueError(f"an agent is shown one of {', '.join(SHOWN)}, got {information!r}")
     if information == "state":
@@ -98,20 +71,7 @@ def _stacked_estimates(
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
-    """Show some entries of an observation alone.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        With a row of numbers as its observation.
-    entries : sequence of int
-        Those that are shown, in this order.
-
-    Returns
-    -------
-    gymnasium.Env
-        The environment, with observations in float32.
-    """
+    """Show some entries of an observation alone."""
     space: Any = env.observation_space
     chosen = list(entries)
     part = gym.spaces.Box(space.low[chosen], space.high[chosen], dtype=np.float32)
@@ -127,17 +87,6 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
 
     Before an episode's first step there were its first observation and no action. Of an angle earlier observations
     show how far it has turned since, in rad, as :func:`kkl_gym.turning.turned` finds it.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        With rows of numbers as observations.
-    count : int
-        Observations shown.
-    angles : sequence of pairs of int
-        Entries that are the cosine and the sine of an angle.
-    actions : bool
-        Whether actions are shown.
     """
 
     def __init__(

@@ -54,22 +54,7 @@ _OF_THE_RUN = ("n_envs", "n_timesteps", "normalize", "noise_type", "noise_std") 
 
 
 def algorithm_for(action_space: gym.Space[Any], env_id: str, information: Shown) -> str:
-    """Choose who learns: recurrent PPO where that is what is shown, SAC where it has settings, else PPO.
-
-    Parameters
-    ----------
-    action_space : gymnasium.Space
-        Of the environment.
-    env_id : str
-        The environment.
-    information : str
-        What the agent is shown.
-
-    Returns
-    -------
-    str
-        A key of ``ALGORITHMS``.
-    """
+    """Choose who learns: recurrent PPO where that is what is shown, SAC where it has settings, else PPO."""
     if information == "recurrent":
         return RECURRENT
     return "sac" if isinstance(action_space, spaces.Box) and env_id in settings_of("sac") else "ppo"
@@ -77,23 +62,7 @@ def algorithm_for(action_space: gym.Space[Any], env_id: str, information: Shown)
 
 @cache
 def settings_of(algorithm: str) -> dict[str, dict[str, Any]]:
-    """What hyperparameters/ALGORITHM.yml says, by environment; rl-zoo3 reads these files too.
-
-    Parameters
-    ----------
-    algorithm : str
-        A key of ``ALGORITHMS``.
-
-    Returns
-    -------
-    dict of str to dict
-        Settings.
-
-    Raises
-    ------
-    ValueError
-        If there is no such algorithm.
-    """
+    """What hyperparameters/ALGORITHM.yml says, by environment; rl-zoo3 reads these files too."""
     if algorithm not in ALGORITHMS:
         raise ValueError(f"unknown algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
     folder = files("training.agents.any_environment").joinpath("hyperparameters")
@@ -101,27 +70,7 @@ def settings_of(algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def hyperparameters(algorithm: str, env_id: str, timesteps: int | None = None) -> dict[str, Any]:
-    """Find the settings of an algorithm for an environment.
-
-    Parameters
-    ----------
-    algorithm : str
-        A key of ``ALGORITHMS``.
-    env_id : str
-        The environment; one that the file does not name gets its default.
-    timesteps : int, optional
-        Steps in place of what the file says.
-
-    Returns
-    -------
-    dict
-        What hyperparameters/ALGORITHM.yml says.
-
-    Raises
-    ------
-    ValueError
-        If there is no such algorithm, or the number of steps is not positive.
-    """
+    """Find the settings of an algorithm for an environment."""
     known = settings_of(algorithm)
     found = deepcopy(known.get(env_id, known["default"]))
     if timesteps is not None:
@@ -150,42 +99,6 @@ def learn_to_play(
     is told the truth in their place. The observer is learned from what happens, and the agent goes on with estimates.
     Under noise estimates are far from the truth; these steps are then fewer, and random actions, from which the
     observer alone is learned. They count too.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Where it acts.
-    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"}
-        What it is shown, as :func:`training.agents.any_environment.information.show`.
-    folder : Path
-        Receives the learning curve, curve.csv, an observer's file if one is learned, and, where the policy is a
-        perceptron, agent.safetensors.
-    algorithm : str, optional
-        As :func:`algorithm_for` chooses by default.
-    timesteps : int, optional
-        Steps of the environment, all together; by default what the hyperparameters say.
-    seed : int
-        Of networks, exploration and episodes.
-    observer : str, optional
-        File of an observer, for x_hat, or of an estimator, for stacked_x_hat; by default one is learned.
-    observer_steps : int, optional
-        The agent's first steps, from the latest 100,000 of which it is learned; by default nine tenths of all, and
-        under noise one tenth. They end with what the algorithm collects at a time, and before what it collects last.
-    aggregate : int
-        How many times it is fitted again while the agent learns on estimates, where an algorithm begins to collect. A
-        twentieth of all steps, the last ones, is then without exploration, and followed by one more fit.
-    progress : ProgressBars, optional
-        Where bars are shown.
-
-    Returns
-    -------
-    stable_baselines3 algorithm
-        The agent, whose ``get_vec_normalize_env()`` says how what it is shown is scaled.
-
-    Raises
-    ------
-    ValueError
-        If something makes no sense or does not fit the environment.
     """
     with show(task, "state") as env:
         actions, estimated = env.action_space, task.estimated(gym.spaces.flatdim(env.observation_space))
@@ -353,13 +266,7 @@ class _Until(BaseCallback):
 
 
 class Bar(BaseCallback):
-    """Tells how many steps are done.
-
-    Parameters
-    ----------
-    report : callable
-        Whom.
-    """
+    """Tells how many steps are done."""
 
     def __init__(self, report: Callable[[float], object]) -> None:
         super().__init__()
@@ -371,20 +278,7 @@ class Bar(BaseCallback):
 
 
 class Curve(BaseCallback):
-    """Writes the learning curve: steps, CPU seconds and return, at the end of each episode.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    began : float
-        When the training began, as :func:`time.process_time` says it.
-
-    Attributes
-    ----------
-    spent : int
-        Steps that were spent before.
-    """
+    """Writes the learning curve: steps, CPU seconds and return, at the end of each episode."""
 
     def __init__(self, path: Path, *, began: float) -> None:
         super().__init__()
@@ -413,26 +307,7 @@ def player_of(
     observer: str | None = None,
     training: Mapping[str, Any] | None = None,
 ) -> Player:
-    """Take the deterministic policy out of a trained agent.
-
-    Parameters
-    ----------
-    model : stable_baselines3 algorithm
-        Whose policy is a perceptron.
-    task : HiddenTask
-        Where it acts.
-    information : str
-        What it is shown.
-    observer : str, optional
-        File of its observer.
-    training : mapping, optional
-        How it was trained.
-
-    Returns
-    -------
-    Player
-        The policy, with the scaling of what it is shown.
-    """
+    """Take the deterministic policy out of a trained agent."""
     head: Head = "clip"
     if isinstance(model.action_space, spaces.Discrete):
         head = "argmax"

@@ -31,50 +31,24 @@ SETTINGS: dict[str, Any] = {"inverse_steps": 2000, "members": 1}
 
 
 class Told:
-    """Environments in which an agent is told what an observer is to estimate, and which keep what happened last.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Of which environment, and what is measured, without noise.
-    rows : int
-        How many will be made, which keep 100,000 steps together.
-    """
+    """Environments in which an agent is told what an observer is to estimate, and which keep what happened last."""
 
     def __init__(self, task: HiddenTask, rows: int) -> None:
         self._task, self._each, self._recorders = task, max(1, KEPT // rows), list[Recorder]()
 
     def make(self) -> gym.Env[np.ndarray, Any]:
-        """Make one environment.
-
-        Returns
-        -------
-        gymnasium.Env
-            Its observations are those of an agent on estimates, had these no error.
-        """
+        """Make one environment."""
         env = self._task.make()
         recorder = Recorder(env, **self._task.signals(_size(env)), keep=self._each)
         self._recorders.append(recorder)
         return part_of(recorder, self._task.told(_size(env)))
 
     def records(self) -> list[Record]:
-        """Read what they keep.
-
-        Returns
-        -------
-        list of Record
-            One of each episode, first those of the first environment.
-        """
+        """Read what they keep."""
         return [record for records in self._rows() for record in records]
 
     def oldest_first(self) -> list[Record]:
-        """Read what they keep, those that ended first at the beginning.
-
-        Returns
-        -------
-        list of Record
-            As of :meth:`records`.
-        """
+        """Read what they keep, those that ended first at the beginning."""
         return oldest_first(self._rows())
 
     def _rows(self) -> list[list[Record]]:
@@ -82,18 +56,7 @@ class Told:
 
 
 def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
-    """Put together what environments have kept that were stepped together.
-
-    Parameters
-    ----------
-    rows : sequence of sequence of Record
-        Of each environment its episodes, in their order.
-
-    Returns
-    -------
-    list of Record
-        Those that ended first at the beginning.
-    """
+    """Put together what environments have kept that were stepped together."""
     dated = list[tuple[int, Record]]()
     for records in rows:
         after = 0  # steps that were made since
@@ -104,24 +67,7 @@ def oldest_first(rows: Sequence[Sequence[Record]]) -> list[Record]:
 
 
 def wander(task: HiddenTask, steps: int, *, seed: int, progress: ProgressBars) -> list[Record]:
-    """Act at random, each action held for a while.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        In which environment, and what is measured.
-    steps : int
-        Of the environment.
-    seed : int
-        Of the environment and the actions.
-    progress : ProgressBars
-        Where a bar is shown.
-
-    Returns
-    -------
-    list of Record
-        One of each episode, without noise.
-    """
+    """Act at random, each action held for a while."""
     with task.make(noisy=False) as env, progress.phase(f"playing {task.env_id}", steps) as report:
         policy = policy_of(WANDERING, env)
         rollouts = roll_out(env, policy, **task.signals(_size(env)), steps=steps, seed=seed, report=report)
@@ -136,26 +82,7 @@ def _size(env: gym.Env[np.ndarray, Any]) -> int:
 def learn_observer(
     task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
 ) -> Path:
-    """Learn an observer from an agent's first steps.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Of which environment, and what is measured.
-    records : sequence of Record
-        Of these steps, without noise.
-    folder : Path
-        Receives observer.safetensors.
-    seed : int
-        Of the training.
-    progress : ProgressBars
-        Where bars are shown.
-
-    Returns
-    -------
-    Path
-        The observer's file.
-    """
+    """Learn an observer from an agent's first steps."""
     changes: dict[str, Any] = {"seed": seed, "held_out": HELD_OUT, **SETTINGS}
     if task.measurement_noise:
         spread = np.std(np.concatenate([record.y for record in records]), 0)
@@ -178,26 +105,7 @@ def learn_observer(
 def refitting(
     task: HiddenTask, every: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
 ) -> KKLTrainingCallback:
-    """Make what fits an observer again to an agent's own steps.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Where the agent acts.
-    every : int
-        Steps from refit to refit.
-    rehearsal : int
-        Steps after the training in which the agent acts without exploration, for a last refit.
-    path : Path
-        Receives the observer in use at each time.
-    records : sequence of Record
-        From before, the oldest first, which it is fitted to as well.
-
-    Returns
-    -------
-    KKLTrainingCallback
-        For the training.
-    """
+    """Make what fits an observer again to an agent's own steps."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS

@@ -24,30 +24,7 @@ LARGEST_SCALED = 10.0  # of a normalised observation, as stable-baselines3 cuts 
 class Player:
     """A deterministic policy, the environment that it was trained in and what it is shown of it.
 
-    Parameters
-    ----------
-    network : MLP
-        Observations in, actions or what they follow from out.
-    head : {"tanh", "clip", "argmax"}
-        What makes an action of that: its hyperbolic tangent, stretched to the bounds (SAC, TD3, TQC); a cut at the
-        bounds (PPO, A2C); the largest entry, of discrete actions (PPO, A2C, DQN).
-    task : HiddenTask
-        Where it acts.
-    information : {"state", "x_hat", "stacked_x_hat", "z", "stacked", "y"}
-        What it is shown.
-    mean, scale : ndarray, shape (width,), optional
-        Observations are shown as (observation - mean) / scale, cut at 10; by default as they are.
-    observer : str, optional
-        File of the observer that it was trained on.
-    fingerprint : str, optional
-        Checksum of what that file holds.
-    training : mapping, optional
-        How it was trained.
-
-    Raises
-    ------
-    AgentError
-        If one of these is not as described.
+    Shapes: ``mean``, ``scale`` (width,).
     """
 
     network: MLP
@@ -82,26 +59,6 @@ class Player:
 
         An agent may come from a stranger's file, and to make an environment may import the module that its id names.
         So the id of an environment that is not Gymnasium's own does nothing unless the caller says it too.
-
-        Parameters
-        ----------
-        observer : str, optional
-            File of its observer, if it lies elsewhere now.
-        env_id : str, optional
-            The environment, as the agent names it. Needed if it is not Gymnasium's own.
-
-        Returns
-        -------
-        gymnasium.Env
-            What the agent is shown is its observation.
-
-        Raises
-        ------
-        AgentError
-            If its observer has changed, the policy does not fit the environment, or that is not Gymnasium's own and
-            not named.
-        ValueError
-            If the environment or the observer cannot be had.
         """
         named = self.task.env_id
         spec = gym.registry.get(named)
@@ -128,17 +85,7 @@ class Player:
     def act(self, observation: np.ndarray, action_space: gym.Space[Any]) -> Any:
         """Act.
 
-        Parameters
-        ----------
-        observation : ndarray, shape (width,) or (n, width)
-            What the agent is shown.
-        action_space : gymnasium.Space
-            Of one environment.
-
-        Returns
-        -------
-        ndarray
-            Actions, one or as many as there are rows.
+        Shapes: ``observation`` (width,) or (n, width).
         """
         if self.mean is not None:
             observation = np.clip((observation - self.mean) / self.scale, -LARGEST_SCALED, LARGEST_SCALED)
@@ -151,20 +98,7 @@ class Player:
         return np.clip(out, space.low, space.high).reshape(*out.shape[:-1], *space.shape)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write weights and description to one safetensors file, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file, whose name should end in ``.safetensors``; its folder is made.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        TypeError, ValueError
-            If JSON cannot hold ``training`` or the environment's arguments.
-        """
+        """Write weights and description to one safetensors file, whole or not at all."""
         tensors: dict[str, np.ndarray] = {}
         storage.put_mlp(tensors, "", self.network)
         if self.mean is not None and self.scale is not None:
@@ -183,23 +117,7 @@ class Player:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "Player":
-        """Read an agent.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file.
-
-        Returns
-        -------
-        Player
-            What :meth:`save` wrote.
-
-        Raises
-        ------
-        AgentError
-            If the file is missing, not readable, damaged, foreign or of a newer format.
-        """
+        """Read an agent."""
         tensors, described = storage.read(path, key=KEY, error=AgentError, what="an agent for any environment")
         with storage.explained(path, AgentError):
             if described.pop("format") != FORMAT:

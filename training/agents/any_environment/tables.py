@@ -40,24 +40,7 @@ def tasks_in(results: "pd.DataFrame") -> list[Task]:
 
 
 def cell(results: "pd.DataFrame", task: Task, shown: str) -> dict[str, Any] | None:
-    """What a table says of agents that are shown the same.
-
-    Parameters
-    ----------
-    results : DataFrame
-        As :func:`training.agents.any_environment.comparison.collect` returns them.
-    task : tuple of str and float
-        The environment and the noise.
-    shown : str
-        What the agents are shown.
-
-    Returns
-    -------
-    dict or None
-        ``returns`` of the agents, their interquartile mean ``middle``, ``seconds``, and ``interval``, the normalised
-        mean with its ends, and ``agents``, normalised, where random actions and the full state are known. None where
-        there are no agents.
-    """
+    """What a table says of agents that are shown the same."""
     here = results[results.environment == task[0]]
     noise = 0.0 if shown == "state" else task[1]
     mine = here[(here.shown == shown) & (here.noise == noise)]
@@ -75,19 +58,7 @@ def cell(results: "pd.DataFrame", task: Task, shown: str) -> dict[str, Any] | No
 
 
 def write_table(path: Path, results: "pd.DataFrame", partial: str = "", settings: str = "") -> None:
-    """Write the table of a comparison.
-
-    Parameters
-    ----------
-    path : Path
-        A Markdown file.
-    results : DataFrame
-        As :func:`training.agents.any_environment.comparison.collect` returns them.
-    partial : str
-        What is missing, as a sentence.
-    settings : str
-        What is not as by default, as a sentence.
-    """
+    """Write the table of a comparison."""
     tasks = tasks_in(results)
     shown = [kind for kind in SHOWN if kind in set(results.shown)]
     lines = [
@@ -129,17 +100,7 @@ def _written(found: Mapping[str, Any]) -> str:
 
 
 def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
-    """Draw the normalised returns of all agents.
-
-    Parameters
-    ----------
-    path : Path
-        A PNG file.
-    results : DataFrame
-        As :func:`training.agents.any_environment.comparison.collect` returns them.
-    partial : str
-        What is missing, as a sentence.
-    """
+    """Draw the normalised returns of all agents."""
     shown = [kind for kind in reversed(SHOWN) if kind in set(results.shown)]
     panels = {}
     for task in tasks_in(results):
@@ -151,18 +112,7 @@ def draw_scores(path: Path, results: "pd.DataFrame", partial: str = "") -> None:
 
 
 def curves(cases: Sequence[Case]) -> "pd.DataFrame":
-    """Learning curves: returns of training episodes, averaged over a twentieth of the training, over its steps.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-        Agents that are done.
-
-    Returns
-    -------
-    DataFrame
-        environment, noise, shown, steps, seconds and return, the last two interquartile means over agents.
-    """
+    """Learning curves: returns of training episodes, averaged over a twentieth of the training, over its steps."""
     import pandas as pd
 
     groups: dict[tuple[str, float, str], list[pd.DataFrame]] = {}
@@ -186,17 +136,7 @@ def curves(cases: Sequence[Case]) -> "pd.DataFrame":
 
 
 def draw_curves(path: Path, found: "pd.DataFrame", partial: str = "") -> None:
-    """Draw learning curves against steps and against CPU seconds.
-
-    Parameters
-    ----------
-    path : Path
-        A PNG file.
-    found : DataFrame
-        As :func:`curves` returns them.
-    partial : str
-        What is missing, as a sentence.
-    """
+    """Draw learning curves against steps and against CPU seconds."""
     tasks = tasks_in(found)
     rows = max(1, math.ceil(len(tasks) / 2))
     with drawing(path, 12.0, 2.3 * rows + 0.8) as figure:

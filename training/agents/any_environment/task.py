@@ -20,37 +20,7 @@ CLEAN, CLEAN_Y = "clean", "clean_y"  # of info, what was before noise was added
 
 @dataclass(frozen=True)
 class HiddenTask:
-    """An environment, what is measured of it, and what an observer is to estimate.
-
-    Parameters
-    ----------
-    env_id : str
-        As ``gym.make`` takes it.
-    measured : tuple of int
-        Entries of the flattened observation that an agent may see.
-    hidden : tuple of int, optional
-        Entries that an observer estimates; by default all that are not measured. Where there is noise it estimates
-        those that are measured as well.
-    measurement_noise : float
-        Standard deviation of the noise on each of them, at each step, in the observation's own units.
-    env_kwargs : mapping of str to object
-        Arguments of the environment.
-    time_constants : tuple of float
-        Of the memory of what is measured, in steps, as :class:`kkl_gym.KKLMemory` takes them; for agents on z.
-    frames : int
-        How many observations are stacked, for agents that see the last ones.
-    past_actions : bool
-        Whether agents on z and on stacked observations are shown what they did before.
-    angles : tuple of tuple of int
-        Pairs of measured entries that are the cosine and the sine of an angle. Agents on z then have a memory of how
-        far it has turned, as :class:`kkl_gym.KKLMemory` takes them; agents on stacked observations see how far it has
-        turned since each.
-
-    Raises
-    ------
-    ValueError
-        If a number or an entry makes no sense.
-    """
+    """An environment, what is measured of it, and what an observer is to estimate."""
 
     env_id: str
     measured: tuple[int, ...]
@@ -89,23 +59,7 @@ class HiddenTask:
         return replace(self, measurement_noise=0.0)
 
     def make(self, *, noisy: bool = True) -> gym.Env[np.ndarray, Any]:
-        """Make the environment, with flat observations and noise on what is measured.
-
-        Parameters
-        ----------
-        noisy : bool
-            Whether the noise is there; ``info`` is the same without it.
-
-        Returns
-        -------
-        gymnasium.Env
-            All entries are in its observations.
-
-        Raises
-        ------
-        ValueError
-            If there is no such environment or entry, or its observations are not numbers.
-        """
+        """Make the environment, with flat observations and noise on what is measured."""
         env = make(self.env_id, self.env_kwargs)
         if not (isinstance(env.observation_space, spaces.Box) and len(env.observation_space.shape) == 1):
             env = gym.wrappers.FlattenObservation(env)
@@ -122,19 +76,7 @@ class HiddenTask:
         return MeasurementNoise(env, self.measured, self.measurement_noise if noisy else 0.0)
 
     def estimated(self, size: int) -> tuple[str, ...]:
-        """What an observer estimates of an observation of some size.
-
-        Parameters
-        ----------
-        size : int
-            Entries of a flattened observation.
-
-        Returns
-        -------
-        tuple of str
-            Signals as :func:`kkl_gym.named.resolved` takes them, in the order of the entries; under noise as they were
-            before it.
-        """
+        """What an observer estimates of an observation of some size."""
         name = f"info[{CLEAN}]" if self.measurement_noise else "obs"
         return tuple(f"{name}[{i}]" for i in self.estimated_entries(size))
 
@@ -144,33 +86,11 @@ class HiddenTask:
         return tuple(sorted({*hidden, *self.measured})) if self.measurement_noise else hidden
 
     def told(self, size: int) -> tuple[int, ...]:
-        """Which entries an agent on estimates would see if these were right and there were no noise.
-
-        Parameters
-        ----------
-        size : int
-            Entries of a flattened observation.
-
-        Returns
-        -------
-        tuple of int
-            What is measured, then what is estimated.
-        """
+        """Which entries an agent on estimates would see if these were right and there were no noise."""
         return (*self.measured, *self._hidden(size))
 
     def signals(self, size: int) -> dict[str, Any]:
-        """What is recorded of the environment to learn from, as :class:`training.rollouts.playing.Recorder` takes it.
-
-        Parameters
-        ----------
-        size : int
-            Entries of a flattened observation.
-
-        Returns
-        -------
-        dict
-            ``measured``, with whatever noise there is, and ``hidden``, what is to be estimated.
-        """
+        """The signals to record, as :class:`training.rollouts.playing.Recorder` takes them."""
         return {"measured": [str(i) for i in self.measured], "hidden": self.estimated(size)}
 
     def _hidden(self, size: int) -> tuple[int, ...]:
@@ -199,15 +119,6 @@ class MeasurementNoise(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordCons
     Its generator is its own, seeded as the environment is: with noise and without, the same seed begins the same
     episodes. ``info`` holds what was before the noise: ``clean``, the whole observation, and ``clean_y``, the entries
     on which noise lies.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        With a row of numbers as its observation.
-    entries : sequence of int
-        On which noise lies.
-    standard_deviation : float
-        Of the noise, at each step.
     """
 
     def __init__(self, env: gym.Env[np.ndarray, Any], entries: Sequence[int], standard_deviation: float) -> None:

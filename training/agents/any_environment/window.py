@@ -22,19 +22,7 @@ KEY = "kkl-gym-window"
 class WindowEstimator:
     """A network from the last outputs, each with the input before it, to hidden signals.
 
-    Parameters
-    ----------
-    network : MLP
-        From a scaled stack, the latest last, to the signals.
-    mean, scale : ndarray, shape (inputs,)
-        The network is given (stack - mean) / scale.
-    task : mapping of str to object
-        What it was made for, as :meth:`made_for` describes it.
-
-    Raises
-    ------
-    ValueError
-        If mean or scale are not as many finite numbers as the network has inputs, or a scale is not positive.
+    Shapes: ``mean``, ``scale`` (inputs,).
     """
 
     network: MLP
@@ -51,18 +39,7 @@ class WindowEstimator:
 
     @staticmethod
     def made_for(task: HiddenTask) -> dict[str, Any]:
-        """What of a task must be the same where an estimator is used.
-
-        Parameters
-        ----------
-        task : HiddenTask
-            The task.
-
-        Returns
-        -------
-        dict
-            What JSON can hold.
-        """
+        """What of a task must be the same where an estimator is used."""
         described = {name: getattr(task, name) for name in ("env_id", "env_kwargs", "measured", "hidden", "frames")}
         found: dict[str, Any] = json.loads(json.dumps({**described, "noisy": task.measurement_noise > 0}))
         return found
@@ -70,31 +47,12 @@ class WindowEstimator:
     def __call__(self, stack: np.ndarray) -> np.ndarray:
         """Estimate.
 
-        Parameters
-        ----------
-        stack : ndarray, shape (..., inputs)
-            The last outputs, each with the input before it.
-
-        Returns
-        -------
-        ndarray of float32, shape (..., outputs)
-            The signals.
+        Shapes: ``stack`` (..., inputs); returns (..., outputs).
         """
         return self.network((stack - self.mean) / self.scale)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write it to one safetensors file, whole or not at all.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file, whose name should end in ``.safetensors``; its folder is made.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written.
-        """
+        """Write it to one safetensors file, whole or not at all."""
         tensors: dict[str, np.ndarray] = {"mean": self.mean, "scale": self.scale}
         storage.put_mlp(tensors, "", self.network)
         described = {"format": FORMAT, "activation": self.network.activation, "task": dict(self.task)}
@@ -102,23 +60,7 @@ class WindowEstimator:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> "WindowEstimator":
-        """Read what :meth:`save` wrote.
-
-        Parameters
-        ----------
-        path : str or PathLike
-            The file.
-
-        Returns
-        -------
-        WindowEstimator
-            What it holds.
-
-        Raises
-        ------
-        ValueError
-            If the file is missing, not readable, damaged, foreign or of a newer format.
-        """
+        """Read what :meth:`save` wrote."""
         tensors, described = storage.read(path, key=KEY, error=ValueError, what="an estimator on stacked observations")
         with storage.explained(path, ValueError):
             if described["format"] != FORMAT:
@@ -128,24 +70,7 @@ class WindowEstimator:
 
 
 class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray], RecordConstructorArgs):
-    """Shows y and what an estimator says of stacked observations, in their place; under noise the estimates alone.
-
-    Parameters
-    ----------
-    env : gymnasium.Env
-        Whose observations are stacks.
-    task : HiddenTask
-        What is measured, and what is to be estimated.
-    estimator : WindowEstimator
-        What estimates.
-    space : gymnasium.spaces.Box
-        Of what is to be shown; it is cut at these bounds.
-
-    Raises
-    ------
-    ValueError
-        If the estimator was made for another task.
-    """
+    """Shows y and what an estimator says of stacked observations, in their place; under noise the estimates alone."""
 
     def __init__(
         self, env: gym.Env[np.ndarray, Any], task: HiddenTask, estimator: WindowEstimator, space: gym.spaces.Box

@@ -31,24 +31,6 @@ def learn_window(
 
     That is the same number of batches of the same size, the same optimiser and the same loss, and a network of the same
     width and depth. Noise of the task's level is added to the outputs, in each batch anew.
-
-    Parameters
-    ----------
-    task : HiddenTask
-        Of which environment, what is measured, and how many observations are stacked.
-    records : sequence of Record
-        Of these steps; outputs may have noise only where there is some, and states none.
-    folder : Path
-        Receives the file.
-    seed : int
-        Of the training.
-    progress : ProgressBars
-        Where a bar is shown.
-
-    Returns
-    -------
-    Path
-        The estimator's file.
     """
     torch.manual_seed(seed)
     stacks = Stacks(task, records)
@@ -74,23 +56,7 @@ def learn_window(
 class Stacks:
     """Batches of stacked observations and hidden signals, both scaled, in cells by how full stacks are.
 
-    Parameters
-    ----------
-    task : HiddenTask
-        What is measured, how well, and how many observations are stacked.
-    records : sequence of Record
-        Episodes from their reset on.
-
-    Attributes
-    ----------
-    mean, scale : ndarray, shape (inputs,)
-        Of what the network is given.
-    x_mean, x_scale : ndarray, shape (outputs,)
-        Of the signals.
-    cells : int
-        Of like samples.
-    parameters : int
-        None are estimated.
+    Shapes: ``mean``, ``scale`` (inputs,), ``x_mean``, ``x_scale`` (outputs,).
     """
 
     parameters = 0
@@ -147,17 +113,6 @@ class WindowRefits(BaseCallback):
     """Fits an estimator again to an agent's own episodes, as :class:`training.KKLTrainingCallback` fits an observer.
 
     Nothing is held out, and no fit is refused.
-
-    Parameters
-    ----------
-    learn : callable
-        As :func:`learn_window`, told all but the records.
-    every : int
-        Steps of all environments together from refit to refit, where an algorithm begins to collect.
-    rehearsal : int
-        Further steps at the end, in which the agent acts without exploration, and which end in a last refit.
-    records : sequence of Record
-        From before, the oldest first, which it is fitted to as well.
     """
 
     def __init__(

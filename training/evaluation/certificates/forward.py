@@ -31,55 +31,7 @@ class Forward:
     Risks "along the motion" are means over recorded states that no training saw: over the measure of the theorems on
     the observer, not over the samples S_1 and S_2 of the training.
 
-    Parameters
-    ----------
-    forward_risk : float
-        Mean |z - T(x)|^2 along the motion, z being the filter's: the forward error R_T (paper, eq. forward-error-RT).
-    pde_risk : float
-        Mean |P(x)|^2 of the PDE's residual P = dT/dx f - A T - B h uniformly over X, R_PDE.
-    physics_risk : float
-        ``forward_risk`` plus the physics weight times ``pde_risk``: the paper's R_1, which stands for its R_S1.
-    reconstruction_risk : float
-        Mean |x - T_inv(T(x))|^2 along the motion, R_2 (paper, eq. true-risk-R2-eta). It is not the R_S2 of the
-        training, whose states x' are drawn in another way.
-    reconstruction_risk_over_box : float
-        The same uniformly over X.
-    propagated_risk : float
-        Mean |T_inv(T(x)) - T_inv(z)|^2 along the motion: what the error of T does to the estimate.
-    residual : mapping of float to float
-        Quantiles of |P| over X, by their level.
-    residual_worst : tuple of float, length nx
-        Where in X it is largest.
-    lipschitz_between : float
-        Largest upper bound l(x) of T_inv's Lipschitz constant on the segments from T(x) to z, of some states along the
-        motion.
-    steep_risk : float
-        Mean l(x)^2 |z - T(x)|^2 of the same states, which is at least ``propagated_risk`` of them.
-    forward_samples : int
-        N_1, the training's pairs (x, z) and collocation points.
-    forward_dimension : float
-        Bound of the pseudo-dimension of |z - T(x)|^2; with the residual beside it, as in R_S1, it would be larger
-        still.
-    forward_term : float
-        The term C_theta with these.
-    start_error : float
-        Largest |z - T(x)| at reset without noise, of states drawn in X.
-    envelope : mapping of float to float
-        Bound of what is left of ``start_error`` at some ages, in seconds, without noise.
-    forgets_start : float
-        Age in seconds after which the start can no longer add more to the estimate than the long run's rms error.
-    bound : float
-        Right-hand side of the paper's noise-free theorem without the terms C, 2 (2 R_2 + 2 l^2 R_1), as printed.
-    forward_share : float
-        Share of 2 l^2 R_1 in it, 0 to 1; the rest is R_2's.
-    noisy_bound : float
-        Right-hand side of the theorem on noise as printed, with the T_inv that is told the noise. It lacks |x - x_bar|.
-    sharp_bound : float
-        The noise-free theorem with l(x) in place of l, R_T in place of R_1, and no squares of sums,
-        (sqrt(R_2) + sqrt(steep_risk))^2.
-    sharp_noisy_bound : float
-        The theorem on noise with that and the missing part, (psi + s + l gain (l_h psi + |v|))^2; s is the root of the
-        sharp bound of the T_inv that is told the noise.
+    Shapes: ``residual_worst`` of length nx.
     """
 
     forward_risk: float
@@ -127,36 +79,7 @@ def certify_forward(
     rng: np.random.Generator,
     report: Callable[[float], object] = lambda share: None,
 ) -> Forward | None:
-    """Say what a learned T allows to say.
-
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    recorded : SettledTrajectories
-        Motions that ``error`` is not from.
-    told, noise_free : Inverse
-        T_inv that is told the noise, and that there is none.
-    noise_error : float
-        Most that noise and psi can do to the estimate through z, l gain (l_h psi + |v|).
-    psi : float
-        Bound of how far process noise moves the state.
-    error : float
-        Mean square error in the long run, without noise.
-    delta : float
-        Probability with which the generalisation term may fail.
-    rng : Generator
-        Of the states drawn in X.
-    report : callable, optional
-        Told the share of the work that is done.
-
-    Returns
-    -------
-    Forward or None
-        None if the observer holds no T.
-    """
+    """Say what a learned T allows to say."""
     if artifact.forward is None:
         return None
     T, T_inv, linear = encoder(artifact.forward), noise_free.T_inv, artifact.filter

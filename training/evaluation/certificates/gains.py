@@ -16,21 +16,7 @@ def theorem_gain(linear: LinearFilter) -> float:
 def envelope(linear: LinearFilter, ages: np.ndarray, *, start: float, disturbance: float = 0.0) -> np.ndarray:
     """Bound |z(t) - T(x(t))| from the reset on (paper, lemma zeta_bound, with the sign of its exponent put right).
 
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-    ages : ndarray, shape (m,)
-        Seconds since the reset.
-    start : float
-        Bound of |z - T(x)| at the reset.
-    disturbance : float, default 0
-        Bound of |y - h(x)| at all times, l_h psi + sqrt(ny) v in the paper, whose v is the same for all outputs.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        cond(V) e^{-|lambda_min| t} start + gain (1 - e^{-|lambda_min| t}) disturbance, gain being the theorem's.
+    Shapes: ``ages`` (m,); returns (m,).
     """
     left = np.exp(-linear.slowest * ages)
     return np.asarray(_conditioning(linear) * left * start + theorem_gain(linear) * (1.0 - left) * disturbance)
@@ -56,16 +42,6 @@ def h_infinity(linear: LinearFilter) -> float:
 
     The greatest gain is looked for among frequencies up to Nyquist's and some more about each pole, and then refined
     about the best one.
-
-    Parameters
-    ----------
-    linear : LinearFilter
-        The filter.
-
-    Returns
-    -------
-    float
-        The norm.
     """
     poles = np.linalg.eigvals(linear.A) * linear.dt
     near = np.geomspace(1e-2, 1e2, 40)
@@ -93,21 +69,7 @@ def noise_variance(
 
     P is the exact stationary covariance of z and J the Jacobian of T_inv.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    z : ndarray, shape (n, size)
-        Filter states.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of the noise on each sample of y.
-    process_noise : float, default 0
-        What T_inv is told of process noise, in multiples of the system's scale per second.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Sums of the variances of the states, each in its own unit squared.
+    Shapes: ``z`` (n, size), ``measurement_noise`` of length ny; returns (n,).
     """
     J = decoder(artifact, measurement_noise, process_noise).jacobian(z)
     P = (np.reshape(measurement_noise, (-1, 1, 1)) ** 2 * stationary_covariance(artifact.filter)).sum(0)

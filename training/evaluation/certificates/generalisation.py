@@ -8,26 +8,7 @@ from observers import MLP
 
 
 def pseudo_dimension_bound(mlp: MLP) -> float:
-    """Bound the pseudo-dimension of {(x, y) -> |y - mlp(x)|^2} over all weights from above.
-
-    Parameters
-    ----------
-    mlp : MLP
-        A network of the set.
-
-    Returns
-    -------
-    float
-        The bound.
-
-    Notes
-    -----
-    Anthony and Bartlett, Neural Network Learning (1999), theorem 8.14: a set of functions of d parameters, each
-    computed by t operations (sums, products, quotients, comparisons) of which q are exponentials, has
-    VC dimension at most (d (q + 1))^2 + 11 d (q + 1) (t + log2(9 d (q + 1))). The pseudo-dimension is the VC dimension
-    of the functions' subgraphs, which a last comparison with a given threshold makes of them. A unit of tanh or
-    x sigmoid(x) takes one exponential and at most four more operations.
-    """
+    """Bound the pseudo-dimension of {(x, y) -> |y - mlp(x)|^2} over all weights from above."""
     parameters = sum(weight.size + bias.size for weight, bias in zip(mlp.weights, mlp.biases, strict=True))
     units = sum(len(bias) for bias in mlp.biases[:-1])
     operations = 2 * parameters + 5 * units + 3 * mlp.outputs + 1
@@ -36,24 +17,7 @@ def pseudo_dimension_bound(mlp: MLP) -> float:
 
 
 def generalisation_term(largest_loss: float, *, pseudo_dimension: float, samples: int, delta: float) -> float:
-    """Bound how far the risk may lie above its mean on a sample (paper, sec. 4.3).
-
-    Parameters
-    ----------
-    largest_loss : float
-        Bound M of the loss.
-    pseudo_dimension : float
-        That of the losses, d.
-    samples : int
-        Their number, N.
-    delta : float
-        Probability with which the bound may fail.
-
-    Returns
-    -------
-    float
-        M sqrt(2 d ln(e N/d) / N) + M sqrt(ln(1/delta) / 2N), infinite where N < d: then nothing is said.
-    """
+    """Bound how far the risk may lie above its mean on a sample (paper, sec. 4.3)."""
     if samples < pseudo_dimension:
         return math.inf
     complexity = math.sqrt(2 * pseudo_dimension * math.log(math.e * samples / pseudo_dimension) / samples)

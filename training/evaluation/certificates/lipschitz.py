@@ -15,19 +15,7 @@ SLOPES = {"tanh": (0.0, 1.0), "silu": (-0.0998393202, 1.0998393202)}
 def lipschitz_lower(network: Smooth, x: np.ndarray) -> tuple[float, np.ndarray]:
     """Bound a network's Lipschitz constant from below, over any convex set that holds some points.
 
-    Parameters
-    ----------
-    network : Smooth
-        The network.
-    x : ndarray, shape (n, inputs)
-        The points.
-
-    Returns
-    -------
-    largest : float
-        The largest spectral norm of the Jacobian at a point.
-    at : ndarray, shape (inputs,)
-        The point where it is.
+    Shapes: ``x`` (n, inputs); returns ``at`` (inputs,).
     """
     norms = np.linalg.norm(network.jacobian(x), ord=2, axis=(1, 2))
     worst = int(norms.argmax())
@@ -35,30 +23,7 @@ def lipschitz_lower(network: Smooth, x: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def lipschitz_upper(network: Smooth, steps: int = 150) -> float:
-    """Bound a network's Lipschitz constant from above, everywhere, by a quadratic certificate for each layer.
-
-    Parameters
-    ----------
-    network : Smooth
-        The network.
-    steps : int, default 150
-        Of the search for the multipliers. Any number gives a bound, more of them a better one.
-
-    Returns
-    -------
-    float
-        No two inputs anywhere give a larger ratio; not more than :func:`norm_product`.
-
-    Notes
-    -----
-    Let M be a matrix with |f(h) - f(h')|^2 <= (h - h')^T M (h - h') for everything behind a layer h = phi(W x + b).
-    With activations of slopes between a and b, and any positive diagonal D with D - M > 0, the same holds in
-    front of it for W^T [(a + b)^2/4 D (D - M)^-1 D - a b D] W (the S-procedure on (dh - a dv)^T D (b dv - dh) >= 0,
-    then a Schur complement). Beginning at W^T W of the last layer this leads to the input, where the largest eigenvalue
-    is the square of the constant. Fazlyab et al. (NeurIPS 2019) pose it as one semidefinite program, Xu and Sivaranjani
-    (ECLipsE, NeurIPS 2024) layer by layer; here the diagonals of all layers are found together by gradients, so that no
-    solver of such programs is needed. Every choice of them is sound; a good one is less than the product of norms.
-    """
+    """Bound a network's Lipschitz constant from above, everywhere, by a quadratic certificate for each layer."""
     if len(network.mlp.weights) == 1 or norm_product(network) == 0.0:
         return norm_product(network)
     low, high = SLOPES[network.mlp.activation]

@@ -20,26 +20,7 @@ def segment_lipschitz(
 ) -> np.ndarray:
     """Bound a network's Lipschitz constant from above along each of some line segments.
 
-    Parameters
-    ----------
-    network : Smooth
-        The network.
-    start, end : ndarray, shape (n, inputs)
-        The segments' ends.
-    report : callable, optional
-        Told the share of the segments that are done.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        No two points of a segment give a larger ratio.
-
-    Notes
-    -----
-    Interval arithmetic through the layers: the slopes that an activation can have on a piece of a segment enclose the
-    Jacobian, J in C +- R entry by entry, so that |J| <= |C| + |R|. The range of the next layer's values follows from
-    the enclosure of their derivative along the piece (the mean value theorem), which loses far less than the range
-    of the layer before. Pieces that come out much steeper than their segment is known to be are halved.
+    Shapes: ``start``, ``end`` (n, inputs); returns (n,).
     """
     constants, found = np.zeros(len(start)), np.zeros(len(start))
     owner = np.arange(len(start))

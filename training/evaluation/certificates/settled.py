@@ -24,20 +24,7 @@ TRUNCATED = 3.0  # standard deviations at which Gaussian noise is cut, for theor
 class SettledTrajectories:
     """Trajectories from where the filter has forgotten its start, one behind the other.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, nx)
-        States without noise.
-    z : ndarray, shape (n, size)
-        The filter's, under noise-free outputs.
-    noisy_x : ndarray, shape (n, nx)
-        States from the same starts under process noise.
-    noisy_z : ndarray, shape (n, size)
-        The filter's under these and noisy outputs.
-    noise : ndarray, shape (n, size)
-        The part of z that is due to measurement noise alone.
-    trajectories : int
-        Their number, each of which has the same number of samples.
+    Shapes: ``x`` (n, nx), ``z`` (n, size), ``noisy_x`` (n, nx), ``noisy_z`` (n, size), ``noise`` (n, size).
     """
 
     x: np.ndarray
@@ -71,32 +58,7 @@ def record_settled(
 ) -> SettledTrajectories:
     """Simulate trajectories from starts uniform in X, and record them once the filter has forgotten its start.
 
-    Parameters
-    ----------
-    artifact : Artifact
-        The observer.
-    system : System
-        What it was made for.
-    measurement_noise : float or tuple of float, length ny
-        Standard deviation of v, of all outputs or each, which is cut at three of these.
-    process_noise : float
-        Bound of w in multiples of the system's scale per second.
-    trajectories : int
-        How many to simulate.
-    seed : int
-        Of starts and noise.
-    policy : callable, optional
-        Acts on the system, errs and explores, alike with process noise and without; by default there is no input.
-
-    Returns
-    -------
-    SettledTrajectories
-        Those that stayed within the system's bounds, with process noise and without.
-
-    Raises
-    ------
-    ValueError
-        If more than half of them leave the bounds.
+    Shapes: ``measurement_noise`` of length ny.
     """
     rng = generator(Stream.CERTIFICATE, seed)
     linear = artifact.filter

@@ -11,30 +11,7 @@ from training.trajectories.closed_loop import ClosedLoop
 
 
 class ClosedLoopSampler:
-    """Batches half from open-loop trajectories, half from closed-loop ones with the noise that these already hold.
-
-    Parameters
-    ----------
-    open_loop : TrajectorySampler
-        Where the first half is from, and the coordinates of both.
-    data : ClosedLoop
-        Where the other half is from.
-    dt : float
-        Sampling interval in seconds.
-    device : torch.device
-        Where batches are made.
-
-    Attributes
-    ----------
-    coordinates : Coordinates
-        In which the network sees z.
-    parameters : int
-        How many of the last components of x are parameters.
-    kinds_of_plant : int
-        As of :class:`training.maps.samplers.TrajectorySampler`.
-    cells : int
-        Number of cells of like samples, those of the two halves apart.
-    """
+    """Batches half from open-loop trajectories, half from closed-loop ones with the noise that these already hold."""
 
     def __init__(self, open_loop: TrajectorySampler, data: ClosedLoop, *, dt: float, device: torch.device) -> None:
         self.open_loop, self.coordinates = open_loop, open_loop.coordinates

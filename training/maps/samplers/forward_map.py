@@ -19,31 +19,7 @@ class ForwardMapSampler:
     Lipschitz constant (paper, lemma R-eta-bound). z' is therefore blurred by Gaussian noise with the covariance of that
     error, measured on the forward map's own data, and each coordinate is shrunk to its linear conditional mean.
 
-    Parameters
-    ----------
-    forward : callable
-        T on tensors, (n, nx) to (n, nz).
-    error : ndarray, shape (n, nz)
-        Samples of z - T(x).
-    points : ndarray, shape (n, nx)
-        States of which x' is drawn.
-    batch : int
-        Samples in a batch.
-    device : torch.device
-        Where batches are made.
-    scaling : {"relative", "range"}, default "relative"
-        Of states and their errors, see :class:`training.maps.scaling.StateScale`.
-
-    Attributes
-    ----------
-    coordinates : Coordinates
-        In which the network sees z.
-    parameters : int
-        0: none are estimated here.
-    kinds_of_plant : int
-        1: all motions have the same parameters.
-    scale : StateScale
-        Of the states.
+    Shapes: ``error`` (n, nz), ``points`` (n, nx).
     """
 
     cells, kinds_of_plant = 1, 1

@@ -35,59 +35,9 @@ class TrajectorySampler:
     improve in proportion. Where parameters differ, motions of the system's own are in cells apart: their errors can be
     smaller, and in cells with the others they would count for little.
 
-    Parameters
-    ----------
-    data : Trajectories
-        Where states and noise-free z are from.
-    linear : LinearFilter
-        The filter that ran beside them.
-    measurement_noise_max : float or tuple of float, length ny
-        Largest standard deviation of measurement noise, of all outputs or each.
-    batch : int
-        Samples in a batch.
-    device : torch.device
-        Where batches are made.
-    measurement_noise : float or tuple of float, length ny, default 0.5
-        Usual standard deviation of the noise, from which the unit of what the network is told of it follows.
-    noise_free_share : float, default 0.2
-        Share of the samples without measurement noise.
-    high_noise_emphasis : float, default 2
-        Of the other samples a share p to this power lies below the level at p of the way, on a logarithmic scale, along
-        the two decades up to ``measurement_noise_max``: high levels are harder to learn.
-    process_noise_max : float, default 0
-        If positive, the network is told the level of process noise as well, up to this one, in multiples of the
-        system's scale per second.
-    error : ndarray, shape (size, size), optional
-        Covariance of an error of z that is there at every noise level, where z comes from a learned T.
-    parameters : int, default 0
-        How many of the last components of ``data.x`` are parameters that are estimated beside the state.
-    scaling : {"relative", "range"}, default "relative"
-        Of states and their errors, see :class:`training.maps.scaling.StateScale`.
-    silent : ndarray, shape (size, k), optional
-        Directions of z that the network is not to see.
-    like : InverseMap, optional
-        A map whose network is to be given these batches: coordinates, scales, units and ends are then its own.
-
-    Attributes
-    ----------
-    coordinates : Coordinates
-        In which the network sees z.
-    noise_gain : ndarray, shape (modes,) or (ny, modes)
-        Standard deviation of each coordinate's noise where that of the output, or of each of several, is 1.
-    parameters : int
-        As given.
-    scale : StateScale
-        Of the states.
-    measurement_noise_max, measurement_noise_unit : ndarray, shape (ny,)
-        Largest standard deviation of each output's noise, and the one that counts as one.
-    age_unit : float
-        Seconds that count as one.
-    age_max : float
-        Seconds since reset beyond which the network is told no difference.
-    cells : int
-        Their number.
-    kinds_of_plant : int
-        1, or 2 where cells 2k and 2k + 1 differ in whose parameters motions have.
+    Shapes: ``measurement_noise_max`` of length ny, ``measurement_noise`` of length ny, default 0.5, ``error`` (size,
+    size), ``silent`` (size, k), ``noise_gain`` (modes,) or (ny, modes), ``measurement_noise_max``,
+    ``measurement_noise_unit`` (ny,).
     """
 
     AGES_PER_BATCH = 32
