@@ -1,14 +1,15 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 
-from training.agents.any_environment.information import part_of
+from training.agents.any_environment.information import part_of, show
 from training.agents.any_environment.task import CLEAN_Y, HiddenTask
 from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
@@ -102,14 +103,57 @@ def learn_observer(
     return path
 
 
-def refitting(
-    task: HiddenTask, every: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
-) -> KKLTrainingCallback:
-    """Make what fits an observer again to an agent's own steps."""
-    outputs = CLEAN_Y if task.measurement_noise else "y"
-    return KKLTrainingCallback(
-        every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
-    )
+class Estimation(Protocol):
+    """How estimates of hidden signals are learned from an agent's steps, and shown to the agent."""
+
+    def learn(
+        self, task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
+    ) -> Path:
+        """Learn from the first steps; returns the file of what was learned."""
+        ...
+
+    def show(self, task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
+        """Make the environment that shows estimates, and keeps the last ``keep`` steps to learn from again."""
+        ...
+
+    def refits(
+        self,
+        task: HiddenTask,
+        learn: Callable[[Sequence[Record]], Path],
+        every: int,
+        rehearsal: int,
+        path: Path,
+        records: Sequence[Record],
+    ) -> BaseCallback:
+        """Make what learns again from an agent's own steps, beside those of ``records``."""
+        ...
 
 
-__all__ = ["KEPT", "OBSERVER", "Told", "learn_observer", "oldest_first", "refitting", "wander"]
+class _KKL:
+    """By a KKL observer."""
+
+    learn = staticmethod(learn_observer)
+
+    def show(self, task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
+        """Show the observer's estimates; :class:`KKLTrainingCallback` keeps the steps."""
+        return show(task, "x_hat", path)
+
+    def refits(
+        self,
+        task: HiddenTask,
+        learn: Callable[[Sequence[Record]], Path],
+        every: int,
+        rehearsal: int,
+        path: Path,
+        records: Sequence[Record],
+    ) -> BaseCallback:
+        """Refit the map to what :class:`KKLTrainingCallback` has kept."""
+        outputs = CLEAN_Y if task.measurement_noise else "y"
+        return KKLTrainingCallback(
+            every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
+        )
+
+
+KKL: Estimation = _KKL()
+
+__all__ = ["KEPT", "KKL", "OBSERVER", "SETTINGS", "Estimation", "Told", "learn_observer", "oldest_first", "wander"]
