@@ -26,11 +26,25 @@ class Spy(gym.Env):
 
 
 @pytest.fixture
-def spy(tmp_path):
-    """Path of an observer for Spy-v0, which is there as long."""
-    gym.register("Spy-v0", entry_point=Spy, disable_env_checker=True)
+def register():
+    """Registers environments, as long as a test takes."""
+    names = []
+
+    def registered(env_id, entry_point, **options):
+        gym.register(env_id, entry_point=entry_point, disable_env_checker=True, **options)
+        names.append(env_id)
+        return env_id
+
+    yield registered
+    for name in names:
+        gym.registry.pop(name)
+
+
+@pytest.fixture
+def spy(tmp_path, register):
+    """Path of an observer for Spy-v0."""
+    register("Spy-v0", Spy)
     recorded = {"pipeline": "recorded", "eigenvalues": [-0.3, -1.0, -3.0], "dt": 1.0, "measurement_noise_max": 0.1}
     artifact = observer_of("Spy-v0", ["obs[0]"], ["obs[1]"], ["action[0]"])
     dataclasses.replace(artifact, training={**recorded, "held_out": 0.5}).save(tmp_path / "spy.safetensors")
-    yield tmp_path / "spy.safetensors"
-    gym.registry.pop("Spy-v0")
+    return tmp_path / "spy.safetensors"
