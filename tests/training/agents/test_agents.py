@@ -251,18 +251,18 @@ def test_pictures_show_states_outputs_and_inputs(learned, tmp_path, monkeypatch)
     drawn = []
     monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
     agent, _ = learned
-    episodes = play(agent.make(2), agent, steps=TASK.steps, seed=0)
+    episodes = play(agent.make(1), agent, steps=TASK.steps, seed=0)
     picture.draw(TASK, episodes, tmp_path / "a.png")
     (figure,) = drawn
-    axes = np.reshape(figure.axes, (4, 2))
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["x1", "x2", "y", "u"]
-    for i in range(2):
-        found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in axes[:, i]]
-        for j in range(2):
-            np.testing.assert_array_equal(found[j]["state"], episodes.x[:, i, j])
-            np.testing.assert_array_equal(found[j]["estimate"], episodes.x_hat[:, i, j])
-        np.testing.assert_array_equal(found[2]["measured output"], episodes.y[:, i, 0])
-        np.testing.assert_array_equal(found[3]["input"], episodes.u[:, i, 0])
+    assert [ax.get_ylabel() for ax in figure.axes] == ["x1", "x2", "y", "u"]
+    found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in figure.axes]
+    for row, label, values in (
+        (0, "state", episodes.x[:, 0, 0]),
+        (1, "estimate", episodes.x_hat[:, 0, 1]),
+        (2, "measured output", episodes.y[:, 0, 0]),
+        (3, "input", episodes.u[:, 0, 0]),
+    ):
+        np.testing.assert_array_equal(found[row][label], values)
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
     assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10
