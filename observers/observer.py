@@ -756,8 +756,7 @@ def load(
     Parameters
     ----------
     name_or_path : str or PathLike
-        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file. A name without a version is
-        the newest; ``"van_der_pol-v2"`` is that version for good.
+        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
     measurement_noise : float or sequence of float, length ny, optional
         As for :class:`KKLObserver`.
     process_noise : float, optional

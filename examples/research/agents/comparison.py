@@ -12,7 +12,7 @@ import numpy as np
 import kkl_gym
 from kkl_gym import get_system
 from observers.storage import explained, write
-from training.agents.agent import fingerprint, rules, versioned
+from training.agents.agent import fingerprint, rules
 from training.agents.information import OBSERVED, make, observer_of
 from training.agents.play import Policy, play
 from training.agents.tasks import TASKS, get_task, scores, successes
@@ -70,7 +70,7 @@ class Case:
 
         task = get_task(self.system, self.measurement_noise)
         recurrent = self.information.startswith("recurrent")
-        named = versioned(self.observer or observer_of(get_system(task.system))) if self._observes else None
+        named = (self.observer or observer_of(get_system(task.system))) if self._observes else None
         return {
             "protocol": PROTOCOL,
             "episodes": self.episodes,

@@ -66,7 +66,7 @@ class WindowEstimator:
         tensors, described = storage.read(path, key=KEY, error=ValueError, what="an estimator on stacked observations")
         with storage.explained(path, ValueError):
             if described["format"] != FORMAT:
-                raise ValueError(f"it has another format than {FORMAT}, which this version of kkl-gym reads")
+                raise ValueError(f"it has another format than {FORMAT}, which kkl-gym reads: train it again")
             network = storage.get_mlp(tensors, "", described["activation"])
             return cls(network, tensors["mean"], tensors["scale"], dict(described["task"]))
 
