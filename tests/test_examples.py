@@ -135,7 +135,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
     (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
     for line in commands.splitlines():
         _, command, *rest = line.split()
-        extra = {"train": ["--no-monitor"], "evaluate": ["--noise", "0"]}.get(command, [])
+        extra = {"train": ["--no-monitor"], "evaluate": ["--measurement-noise", "0"]}.get(command, [])
         main([command, *rest, *SMALL[command].split(), *extra])
     with pytest.raises(SystemExit, match="--policy"):
         main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])

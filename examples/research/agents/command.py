@@ -75,7 +75,7 @@ class Compare:
     """Shipped ones, or classes of yours with inputs as script.py:Class or module:Class."""
     information: Annotated[
         tuple[Knows, ...] | None,
-        tyro.conf.arg(aliases=["--knows"], help_behavior_hint="(default: all but x_hat_std)"),
+        tyro.conf.arg(help_behavior_hint="(default: all but x_hat_std)"),
     ] = None
     """What agents know (docs/guides/agents.md). In environments (docs/results/partly_observed.md): state,
     x_hat, stacked_x_hat, z, stacked, recurrent, y."""
@@ -99,9 +99,7 @@ class Compare:
     """Folder with results.csv and curves.csv of an earlier comparison in environments. What it has of other
     environments, and of what this one's agents are not shown, is taken over without training it again. Give it each
     time: tables are written anew. That both were made with the same settings is for you to see to."""
-    noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]", aliases=["--measurement-noise"])] = (
-        0.0,
-    )
+    measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]")] = (0.0,)
     """Standard deviations of the noise on what is measured in environments; each level is a task of its own."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
     """Of agents in environments."""
@@ -134,7 +132,7 @@ class Compare:
     def _in_environments(self, information: tuple[Any, ...], console: Console) -> None:
         """Compare agents in environments of others."""
         compare_environments(
-            [self.environment.task(env_id, level) for level in self.noise for env_id in self.environments],
+            [self.environment.task(env_id, level) for level in self.measurement_noise for env_id in self.environments],
             self.out or Path("runs/agents/environments"),
             console,
             kinds=information,

@@ -83,7 +83,7 @@ def write_table(path: Path, results: pd.DataFrame, methods: pd.DataFrame, *, not
         for case in cases:
             lines += [f"## {title}, {DOMAINS[case[0]]}, noise {case[1]}", "", explanation, ""]
             lines += _by_method(methods, partial(_spread, summary, form, case))
-    states = [column for column in results if NRMSE.fullmatch(column)]  # none in results of earlier versions
+    states = [column for column in results if NRMSE.fullmatch(column)]  # none in the published results.csv
     if states:
         medians = results[results.escaped == 0].groupby(["starts", "noise", "system", "method"])[states].median()
         for case in cases:

@@ -19,7 +19,6 @@ from examples.research.certificates.settled import TRUNCATED, SettledTrajectorie
 from kkl_gym.system import System
 from observers import Artifact, KKLObserver
 from observers.checks import noise_levels
-from training.config import current_names
 from training.evaluation.levels import Level, level_for
 from training.evaluation.metrics import nrmse
 from training.maps.smooth import decoder
@@ -132,7 +131,7 @@ def certify(
     samples = inverse_samples(artifact.training)
     inverse_dimension = pseudo_dimension_bound((artifact.free_inverse or artifact.inverse).mlp)
     return Certificate(
-        observer=name or f"{artifact.system} ({current_names(artifact.training).get('pipeline', 'unknown')})",
+        observer=name or f"{artifact.system} ({artifact.training.get('pipeline', 'unknown')})",
         system=system.name,
         measurement_noise=level,
         noise_bound=noise_levels("noise_bound", noise_bound, system.ny),

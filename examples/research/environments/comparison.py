@@ -55,12 +55,14 @@ class Case:
     def identity(self) -> dict[str, Any]:
         """What must not differ between a result that is there and one that is asked for."""
         task = asdict(self.task)
-        for option, kinds in (("time_constants", ("z",)), ("frames", ("stacked", "stacked_x_hat"))):
+        for option, kinds in (
+            ("time_constants", ("z",)),
+            ("frames", ("stacked", "stacked_x_hat")),
+            ("past_actions", ("z", "stacked")),
+            ("angles", ("z", "stacked")),
+        ):
             if self.kind not in kinds:
                 del task[option]  # which is nothing to the others
-        for option, usual in (("past_actions", True), ("angles", ())):
-            if self.kind not in ("z", "stacked") or task[option] == usual:
-                del task[option]  # as comparisons did before there were these
         described: dict[str, Any] = {
             "protocol": PROTOCOL,
             "episodes": self.episodes,

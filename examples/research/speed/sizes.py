@@ -46,7 +46,7 @@ class Sizes:
     """Settings that differ from the preset's, as `kkl-gym tune` writes them."""
     measurement_noise: NoiseLevel = None
     """Standard deviation of the noise on each sample of y, for errors under noise."""
-    trajectories: Annotated[int, tyro.conf.arg(aliases=["--runs"])] = 100
+    trajectories: int = 100
     """Number of motions for errors."""
     num_envs: int = 1024
     """Rows of the batch that is timed."""

@@ -538,8 +538,6 @@ def test_lengths_of_memories_and_stacks_tell_apart_those_agents_alone(tmp_path):
     assert differ(replace(PENDULUM, time_constants=(1, 2, 4), frames=9)) == {"z", "stacked", "stacked_x_hat"}
     assert differ(replace(PENDULUM, angles=((0, 1),))) == {"z", "stacked"}
     assert differ(replace(PENDULUM, past_actions=False)) == {"z", "stacked"}
-    for kind in SHOWN:  # as comparisons were written before there were these options
-        assert not {"angles", "past_actions"} & set(Case(PENDULUM, kind, 0, 2, None, 0, tmp_path).identity["task"])
 
 
 def test_a_table_says_what_agents_were_told():

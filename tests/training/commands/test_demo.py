@@ -30,7 +30,20 @@ def test_all_that_ship(tmp_path, capsys):
 @pytest.mark.parametrize("system", [OWN, AUTONOMOUS])
 def test_a_system_of_ones_own(system, saved, tmp_path, capsys):
     observer = saved(system=system, dt=0.02)
-    main(["demo", system, "--observer", observer, "--out", str(tmp_path), "--duration", "1", "--noise", "0.2"])
+    main(
+        [
+            "demo",
+            system,
+            "--observer",
+            observer,
+            "--out",
+            str(tmp_path),
+            "--duration",
+            "1",
+            "--measurement-noise",
+            "0.2",
+        ]
+    )
     out = capsys.readouterr().out
     name = system.rpartition(":")[2].lower()
     assert f" {name} " in out

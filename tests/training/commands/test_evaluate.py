@@ -34,11 +34,10 @@ COLUMNS = "observer,starts,driven,process_noise,measurement_noise,trajectory,sma
 RESULTS = Path(__file__).parents[3] / "docs" / "results"
 
 
-@pytest.mark.parametrize("option", ["--measurement-noise", "--noise"])
-def test_every_column_of_the_csv_file_holds_one_thing(option, saved, tmp_path):
+def test_every_column_of_the_csv_file_holds_one_thing(saved, tmp_path):
     path, csv = saved(), tmp_path / "new" / "errors.csv"
-    main(["evaluate", path, "--trajectories", "2", "--duration", "2", option, "0", "0.3", "--process-noise", "0.1",
-          "--csv", str(csv)])  # fmt: skip
+    main(["evaluate", path, "--trajectories", "2", "--duration", "2", "--measurement-noise", "0", "0.3",
+          "--process-noise", "0.1", "--csv", str(csv)])  # fmt: skip
     assert csv.read_text().splitlines()[0] == f"{COLUMNS},nrmse1,nrmse2"
     found = pd.read_csv(csv)
     assert len(found) == 3 * 2 * 2
@@ -152,15 +151,15 @@ def test_levels_of_each_output(tmp_path, capsys):
     system = f"{linear_system.__file__}:TwoOutputs"
     linear_system.exact_observer(0.01, np.eye(2), "two-outputs").save(tmp_path / "two.safetensors")
     options = [str(tmp_path / "two.safetensors"), "--system", system, "--trajectories", "2", "--duration", "2"]
-    main(["evaluate", *options, "--noise", "0", "0.2,0.1", "0.4", "--csv", str(tmp_path / "errors.csv")])
+    main(["evaluate", *options, "--measurement-noise", "0", "0.2,0.1", "0.4", "--csv", str(tmp_path / "errors.csv")])
     assert pd.read_csv(tmp_path / "errors.csv").measurement_noise.unique().tolist() == ["0.0", "0.2, 0.1", "0.4"]
     assert "│ X      │ 0.2, 0.1 │" in capsys.readouterr().out
     main(["evaluate", *options])
     assert "│ X      │ 0.1, 0.3 │" in capsys.readouterr().out  # the system's own
     with pytest.raises(SystemExit, match="one number, or one for each of 2 outputs"):
-        main(["evaluate", *options, "--noise", "1,2,3"])
+        main(["evaluate", *options, "--measurement-noise", "1,2,3"])
     with pytest.raises(SystemExit):
-        main(["evaluate", *options, "--noise", "loud"])
+        main(["evaluate", *options, "--measurement-noise", "loud"])
     assert "write a number, or one for each output, as in 0.1,0.3" in " ".join(capsys.readouterr().err.split())
 
 

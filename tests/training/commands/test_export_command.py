@@ -9,7 +9,7 @@ from training.cli import main
 
 
 def test_c(tmp_path, capsys):
-    main(["export", "lorenz-spinn", "--format", "c", "--noise", "0.3", "--out", str(tmp_path / "made")])
+    main(["export", "lorenz-spinn", "--format", "c", "--measurement-noise", "0.3", "--out", str(tmp_path / "made")])
     assert sorted(path.name for path in (tmp_path / "made").iterdir()) == [
         "lorenz_spinn.c", "lorenz_spinn.h", "lorenz_spinn_main.c"
     ]  # fmt: skip
@@ -26,7 +26,7 @@ def test_without_a_compiler(tmp_path, capsys, monkeypatch):
 
 
 def test_javascript(tmp_path, capsys):
-    main(["export", "lorenz-spinn", "--format", "js", "--noise", "0.3", "--out", str(tmp_path)])
+    main(["export", "lorenz-spinn", "--format", "js", "--measurement-noise", "0.3", "--out", str(tmp_path)])
     constants, module = tmp_path / "lorenz_spinn_step.safetensors", tmp_path / "kkl_observer.js"
     assert "export class Observer" in module.read_text()
     assert capsys.readouterr().out == f"wrote {constants}, {constants.stat().st_size / 1e3:.0f} kB, and {module}\n"
@@ -45,10 +45,10 @@ def test_onnx(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("lorenz --format onnx --noise 0.1", "levels of noise are inputs of an ONNX graph"),
+        ("lorenz --format onnx --measurement-noise 0.1", "levels of noise are inputs of an ONNX graph"),
         ("lorenz --format onnx --process-noise 0.1", "levels of noise are inputs of an ONNX graph"),
-        ("lorenz --format c --noise 5", "beyond the map's range, 0 to 3.0"),
-        ("lorenz --format c --noise 0.1,0.2", "must be one number, or one for each of 1 outputs"),
+        ("lorenz --format c --measurement-noise 5", "beyond the map's range, 0 to 3.0"),
+        ("lorenz --format c --measurement-noise 0.1,0.2", "must be one number, or one for each of 1 outputs"),
         ("none --format c", "unknown observer 'none'"),
     ],
 )

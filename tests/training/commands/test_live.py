@@ -117,7 +117,7 @@ def test_the_command(monkeypatch):
     asked = []
     monkeypatch.setattr(module, "show", lambda environment, level, *, seed: asked.append((environment, level, seed)))
     main(["demo", "--live"])
-    main(["demo", "lorenz", "--live", "--noise", "0.2", "--seed", "3"])
+    main(["demo", "lorenz", "--live", "--measurement-noise", "0.2", "--seed", "3"])
     assert [(environment.system.name, *rest) for environment, *rest in asked] == [
         ("van_der_pol", None, 0),
         ("lorenz", 0.2, 3),

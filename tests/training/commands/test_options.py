@@ -32,7 +32,7 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(tmp_
     path = "runs/falling_in_a_script/falling_in_a_script.safetensors"
     system = ["--system", "mine.py:Falling"]
     sizes = {
-        "evaluate": "--trajectories 8 --duration 6 --noise 0 --csv errors.csv",
+        "evaluate": "--trajectories 8 --duration 6 --measurement-noise 0 --csv errors.csv",
         "certify": "--trajectories 8 --measurement-noise 0.01",
         "faults": "--trajectories 4 --duration 6 --measurement-noise 0.01",
     }
@@ -50,7 +50,7 @@ def test_the_systems_own_controller_needs_no_option(tmp_path, monkeypatch):
     (tmp_path / "mine.py").write_text(SCRIPT)
     main(["train", "mine.py:Falling", "--policy", "controller", "--no-monitor", *SMALL.split()])
     path = "runs/falling_in_a_script/falling_in_a_script.safetensors"
-    small = "--trajectories 5 --duration 6 --noise 0 --csv errors.csv"
+    small = "--trajectories 5 --duration 6 --measurement-noise 0 --csv errors.csv"
     main(["evaluate", path, "--system", "mine.py:Falling", *small.split()])
     assert (pd.read_csv("errors.csv").starts == "X").sum() == 10
 

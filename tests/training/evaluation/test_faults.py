@@ -125,7 +125,7 @@ def test_duffing_is_reported_by_amplitude(tmp_path):
 def test_command(tmp_path, monkeypatch, capsys):
     artifact = with_limits("lorenz")
     monkeypatch.setattr(Artifact, "read", lambda path: artifact)
-    main(["faults", "lorenz", "--runs", "4", "--duration", "12", "--out", str(tmp_path)])
+    main(["faults", "lorenz", "--trajectories", "4", "--duration", "12", "--out", str(tmp_path)])
     assert "noticed" in capsys.readouterr().out
     found = pd.read_csv(tmp_path / "faults.csv")
     assert found.groupby(["observer", "system"]).size().to_dict() == {("lorenz", "lorenz"): 16}
@@ -167,7 +167,7 @@ def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path,
         main(["faults", path])
     options = ["--system", system, "--trajectories", "4", "--duration", "12", "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit, match=f"nothing is left of {path}"):
-        main(["faults", path, "--noise", "1.5", *options])
+        main(["faults", path, "--measurement-noise", "1.5", *options])
     assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in capsys.readouterr().out
     main(["faults", path, *options])
     found = pd.read_csv(tmp_path / "out" / "faults.csv")
