@@ -95,7 +95,7 @@ assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
-assert agent.observer == "fitzhugh_nagumo-v1" and agent.task == PROFILES["fitzhugh_nagumo"].task
+assert agent.observer == "fitzhugh_nagumo" and agent.task == PROFILES["fitzhugh_nagumo"].task
 """
     do(sys.executable, "-c", checks)
 

@@ -9,7 +9,7 @@ from training.agents.agent import Agent, AgentError
 from training.commands.agent import find
 from training.systems import PROFILES
 
-FILES = [(resolve(name), Artifact, ArtifactError) for name in sorted(set(shipped().values()))]
+FILES = [(resolve(name), Artifact, ArtifactError) for name in shipped()]
 FILES += [(find(name), Agent, AgentError) for name in PROFILES]
 
 

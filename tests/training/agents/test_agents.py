@@ -1,6 +1,5 @@
 """Training, saving and playing agents, at toy size."""
 
-import hashlib
 import json
 import os
 import re
@@ -15,17 +14,15 @@ from linear_system import Oscillator
 from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import save as serialise
-from safetensors.numpy import save_file
+from safetensors_bytes import with_arrays
 from stable_baselines3 import PPO, SAC
 
 from kkl_gym import get_system
 from observers import MLP
-from observers.names import resolve
 from training import figures
 from training.agents import SB3VecEnv, picture
-from training.agents.agent import Agent, AgentError, fingerprint, rules, versioned
+from training.agents.agent import Agent, AgentError, fingerprint, rules
 from training.agents.cost import WORST, Cost
-from training.agents.information import observer_of
 from training.agents.learn import hyperparameters, learn, learn_recurrent
 from training.agents.play import play
 from training.agents.tasks import TASKS, ControlTask, get_task, scores
@@ -72,7 +69,7 @@ def test_equal_seeds_give_equal_agents(learned, tmp_path):
 def test_a_saved_agent_plays_the_same(learned):
     agent, folder = learned
     read = Agent.read(folder / "agent.safetensors")
-    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol-v2")
+    assert (read.task, read.information, read.observer) == (TASK, "x_hat", "van_der_pol")
     assert read.fingerprint == fingerprint("van_der_pol")
     assert (read.training["algorithm"], read.training["seed"], read.training["timesteps"]) == ("ppo", 1, 256 * 32)
     assert "rollout/ep_rew_mean" in (folder / "progress.csv").read_text().splitlines()[0]
@@ -104,7 +101,7 @@ def test_mismatches_are_errors(learned, saved, tmp_path):
     own = replace(agent, observer=str(path), fingerprint=fingerprint(str(path)))
     assert own.make(1)
     shutil.copy(saved(system="van_der_pol", noise=False), path)
-    with pytest.raises(AgentError, match="another version of the observer"):
+    with pytest.raises(AgentError, match="is not the one that the agent was trained on: its file has changed"):
         own.make(1)
     path.unlink()
     with pytest.raises(AgentError, match="observer cannot be read"):
@@ -123,13 +120,14 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
     with safe_open(folder / "agent.safetensors", framework="numpy") as opened:
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
         text = opened.metadata()["kkl-gym-agent"]
-    content = serialise(tensors, metadata={"kkl-gym-agent": text})  # whose checksum nobody has to mend
+    key, content = "kkl-gym-agent", (folder / "agent.safetensors").read_bytes()
     cases = {
         "truncated": (content[:-7], "damaged"),
         "empty": (b"", "damaged"),
-        "newer": (content.replace(b'\\"format\\": 1', b'\\"format\\": 9'), "another format"),
-        "incomplete": (content.replace(b'\\"squashed\\"', b'\\"squished\\"'), "incomplete"),
-        "unknown": (content.replace(b'\\"x_hat\\"', b'\\"x_hut\\"'), "knows one of state, .* got 'x_hut'"),
+        "unsealed": (serialise(tensors, metadata={key: text}), "lacks its checksum, the metadata kkl-gym-agent-sha256"),
+        "newer": (with_arrays(tensors, key, text.replace('"format": 1', '"format": 9')), "another format"),
+        "incomplete": (with_arrays(tensors, key, text.replace("squashed", "squished")), "incomplete"),
+        "unknown": (with_arrays(tensors, key, text.replace("x_hat", "x_hut")), "knows one of state, .* got 'x_hut'"),
     }
     for name, (changed, match) in cases.items():
         assert changed != content
@@ -143,16 +141,6 @@ def test_damaged_and_foreign_files(learned, saved, tmp_path):
         Agent.read(tmp_path / "none.safetensors")
     with pytest.raises(AgentError, match="no agent 'nothing' ships"):
         find("nothing")
-
-
-@pytest.mark.parametrize("name", ["van_der_pol-static-v2", "lorenz-v2"])
-def test_agents_from_before_there_were_checksums_still_find_their_observers(name, tmp_path):
-    """Their fingerprint is the SHA-256 of the observer's file as it was without a checksum."""
-    with safe_open(resolve(name), framework="numpy") as opened:
-        tensors = {key: opened.get_tensor(key) for key in opened.keys()}  # noqa: SIM118
-        save_file(tensors, tmp_path / "old.safetensors", metadata={"kkl-gym": opened.metadata()["kkl-gym"]})
-    before = hashlib.sha256((tmp_path / "old.safetensors").read_bytes()).hexdigest()
-    assert fingerprint(str(tmp_path / "old.safetensors")) == before == fingerprint(name)
 
 
 @pytest.fixture
@@ -182,7 +170,7 @@ def parts():
     lambda t, d: d["task"].update(system=3),
     lambda t, d: d["task"].update(duration=float("inf")),
     lambda t, d: d.update(observer=3),
-    lambda t, d: d.update(observer=["lorenz-v2"]),
+    lambda t, d: d.update(observer=["lorenz"]),
     lambda t, d: d.update(fingerprint=3),
     lambda t, d: d.update(rules=[]),
     lambda t, d: d.update(training="sac"),
@@ -195,7 +183,7 @@ def test_contents_that_make_no_agent(change, parts, tmp_path):
     tensors, described = parts
     change(tensors, described)
     path = tmp_path / "agent.safetensors"
-    save_file(tensors, path, metadata={"kkl-gym-agent": json.dumps(described)})
+    path.write_bytes(with_arrays(tensors, "kkl-gym-agent", described))
     with pytest.raises(AgentError, match=re.escape(str(path))):
         Agent.read(path)
 
@@ -256,15 +244,13 @@ def test_shipped_systems_need_no_trust_but_a_wrong_name_is_an_error(learned):
 
 def test_metadata_nested_without_end(tmp_path):
     path = tmp_path / "agent.safetensors"
-    save_file({"0.weight": np.ones((1, 1))}, path, metadata={"kkl-gym-agent": "[" * 100_000})
+    path.write_bytes(with_arrays({"0.weight": np.ones((1, 1))}, "kkl-gym-agent", "[" * 100_000))
     with pytest.raises(AgentError, match=re.escape(str(path))):
         Agent.read(path)
 
 
 @pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol", "van_der_pol-y", "rossler", "lorenz"])
 def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
-    with safe_open(find(name), framework="numpy") as opened:
-        assert len(opened.metadata()["kkl-gym-agent-sha256"]) == 64
     Agent.read(find(name)).save(tmp_path / "new" / "agent.safetensors")
     assert (tmp_path / "new" / "agent.safetensors").read_bytes() == find(name).read_bytes()
     assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
@@ -427,7 +413,7 @@ def test_metadata_is_json(learned):
 )
 def test_shipped_agents_act_on_estimates(name, least):
     agent = Agent.read(find(name))
-    assert (agent.information, agent.observer) == ("x_hat", versioned(observer_of(get_system(name))))
+    assert (agent.information, agent.observer) == ("x_hat", name)
     assert agent.task == TASKS[name]
     system, episodes = get_system(name), play(agent.make(20), agent, steps=agent.task.steps, seed=0)
     assert scores(system, episodes.x).mean() > least  # zero input: about -0.6

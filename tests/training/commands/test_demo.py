@@ -62,7 +62,7 @@ def test_a_moving_picture(tmp_path, monkeypatch, capsys):
 
 
 def test_one_that_ships_with_another_observer(tmp_path, capsys):
-    main(["demo", "lorenz", "--observer", "lorenz-small-v2", "--out", str(tmp_path), "--duration", "1"])
+    main(["demo", "lorenz", "--observer", "lorenz-small", "--out", str(tmp_path), "--duration", "1"])
     assert "observer" in capsys.readouterr().out
     assert (tmp_path / "estimates-lorenz.png").exists()
 

@@ -54,7 +54,7 @@ def test_every_kind_of_map(options, precision, tolerance, make_artifact, tmp_pat
         ("lorenz-spinn", "float", 1e-5),
         *(
             pytest.param(name, precision, tolerance, marks=pytest.mark.slow)
-            for name in sorted(set(shipped().values()))
+            for name in shipped()
             for precision, tolerance in (("float", 1e-5), ("double", 1e-9))
         ),
     ],
@@ -70,7 +70,7 @@ def test_100_000_steps_of_what_ships(name, precision, tolerance, tmp_path):
 
 @needs_cc
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(shipped().values())))
+@pytest.mark.parametrize("name", shipped())
 def test_how_long_a_step_takes(name, tmp_path):
     """Printed for docs/guides/speed.md."""
     exported = Exported.read(name)
