@@ -43,7 +43,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff format .
 
 # Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
-# NAME and NAME-small, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# NAME and NAME-small, into runs/tracking. What ships lies in observers/maps.
 # One thread each, with which the same machine makes the same numbers to the last bit.
 maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, two hours, or one with make -j 2 maps; resumable
 
