@@ -476,7 +476,8 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
 
 def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
     """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
-    left, values = dict(described), {}
+    left = dict(described)
+    values: dict[str, Any] = {}
     for entry in fields(kind):
         name = entry.name
         if name == "filter":

@@ -21,14 +21,14 @@ from training.tuning import Probe, Spectrum
 
 PENALTY = 0.03  # of the mean square error for a factor e in the Lipschitz constant
 NO_NOISE = 0.02  # of the system's own measurement noise: the largest in training of those that are to know none
-# How inverses were trained before there was one for free motion, samples drawn alike for all systems; and before SOAP.
+# One inverse for free and driven motion, samples drawn alike for all systems; and the same by Adam.
 TOGETHER: dict[str, Any] = {
     "free_inverse": False,
     "process_noise_share": 0.0,
     "noise_free_share": 0.2,
     "high_noise_emphasis": 2.0,
 }
-EARLIER: dict[str, Any] = {**TOGETHER, "optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
+TOGETHER_BY_ADAM: dict[str, Any] = {**TOGETHER, "optimiser": "adam", "batch": 4096, "learning_rate": 8e-3}
 
 
 class Ablation(KKLMethod):
@@ -154,7 +154,7 @@ class Transients(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """No noise."""
-        return {**super().changes(task), **EARLIER, "measurement_noise_max": multiple(task.system, NO_NOISE)}
+        return {**super().changes(task), **TOGETHER_BY_ADAM, "measurement_noise_max": multiple(task.system, NO_NOISE)}
 
 
 class NoiseAware(Ablation):
@@ -165,7 +165,7 @@ class NoiseAware(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """All that is not the default's."""
-        return {**super().changes(task), **EARLIER}
+        return {**super().changes(task), **TOGETHER_BY_ADAM}
 
 
 class MoreModes(Ablation):
@@ -176,7 +176,7 @@ class MoreModes(Ablation):
 
     def changes(self, task: Task) -> Mapping[str, Any]:
         """Its modes are the preset's."""
-        return EARLIER
+        return TOGETHER_BY_ADAM
 
 
 class BySOAP(Ablation):

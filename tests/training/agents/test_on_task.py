@@ -105,7 +105,7 @@ def test_refusals():
 
 
 def test_its_specification_makes_it_again():
-    env = OnTask(gym.make("KKLRossler-v0"), observer="rossler-v2")
+    env = OnTask(gym.make("KKLRossler-v0"), observer="rossler")
     again = gym.make(env.spec)
     assert isinstance(again, OnTask)
     assert (again.reset(seed=1)[0] == env.reset(seed=1)[0]).all()
