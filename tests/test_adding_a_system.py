@@ -40,14 +40,15 @@ def edit(text, where, line, new):
 def test_following_the_page_adds_a_system(tmp_path):
     """Everything is done but the commands in full. One test, so that it is done once."""
     root = tmp_path
-    for package in ("kkl_gym", "observers", "training"):
+    for package in ("kkl_gym", "observers", "training", "examples"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", root)
-    command = root / "bin" / "kkl-gym"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m training "$@"\n')
-    command.chmod(0o755)
-    path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
+    (root / "bin").mkdir()
+    for name, module in (("kkl-gym", "-m training"), ("python", "")):
+        command = root / "bin" / name
+        command.write_text(f'#!/bin/sh\nexec "{sys.executable}" {module} "$@"\n')
+        command.chmod(0o755)
+    path = os.pathsep.join([str(root / "bin"), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
 
     def do(*arguments):

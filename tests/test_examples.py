@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from pages import RESEARCH, read_command
+from rich.console import Console
 
 from training.cli import main
 from training.teaching import monitor
@@ -74,7 +76,7 @@ SMALL = {
     "certify": "--trajectories 2",
     "faults": "--trajectories 4 --duration 6",
     "agent train": "--timesteps 1",
-    "agent compare": "--information state x_hat --seeds 1 --episodes 2 --timesteps 1 --jobs 1",
+    "agents": "--information state x_hat --seeds 1 --episodes 2 --timesteps 1 --jobs 1",
     "demo": "--duration 1",
     "speed": "--steps 5 --turns 1 --num-envs 4 --vector-steps 3",
 }
@@ -98,11 +100,9 @@ def test_a_system_of_ones_own_as_the_page_says(tmp_path, capsys, monkeypatch):
     own, agent, registered = re.findall(r"```python\n(.*?)```", USED, re.DOTALL)
     done = set()
     for line in "".join(re.findall(r"```sh\n(.*?)```", TRAINED + USED, re.DOTALL)).splitlines():
-        kkl_gym, command, *rest = line.partition("#")[0].split()
-        assert kkl_gym == "kkl-gym"
-        name = f"{command} {rest[0]}" if command == "agent" else command
-        main([command, *rest, *SMALL[name].split()])
-        done.add(name)
+        command = re.match(rf"(?:kkl-gym|{RESEARCH}) (agent train|\S+)", line)[1]
+        read_command([*line.partition("#")[0].split(), *SMALL[command].split()]).run(Console(width=140))
+        done.add(command)
     assert done == set(SMALL)
     printed = capsys.readouterr().out
     for written in ("config.json", "pendulum.safetensors", "table.md", "faults.csv", "agent.safetensors", "scores.png"):
