@@ -210,3 +210,52 @@ def test_links_lead_somewhere():
             if not re.match(r"[a-z]+:", link):
                 assert found.exists(), f"{name(page)}: {link}"
                 assert not anchor or found.suffix != ".md" or anchor in Page(found).anchors, f"{name(page)}: {link}"
+
+
+ABBREVIATIONS = re.compile(r"\b(?:e\.g|i\.e|et al|al|cf|vs|sec|Sec|eq|Eq|fig|Fig|ch|no|[C-SU-WYZ])\.$")
+ENDS = re.compile(r"(?<=[.!?])[)\"'*_”]*\s+")
+NO_PROSE = {
+    r"\A---\n.*?\n---\n|^( *)(```|~~~).*?^\1\2 *$|<!--.*?-->|\$\$.*?\$\$|\\\[.*?\\\]": "",
+    r"`[^`]+`": "code",
+    r"!\[[^\]]*\]\([^)]*\)(?:\{[^}]*\})?": "",
+    r"\[((?:[^\[\]]|\[[^\]]*\])*)\]\([^)]*\)": r"\1",
+    r"<[^>\n]+>|^ *(?:\||#)[^\n]*$|^ *[-=]{3,} *$": "",
+    r"^ *(?:[-*+]|\d+\.|!!!|\?\?\?) +": "\n\n",
+}
+
+
+def sentences(text):
+    """Those of paragraphs and list items."""
+    for pattern, instead in NO_PROSE.items():
+        text = re.sub(pattern, instead, text, flags=re.DOTALL | re.MULTILINE)
+    for block in re.split(r"\n\s*\n", text):
+        begun = ""
+        for part in ENDS.split(" ".join(block.split())):
+            begun = f"{begun} {part}".strip()
+            if not ABBREVIATIONS.search(begun):
+                yield begun
+                begun = ""
+        yield begun
+
+
+def test_no_sentence_has_more_than_35_words():
+    page = (
+        "# Title\n\nOne [link](a.b), by Wu et al. 2023, e.g. `x. y`! Two.\n\n| table. |\n\n- An *item.* And\n  more\n"
+    )
+    found = ["One link, by Wu et al. 2023, e.g. code!", "Two.", "An *item.", "And more"]
+    assert list(filter(None, sentences(page))) == found
+    for page in PAGES:
+        if page.name not in {"table.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md"}:  # commands write tables
+            for sentence in sentences(Page(page).text):
+                words = [word for word in sentence.split() if any(map(str.isalnum, word))]
+                assert len(words) <= 35, f"{name(page)}: {sentence}"
+
+
+def test_the_page_on_the_paper_has_its_numbered_equations_theorems_and_assumptions():
+    rows = [line for line in Page(ROOT / "docs/background/paper.md").text.splitlines() if line.startswith("|")]
+    assert {len(re.split(r"(?<!\\)\|", row)) for row in rows} == {5}  # three columns
+    cells = " ".join(row.split("|")[1] for row in rows)
+    inside_proofs = {32, 33, 34, 35}
+    assert set(range(1, 41)) - inside_proofs == {int(number) for number in re.findall(r"(?<!T)\((\d+)\)", cells)}
+    for kind, last in (("theorem", 4), ("lemma", 6), ("assumption", 5), ("definition", 4)):
+        assert set(range(1, last + 1)) == {int(number) for number in re.findall(rf"{kind} (\d)", cells)}, kind
