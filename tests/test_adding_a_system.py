@@ -40,15 +40,16 @@ def edit(text, where, line, new):
 def test_following_the_page_adds_a_system(tmp_path):
     """Everything is done but the commands in full. One test, so that it is done once."""
     root = tmp_path
-    for package in ("kkl_gym", "observers", "training", "examples"):
+    for package in ("kkl_gym", "observers", "training"):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "examples" / "research", root / "examples" / "research")
     shutil.copy(ROOT / "pyproject.toml", root)
     (root / "bin").mkdir()
-    for name, module in (("kkl-gym", "-m training"), ("python", "")):
+    for name, called in (("kkl-gym", f'"{sys.executable}" -m training'), ("python", f'"{sys.executable}"')):
         command = root / "bin" / name
-        command.write_text(f'#!/bin/sh\nexec "{sys.executable}" {module} "$@"\n')
+        command.write_text(f'#!/bin/sh\nexec {called} "$@"\n')
         command.chmod(0o755)
-    path = os.pathsep.join([str(root / "bin"), os.environ["PATH"]])
+    path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
 
     def do(*arguments):
@@ -96,7 +97,7 @@ assert np.allclose(controller(system)(np.array([system.target])), 0.0)
 assert preset(system, "input-aware", "fast").eigenvalues[0] == -0.1
 assert observers.load("fitzhugh_nagumo", 0.5, monitor=True).artifact.system == "fitzhugh_nagumo"
 agent = Agent.read("runs/first-look/agent/agent.safetensors")
-assert agent.observer == "fitzhugh_nagumo-v1" and agent.task == PROFILES["fitzhugh_nagumo"].task
+assert agent.observer == "fitzhugh_nagumo" and agent.task == PROFILES["fitzhugh_nagumo"].task
 """
     do(sys.executable, "-c", checks)
 
