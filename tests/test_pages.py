@@ -13,11 +13,12 @@ from pkgutil import resolve_name
 import numpy as np
 import pytest
 from gymnasium.utils.play import PlayableGame, play
-from pages import PAGES, RESEARCH, ROOT, Page, name, read_command
+from pages import PAGES, ROOT, Page, name
 
 from examples.research.__main__ import COMMANDS as OF_RESEARCH
-from training.cli import COMMANDS, EXTRAS
+from training.cli import COMMANDS, EXTRAS, read
 
+RESEARCH = "python -m examples.research"
 # Commands of others, which are taken on trust.
 OF_OTHERS = {"cc", "cd", "cp", "dask", "printf", "ray", "sleep", "srun", "tensorboard", "./van_der_pol"}
 
@@ -140,9 +141,10 @@ def test_commands_exist():
         line, (command, *rest) = f"{name(page)}: {' '.join(words)}", words
         for path in re.findall(r"(?<![\w/])examples/\w+\.py", line):
             assert (ROOT / path).exists(), line
-        if command == "kkl-gym" or words[:3] == tuple(RESEARCH.split()):
+        research = line.partition(": ")[2].startswith(RESEARCH)
+        if command == "kkl-gym" or research:
             try:
-                read_command(words)
+                read(rest[2:], prog=RESEARCH, commands=OF_RESEARCH) if research else read(rest)
             except SystemExit as end:
                 pytest.fail(f"{line}\n{end}")
         elif command == "make":

@@ -10,10 +10,6 @@ from functools import cached_property
 from itertools import groupby
 from pathlib import Path
 
-from examples.research.__main__ import COMMANDS
-from training.cli import read
-
-RESEARCH = "python -m examples.research"
 ROOT = Path(__file__).parents[2]
 PAGES = [
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "examples/README.md")),
@@ -26,13 +22,6 @@ COMMENT = re.compile(r"<!--\s*(slow|continues|small|first|printed)\b:?\s*(.*?)\s
 def name(page):
     """Of a page, for people."""
     return page.relative_to(ROOT).as_posix()
-
-
-def read_command(words):
-    """What the parser makes of a line that calls ``kkl-gym`` or a command of research."""
-    if words[0] == "kkl-gym":
-        return read(list(words[1:]))
-    return read(list(words[3:]), prog=RESEARCH, commands=COMMANDS)
 
 
 @dataclass(frozen=True)
