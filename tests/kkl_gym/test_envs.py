@@ -46,22 +46,14 @@ def play(env, steps, seed=None, actions=None, reset=True):
 def test_checkers_are_content(name, observe):
     env = gym.make(ENV_IDS[name], observe=observe)
     check_env(env.unwrapped, skip_render_check=True)
+    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
+    sb3.check_env(env)
 
 
-@everyone
-def test_checkers_are_content_with_rendering(name):
+def test_checkers_are_content_with_rendering():
     for needed in ("matplotlib", "pygame"):
         pytest.importorskip(needed)
-    check_env(gym.make(ENV_IDS[name]).unwrapped)
-
-
-@everyone
-@both
-def test_sb3s_checker_is_content(name, observe):
-    sb3 = pytest.importorskip("stable_baselines3.common.env_checker")
-    env = gym.make(ENV_IDS[name], observe=observe)
-    sb3.check_env(env)
-    sb3.check_env(env.unwrapped)
+    check_env(gym.make("KKLLorenz-v0").unwrapped)
 
 
 def test_ids():
@@ -72,11 +64,7 @@ def test_ids():
         "lorenz": "KKLLorenz-v0",
     }
     assert gym.make("kkl_gym:KKLLorenz-v0").unwrapped.system == Lorenz()
-
-
-def test_unknown_id():
-    with pytest.raises(gym.error.Error):
-        gym.make("KKLNonsense-v0")
+    assert {gym.spec(id_).max_episode_steps for id_ in ENV_IDS.values()} == {5000}
 
 
 @everyone
@@ -85,19 +73,11 @@ def test_equal_seeds_give_equal_episodes(name, observe):
     a, b = (gym.make(ENV_IDS[name], observe=observe) for _ in range(2))
     play(b, 10, seed=5)  # whatever came before
     first = play(a, 150, seed=3)  # longer than two blocks of noise
-    assert np.array_equal(first, play(b, 150, seed=3))
-    assert np.array_equal(first, play(a, 150, seed=3))
-    assert not np.array_equal(first, play(a, 150, seed=4))
-
-
-@everyone
-def test_a_second_reset_without_seed_differs_but_reproducibly(name):
-    a, b = (gym.make(ENV_IDS[name]) for _ in range(2))
-    first = play(a, 20, seed=3)
     second = play(a, 20)
-    assert (first[0, -2:] != second[0, -2:]).all()
-    play(b, 20, seed=3)
+    assert np.array_equal(first, play(b, 150, seed=3))
     assert np.array_equal(second, play(b, 20))
+    assert (first[0, -2:] != second[0, -2:]).all()
+    assert not np.array_equal(first, play(a, 150, seed=4))
 
 
 @everyone
@@ -133,15 +113,11 @@ def test_spec_round_trip():
     assert json.loads(again.spec.to_json()) == json.loads(text)
 
 
-PROPERTY = {name: {o: KKLEnv(name, observe=o) for o in ("state", "output")} for name in ENV_IDS}
-
-
-@everyone
-@both
-@settings(deadline=None, max_examples=25, derandomize=True)
+@pytest.mark.parametrize(("name", "observe"), [("lorenz", "state"), ("rossler", "output"), ("van_der_pol", "state")])
+@settings(deadline=None, max_examples=10, derandomize=True)
 @given(data=st.data(), seed=st.integers(0, 2**31))
 def test_any_start_and_any_actions(name, observe, data, seed):
-    env = PROPERTY[name][observe]
+    env = KKLEnv(name, observe=observe)
     x0 = data.draw(st.tuples(*(st.floats(*bounds) for bounds in env.system.bounds)))
     actions = data.draw(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), max_size=40))
     obs, info = env.reset(seed=seed, options={"x0": x0})
@@ -156,6 +132,7 @@ def test_any_start_and_any_actions(name, observe, data, seed):
         assert obs.dtype == np.float32
         assert np.isfinite(obs).all()
         assert obs in env.observation_space
+        assert np.array_equal(obs, info["x" if observe == "state" else "y"].astype(np.float32))
         assert type(reward) is float
         assert 0 <= reward <= 1
         assert type(terminated) is bool
@@ -189,17 +166,6 @@ def test_reward_is_one_at_the_target_and_follows_the_formula(name):
         assert reward < 1
 
 
-@everyone
-@both
-def test_observations_are_what_info_says(name, observe):
-    env = KKLEnv(name, observe=observe)
-    obs, info = env.reset(seed=2)
-    for _ in range(20):
-        shown = info["x" if observe == "state" else "y"]
-        assert np.array_equal(obs, shown.astype(np.float32))
-        obs, _, _, _, info = env.step(np.zeros(1))
-
-
 @both
 def test_observations_and_infos_are_copies(observe):
     env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
@@ -215,9 +181,8 @@ def test_observations_and_infos_are_copies(observe):
             assert np.array_equal(info[key], expected[-1][key])
 
 
-@both
-def test_escape_terminates_with_the_last_state(observe):
-    env = KKLEnv("rossler", observe=observe)
+def test_escape_terminates_with_the_last_state():
+    env = KKLEnv("rossler")
     obs, info = env.reset(seed=0, options={"x0": ESCAPING})
     steps = 0
     terminated = False
@@ -247,9 +212,8 @@ def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
         env.step(np.zeros(1))
 
 
-@everyone
-def test_measurement_noise_has_the_stated_deviation(name):
-    env = KKLEnv(name, measurement_noise=0.5)
+def test_measurement_noise_has_the_stated_deviation():
+    env = KKLEnv("van_der_pol", measurement_noise=0.5)
     v = []
     for _ in range(4):
         _, info = env.reset(seed=len(v))
@@ -272,8 +236,7 @@ def test_no_noise(name):
         assert info["y"].tolist() == list(env.system.h(x))
 
 
-@pytest.mark.parametrize("level", [None, 0.3])
-@everyone
+@pytest.mark.parametrize(("name", "level"), [("lorenz", None), ("rossler", 0.3)])
 def test_process_noise_is_bounded_and_uniform(name, level):
     """w recovered from what the noise adds to a short interval; x' = f(x) + w makes x gain w dt + O(dt^2)."""
     dt = 1e-5
@@ -304,21 +267,20 @@ def test_noise_is_not_repeated_between_blocks():
     assert len(np.unique(np.round(v, 9))) == len(v)
 
 
-@everyone
-def test_actions_are_scaled_and_clipped(name):
-    env = KKLEnv(name, process_noise=0)
+def test_actions_are_scaled_and_clipped():
+    env = KKLEnv("lorenz", process_noise=0)
     u_max = env.system.u_max[0]
     x0 = env.reset(seed=0)[1]["x"]
     for action, u in ((0.5, 0.5), (-1, -1), (0, 0), (3.0, 1), (-1e30, -1), (math.inf, 1)):
         env.reset(options={"x0": x0})
         *_, info = env.step(np.array([action]))
         assert info["u"] == pytest.approx([u * u_max], rel=1e-12)
-        expected = advance(env.system, x0.tolist(), [u * u_max], [0.0] * env.system.nx, env.dt)
+        expected = advance(env.system, x0.tolist(), [u * u_max], [0.0] * 3, env.dt)
         assert np.allclose(info["x"], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("action", [
-    [math.nan], np.float32(0.5), 0.5, [], [0.1, 0.2], [[0.1]], np.zeros((1, 1)), np.zeros((2, 1)), None, "a", ["a"],
+    [math.nan], 0.5, [], [0.1, 0.2], np.zeros((1, 1)), None, ["a"],
 ])  # fmt: skip
 def test_wrong_actions_raise_and_change_nothing(action):
     env, other = KKLEnv("lorenz"), KKLEnv("lorenz")
@@ -328,21 +290,14 @@ def test_wrong_actions_raise_and_change_nothing(action):
     assert np.array_equal(env.step([0.3])[0], other.step([0.3])[0])
 
 
-@pytest.mark.parametrize("options", [
-    {"x0": [1.0, 2.0]}, {"x0": 1.0}, {"x0": [[1.0, 2.0, 3.0]]}, {"x0": [1.0, 2.0, math.nan]},
-    {"x0": [math.inf, 0.0, 0.0]}, {"x0": [61.0, 0.0, 0.0]}, {"x0": [0.0, 0.0, -50.1]},
-])  # fmt: skip
-def test_wrong_starts_raise(options):
-    with pytest.raises(ValueError, match="x0 must be 3 numbers within"):
-        KKLEnv("lorenz").reset(options=options)
-
-
-def test_start_is_taken():
+@pytest.mark.parametrize("x0", [[1.0, 2.0], 1.0, [1.0, 2.0, math.nan], [61.0, 0.0, 0.0], [0.0, 0.0, -50.1]])
+def test_starts_within_the_bounds_alone_are_taken(x0):
     env = KKLEnv("lorenz")
-    _, info = env.reset(seed=0, options={"x0": (60, -120, 160)})
-    assert info["x"].tolist() == [60.0, -120.0, 160.0]
-    for empty in (None, {}):
-        env.reset(options=empty)
+    assert env.reset(options={"x0": (60, -120, 160)})[1]["x"].tolist() == [60.0, -120.0, 160.0]
+    with pytest.raises(ValueError, match="x0 must be 3 numbers within"):
+        env.reset(options={"x0": x0})
+    with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
+        env.reset(options={"x_0": [0.0, 0.0, 0.0]})
 
 
 def test_start_box():
@@ -362,25 +317,15 @@ def test_start_box():
     assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
 
 
-def test_unknown_option():
-    with pytest.raises(ValueError, match="unknown reset option 'x_0'"):
-        KKLEnv("lorenz").reset(options={"x_0": [0.0, 0.0, 0.0]})
-
-
 @pytest.mark.parametrize(
     ("wrong", "match"),
     [
         ({"system": "nonsense"}, "unknown system 'nonsense'"),
         ({"dt": 0}, "dt must be"),
-        ({"dt": -0.01}, "dt must be"),
-        ({"dt": math.nan}, "dt must be"),
-        ({"dt": math.inf}, "dt must be"),
         ({"observe": "all"}, "observe must be .* 'all'"),
         ({"parameters": {"gamma": 1.0}}, "lorenz has no parameter 'gamma'"),
         ({"parameters": {"rho": math.nan}}, "parameter rho"),
         ({"process_noise": -0.1}, "process_noise must be"),
-        ({"process_noise": math.nan}, "process_noise must be"),
-        ({"measurement_noise": -0.1}, "measurement_noise must be"),
         ({"measurement_noise": math.inf}, "measurement_noise must be"),
         ({"start_box": ((0, 1), (0, 1))}, "start_box must be"),
         ({"start_box": ((0, 1), (0, 1), (2, 1))}, "start_box must lie within"),
@@ -401,9 +346,8 @@ def test_step_and_render_before_reset():
             call()
 
 
-@both
-def test_autonomous_user_system(script, observe):
-    env = KKLEnv(f"{script}:Pendulum", observe=observe)
+def test_autonomous_user_system(script):
+    env = KKLEnv(f"{script}:Pendulum")
     assert env.action_space.shape == (0,)
     check_env(env, skip_render_check=True)
     obs, _ = env.reset(seed=0)
@@ -419,11 +363,11 @@ def test_user_system_through_make_survives_json(script):
     assert np.array_equal(play(env, 10, seed=0), play(again, 10, seed=0))
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "rossler"])
-def test_render(name):
+def test_render():
     pytest.importorskip("matplotlib")
-    env = gym.make(ENV_IDS[name], render_mode="rgb_array")
-    env.reset(seed=0)
+    silent, env = (gym.make("KKLRossler-v0", render_mode=mode) for mode in (None, "rgb_array"))
+    silent.reset(seed=0), env.reset(seed=0)
+    assert silent.render() is None
     first = env.render()
     assert first.dtype == np.uint8
     assert first.shape == (480, 480, 3)
@@ -449,12 +393,6 @@ def test_a_video_shows_motions_as_they_are(dt, fps):
     assert env.metadata["render_fps"] == fps
     many = kkl_gym.VectorActionRepeat(kkl_gym.KKLVectorEnv("lorenz", dt=dt, autoreset_mode="Disabled"), 5)
     assert many.metadata["render_fps"] == max(1, fps // 5)
-
-
-def test_no_render_without_mode():
-    env = KKLEnv("lorenz")
-    env.reset(seed=0)
-    assert env.render() is None
 
 
 def test_output_bounds():
@@ -496,27 +434,11 @@ def test_under_gymnasiums_wrappers():
     assert info["episode"]["r"] == pytest.approx(total)
 
 
-def test_registered_ids_truncate_after_5000_steps():
-    assert {gym.spec(id_).max_episode_steps for id_ in ENV_IDS.values()} == {5000}
-
-
-def test_vector_env():
-    envs = gym.make_vec("KKLLorenz-v0", num_envs=3, vectorization_mode="sync")
-    obs, info = envs.reset(seed=5)
-    assert obs.shape == info["x"].shape == (3, 3)
-    single = gym.make("KKLLorenz-v0")
-    assert np.array_equal(single.reset(seed=6)[0], obs[1])
-    assert np.array_equal(envs.step(np.ones((3, 1), np.float32))[0][1], single.step(np.ones(1, np.float32))[0])
-    envs.close()
-
-
-def isolated(code):
-    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
-
-
 def test_import_is_light_and_registers_once():
-    isolated(
-        "import importlib, sys, kkl_gym, observers, gymnasium as gym\n"
+    code = (
+        "import importlib, sys, gymnasium as gym\n"
+        "gym.make('kkl_gym:KKLRossler-v0').reset(seed=0)\n"  # the prefixed id needs no import
+        "import kkl_gym, observers\n"
         "heavy = {'torch', 'scipy', 'matplotlib', 'sympy', 'stable_baselines3', 'training'} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
         "before = dict(gym.registry)\n"
@@ -525,14 +447,7 @@ def test_import_is_light_and_registers_once():
         "env = gym.make('KKLLorenz-v0'); env.reset(seed=0); env.step(env.action_space.sample())\n"
         "assert not {'torch', 'scipy', 'matplotlib'} & set(sys.modules)\n"
     )
-
-
-def test_the_prefixed_id_needs_no_import():
-    isolated("import gymnasium as gym; gym.make('kkl_gym:KKLRossler-v0').reset(seed=0)")
-
-
-def test_public_names_exist():
-    assert all(hasattr(kkl_gym, name) for name in kkl_gym.__all__)
+    subprocess.run([sys.executable, "-W", "error", "-c", code], check=True, timeout=60)
 
 
 @pytest.mark.parametrize("n", [3, 6, 7, 20])
