@@ -1,28 +1,24 @@
 """What is done to rows in one pass, compiled and not, against a second way to compute it."""
 
-import math
-
 import numpy as np
 import pytest
 
-import kkl_gym.rows
 from kkl_gym.rows import clipped, held, judged
 from observers.thresholds import MANY_ROWS
 
 
-@pytest.fixture(params=[True, False], ids=["compiled", "NumPy"], autouse=True)
-def compiled(request, monkeypatch):
-    """With kernels for many rows, and without."""
-    if request.param:
+@pytest.fixture(params=[3, MANY_ROWS + 3])
+def rows(request):
+    """Few, and so many that compiled code takes them."""
+    if request.param > 3:
         pytest.importorskip("numba")
-    else:
-        monkeypatch.setattr(kkl_gym.rows, "MANY_ROWS", math.inf)
+    return request.param
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_clipped(dtype):
+def test_clipped(rows, dtype):
     low, high = np.array([-1, 0, -np.inf], np.float32), np.array([1, 0.5, np.inf], np.float32)
-    values = np.random.default_rng(0).normal(size=(MANY_ROWS, 3)).astype(dtype)
+    values = np.random.default_rng(0).normal(size=(rows, 3)).astype(dtype)
     values[0] = np.nan, -np.inf, np.inf
     out = clipped(values, low, high)
     assert out.dtype == np.float32
@@ -32,14 +28,12 @@ def test_clipped(dtype):
         clipped(values, low[:2], high[:2])
 
 
-@pytest.mark.parametrize("rows", [3, MANY_ROWS])
 def test_clipped_beyond_float32(rows):
     high = np.array([1.0, np.inf], np.float32)
     out = clipped(np.full((rows, 2), [1e39, -1e300]), -high, high)
     assert np.array_equal(out, np.full((rows, 2), [1.0, -np.inf]))
 
 
-@pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
 @pytest.mark.parametrize("nu", [0, 1, 2])
 def test_held(rows, nu):
     actions, u_max = np.random.default_rng(0).uniform(-2, 2, (2 * rows, 3)), np.array([5.0, 0.25])[:nu]
@@ -53,7 +47,6 @@ def test_held(rows, nu):
         assert np.array_equal(given, before, equal_nan=True)
 
 
-@pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
 def test_judged(rows):
     x = np.random.default_rng(0).normal(size=(2, rows))
     bounds, target, weights = np.array([[-1.0, -0.5], [0.7, 1.0]]), np.array([0.1, -0.2]), np.array([0.3, 2.0])
@@ -69,7 +62,6 @@ def test_judged(rows):
     assert reward[2] == 0.0
 
 
-@pytest.mark.parametrize("rows", [3, MANY_ROWS + 3])
 @pytest.mark.parametrize("far", [1e200, -1e200, np.inf, np.nan])
 def test_what_escapes_far_warns_of_nothing(rows, far):
     """A discrete system's step may lead anywhere, and a weight may be zero."""
