@@ -92,25 +92,26 @@ def test_starts_are_uniform_in_the_training_box(name):
     assert np.allclose(u.std(0), 12**-0.5, atol=0.02)
 
 
-def test_spec_round_trip():
+@pytest.mark.parametrize("own", [False, True])
+def test_spec_round_trip(own, script):
+    system = {"system": f"{script}:Pendulum", "parameters": {"damping": 0.4}} if own else {"parameters": {"rho": 15.0}}
     env = gym.make(
         "KKLLorenz-v0",
-        parameters={"rho": 15.0, "sigma": 9.0},
+        **system,
         dt=0.02,
         observe="output",
         measurement_noise=0.1,
         process_noise=0.2,
         max_episode_steps=70,
     )
-    text = env.spec.to_json()
-    again = gym.make(EnvSpec.from_json(text))
-    assert again.unwrapped.system == Lorenz(rho=15, sigma=9)
+    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
+    assert again.unwrapped.system == (get_system(*system.values()) if own else Lorenz(rho=15))
     assert again.spec.max_episode_steps == 70
     assert (again.unwrapped.dt, again.unwrapped.observe) == (0.02, "output")
     assert (again.unwrapped.measurement_noise, again.unwrapped.process_noise) == (0.1, 0.2)
     assert again.observation_space == env.observation_space
-    assert np.array_equal(play(env, 50, seed=1), play(again, 50, seed=1))
-    assert json.loads(again.spec.to_json()) == json.loads(text)
+    assert np.array_equal(play(env, 20, seed=1), play(again, 20, seed=1))
+    assert json.loads(again.spec.to_json()) == json.loads(env.spec.to_json())
 
 
 @pytest.mark.parametrize(("name", "observe"), [("lorenz", "state"), ("rossler", "output"), ("van_der_pol", "state")])
@@ -118,6 +119,7 @@ def test_spec_round_trip():
 @given(data=st.data(), seed=st.integers(0, 2**31))
 def test_any_start_and_any_actions(name, observe, data, seed):
     env = KKLEnv(name, observe=observe)
+    sizes = {"y": env.system.ny, "x": env.system.nx, "u": env.system.nu}
     x0 = data.draw(st.tuples(*(st.floats(*bounds) for bounds in env.system.bounds)))
     actions = data.draw(st.lists(st.floats(allow_nan=False, allow_infinity=False, width=32), max_size=40))
     obs, info = env.reset(seed=seed, options={"x0": x0})
@@ -138,15 +140,13 @@ def test_any_start_and_any_actions(name, observe, data, seed):
         assert type(terminated) is bool
         assert truncated is False
         assert info["escaped"] == terminated
-        assert info["escaped"].dtype == np.bool_
-        assert all(isinstance(value, np.ndarray) for value in info.values())
         assert list(info) == ["y", "x", "u", "sample", "escaped"]
-        assert info["sample"].shape == ()
-        assert info["sample"].dtype == np.int64
-        for key, size in (("y", env.system.ny), ("x", env.system.nx), ("u", env.system.nu)):
-            assert info[key].dtype == np.float64
-            assert info[key].shape == (size,)
-            assert np.isfinite(info[key]).all()
+        assert {key: (info[key].dtype, info[key].shape) for key in info} == {
+            **{key: (np.float64, (size,)) for key, size in sizes.items()},
+            "sample": (np.int64, ()),
+            "escaped": (np.bool_, ()),
+        }
+        assert all(np.isfinite(info[key]).all() for key in sizes)
         if terminated:
             break
 
@@ -166,40 +166,20 @@ def test_reward_is_one_at_the_target_and_follows_the_formula(name):
         assert reward < 1
 
 
-@both
-def test_observations_and_infos_are_copies(observe):
-    env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
-    obs, info = env.reset(seed=0)
-    other.reset(seed=0)
-    for _ in range(3):
-        for array in (obs, *info.values()):
-            array[...] = 7
-        obs, *_, info = env.step(np.ones(1))
-        expected = other.step(np.ones(1))
-        assert np.array_equal(obs, expected[0])
-        for key in info:
-            assert np.array_equal(info[key], expected[-1][key])
-
-
 def test_escape_terminates_with_the_last_state():
     env = KKLEnv("rossler")
     obs, info = env.reset(seed=0, options={"x0": ESCAPING})
-    steps = 0
     terminated = False
     while not terminated:
-        steps += 1
-        before = obs, info
+        before, last = obs, info
         obs, reward, terminated, truncated, info = env.step(np.zeros(1))
-        assert steps < 300
-    assert steps > 100
-    assert terminated is True
-    assert info["escaped"]
-    assert truncated is False
-    assert np.array_equal(obs, before[0])
-    assert np.array_equal(info["x"], before[1]["x"])
-    assert np.array_equal(info["y"], before[1]["y"])
+    assert 100 < info["sample"] < 300
+    assert (terminated, truncated, info["escaped"].item()) == (True, False, True)
+    assert np.array_equal(obs, before)
+    assert np.array_equal(info["x"], last["x"])
+    assert np.array_equal(info["y"], last["y"])
     assert 0 < reward < 1
-    assert not env.reset(seed=0)[1].get("escaped")
+    assert not env.reset(seed=0)[1]["escaped"]
 
 
 def test_an_interval_too_long_to_simulate_is_an_error_of_its_own():
@@ -223,6 +203,7 @@ def test_measurement_noise_has_the_stated_deviation():
     assert np.mean(v) == pytest.approx(0.0, abs=0.04)
     assert np.std(v) == pytest.approx(0.5, rel=0.05)
     assert np.mean(np.multiply(v[1:], v[:-1])) == pytest.approx(0.0, abs=0.025)  # white
+    assert len(np.unique(np.round(v, 9))) == len(v) > 4 * NOISE_BLOCK  # nor do blocks of it repeat
 
 
 @everyone
@@ -255,16 +236,6 @@ def test_process_noise_is_bounded_and_uniform(name, level):
     assert np.allclose(u.mean(0), 0.0, atol=0.05)
     assert np.allclose(u.std(0), 3**-0.5, rtol=0.05)
     assert np.allclose(np.corrcoef(u.T), np.eye(system.nx), atol=0.08)
-
-
-def test_noise_is_not_repeated_between_blocks():
-    env = KKLEnv("lorenz")
-    _, info = env.reset(seed=0)
-    v = []
-    for _ in range(4 * NOISE_BLOCK):
-        v.append(info["y"][0] - info["x"][1])
-        *_, info = env.step(np.zeros(1))
-    assert len(np.unique(np.round(v, 9))) == len(v)
 
 
 def test_actions_are_scaled_and_clipped():
@@ -301,17 +272,14 @@ def test_starts_within_the_bounds_alone_are_taken(x0):
 
 
 def test_start_box():
-    box = ((-3, 3), (-6.5, -6))
+    box = np.array([(-3.0, 3.0), (-6.5, -6.0)])
     env = gym.make("KKLVanDerPol-v0", start_box=box)
     starts = np.array([env.reset(seed=seed)[1]["x"] for seed in range(50)])
-    assert (starts >= [-3, -6.5]).all()
-    assert (starts <= [3, -6]).all()
+    assert ((starts >= box[:, 0]) & (starts <= box[:, 1])).all()
     assert np.ptp(starts[:, 0]) > 4
-    many = gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"]
-    assert (many == starts).all()
-    mine = np.array(box, dtype=float)
-    env = KKLEnv("van_der_pol", start_box=mine)
-    mine[:] = 100.0  # it was copied
+    assert (gym.make_vec("KKLVanDerPol-v0", num_envs=50, start_box=box).reset(seed=0)[1]["x"] == starts).all()
+    env = KKLEnv("van_der_pol", start_box=box)
+    box[:] = 100.0  # it was copied
     assert env.reset(seed=0)[0] in env.observation_space
     point = gym.make("KKLVanDerPol-v0", start_box=((1, 1), (2, 2)))
     assert point.reset(seed=0)[1]["x"].tolist() == [1, 2]
@@ -356,13 +324,6 @@ def test_autonomous_user_system(script):
     assert obs in env.observation_space
 
 
-def test_user_system_through_make_survives_json(script):
-    env = gym.make("KKLLorenz-v0", system=f"{script}:Pendulum", parameters={"damping": 0.4})
-    again = gym.make(EnvSpec.from_json(env.spec.to_json()))
-    assert again.unwrapped.system == get_system(f"{script}:Pendulum", {"damping": 0.4})
-    assert np.array_equal(play(env, 10, seed=0), play(again, 10, seed=0))
-
-
 def test_render():
     pytest.importorskip("matplotlib")
     silent, env = (gym.make("KKLRossler-v0", render_mode=mode) for mode in (None, "rgb_array"))
@@ -375,9 +336,7 @@ def test_render():
     assert np.array_equal(env.render(), first)
     for _ in range(50):
         env.step(np.zeros(1, np.float32))
-    later = env.render()
-    assert not np.array_equal(later, first)
-    assert not np.shares_memory(later, first)
+    assert not np.array_equal(env.render(), first)
     env.reset(seed=0)
     assert np.array_equal(env.render(), first)
     env.close()
@@ -420,18 +379,12 @@ def test_a_copy_mid_episode_continues_identically(duplicate, render_mode):
 def test_under_gymnasiums_wrappers():
     env = gym.make("KKLVanDerPol-v0", observe="output", max_episode_steps=25)
     env = FrameStackObservation(RecordEpisodeStatistics(env), 4)
-    obs, _ = env.reset(seed=0)
-    assert obs.shape == (4, 1)
-    total = 0.0
-    for k in range(25):
-        obs, reward, terminated, truncated, info = env.step(np.zeros(1, np.float32))
-        total += reward
-        assert obs[-1] == np.float32(info["y"])
-        assert obs in env.observation_space
-        assert truncated is (k == 24)
-        assert terminated is False
-    assert info["episode"]["l"] == 25
-    assert info["episode"]["r"] == pytest.approx(total)
+    assert env.reset(seed=0)[0].shape == (4, 1)
+    steps = [env.step(np.zeros(1, np.float32)) for _ in range(25)]
+    assert all(obs[-1] == np.float32(info["y"]) and obs in env.observation_space for obs, *_, info in steps)
+    assert [truncated for *_, truncated, _ in steps] == [False] * 24 + [True]
+    assert steps[-1][-1]["episode"]["l"] == 25
+    assert steps[-1][-1]["episode"]["r"] == pytest.approx(sum(reward for _, reward, *_ in steps))
 
 
 def test_import_is_light_and_registers_once():
