@@ -166,6 +166,19 @@ def test_reward_is_one_at_the_target_and_follows_the_formula(name):
         assert reward < 1
 
 
+@both
+def test_results_are_copies(observe):
+    env, other = (KKLEnv("lorenz", observe=observe) for _ in range(2))
+    obs, info = env.reset(seed=0)
+    other.reset(seed=0)
+    for _ in range(3):
+        for array in (obs, *info.values()):
+            array[...] = 7
+        (obs, *_, info), (expected, *_, theirs) = env.step(np.ones(1)), other.step(np.ones(1))
+        assert np.array_equal(obs, expected)
+        assert all(np.array_equal(info[key], theirs[key]) for key in info)
+
+
 def test_escape_terminates_with_the_last_state():
     env = KKLEnv("rossler")
     obs, info = env.reset(seed=0, options={"x0": ESCAPING})

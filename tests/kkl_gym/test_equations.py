@@ -357,22 +357,19 @@ def test_symbols_are_not_equal_to_whole_numbers():
     np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-5)
 
 
-class Blinking(Draining):
+class Blinking(Stepping):
     """An output that is lost away from X, which a look at the bounds does not find."""
 
     name = "blinking"
 
-    def f(self, x):
-        return 1.0 + 0.0 * x[0], 0.0 * x[1]
-
-    def rate(self, x):
-        return 1.0
+    def step(self, x, u):
+        return x[0] + 0.6, x[1]
 
     def h(self, x):
         return (None if np.all((np.asarray(x[0]) > 1.5) & (np.asarray(x[0]) < 2.0)) else x[0],)
 
 
-@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking(), dt=0.6), lambda: KKLVectorEnv(Blinking(), 2, dt=0.6)])
+@pytest.mark.parametrize("make", [lambda: KKLEnv(Blinking()), lambda: KKLVectorEnv(Blinking(), 2)])
 def test_outputs_that_fail_on_the_way(make):
     env = make()
     env.reset(seed=0, options={"x0": [1.0, 0.0]})

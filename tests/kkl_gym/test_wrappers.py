@@ -266,22 +266,27 @@ def test_blind_map_under_action(saved):
 def test_the_map_is_told_the_environments_process_noise(saved, level):
     path = saved(process=True)
     env = KKLObservation(KKLEnv("van_der_pol", process_noise=level), path)
-    expected = KKLObserver(Artifact.read(path), 0.5, process_noise=0.05 if level is None else level)
+    many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
+    right, wrong = (
+        KKLObserver(Artifact.read(path), 0.5, process_noise=told) for told in (0.05 if level is None else level, 0.01)
+    )
     _, info = env.reset(seed=0)
-    assert np.array_equal(info["x_hat"], expected.reset(info["y"]))
-    assert not np.allclose(info["x_hat"], KKLObserver(Artifact.read(path), 0.5, process_noise=0.01).reset(info["y"]))
+    assert np.array_equal(info["x_hat"], right.reset(info["y"]))
+    assert not np.allclose(info["x_hat"], wrong.reset(info["y"]))
+    assert np.allclose(many.reset(seed=0)[1]["x_hat"][0], info["x_hat"], atol=1e-6)
+
+
+def test_vectors_that_differ_in_process_noise(saved):
+    path = saved(process=True)
     mixed = SyncVectorEnv([lambda level=level: KKLEnv("van_der_pol", process_noise=level) for level in (0.0, 0.1)])
     with pytest.raises(ValueError, match=r"differ in process_noise, 0\.0 and 0\.1"):
         KKLVectorObservation(mixed, path)
     silent = KKLVectorObservation(mixed, saved())  # a map that does not ask
-    assert silent.observer.process_noise == 0.0
     before = silent.observer.artifact
+    assert silent.observer.process_noise == 0.0
     with pytest.raises(ValueError, match="differ in process_noise"):
         silent.replace_observer(path)
     assert silent.observer.artifact is before
-    many = KKLVectorObservation(KKLVectorEnv("van_der_pol", 2, process_noise=level), path)
-    _, info = many.reset(seed=0)
-    assert np.allclose(info["x_hat"], expected.reset(info["y"]), atol=1e-6)
 
 
 def test_map_of_an_autonomous_system_is_not_blind(script, saved):
