@@ -126,7 +126,8 @@ def test_rows_of_a_vector_are_single_environments(saved, mode):
     path, make = saved(CART_POLE()), partial(gym.make, "CartPole-v1", max_episode_steps=17)
     envs = KKLVectorObservation(SyncVectorEnv([make] * 3, autoreset_mode=mode), path)
     rows = SyncVectorEnv([lambda: KKLObservation(make(), path)] * 3, autoreset_mode=mode)
-    assert len(compare(envs, rows, np.random.default_rng(0).integers(2, size=(60, 3)), mode, infos={"final_obs", "y"})) > 3
+    actions = np.random.default_rng(0).integers(2, size=(60, 3))
+    assert len(compare(envs, rows, actions, mode, infos={"final_obs", "y"})) > 3
 
 
 class Told(gym.Env):

@@ -8,10 +8,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.play import PlayableGame
+from pushed_systems import TwoInputs
 
 from kkl_gym import ActionRepeat, KKLEnv, KKLObservation
 from kkl_gym.rendering import samples_a_frame
-from kkl_gym.system import System
 
 pygame = pytest.importorskip("pygame")
 pytest.importorskip("matplotlib")
@@ -104,19 +104,6 @@ def test_without_pygame(monkeypatch):
         KKLEnv("lorenz", render_mode="human").reset(seed=0)
 
 
-class Two(System):
-    name = "two"
-    X = bounds = ((-1.0, 1.0), (-1.0, 1.0))
-    u_max = (1.0, 2.0)
-    G = ((1.0, 0.0), (0.0, 1.0))
-
-    def f(self, x):
-        return -x[0], -x[1]
-
-    def h(self, x):
-        return (x[0],)
-
-
 def test_keys_for_people():
     env = gym.make("KKLLorenz-v0", render_mode="rgb_array")
     env.reset(seed=0)
@@ -124,7 +111,7 @@ def test_keys_for_people():
     pygame.display.quit()
     one, two = (
         {"".join(map(chr, pressed)): action.tolist() for pressed, action in each.get_keys_to_action().items()}
-        for each in (env.unwrapped, KKLEnv(Two()))
+        for each in (env.unwrapped, KKLEnv(TwoInputs()))
     )
     assert one == {"a": [-1.0], "d": [1.0]}
     assert len(two) == 8

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pushed_systems import Pendulum, TwoInputs
 
 from kkl_gym import SYSTEMS, KKLEnv, KKLVectorEnv, Lorenz, ReverseDuffing, Rossler, System, get_system
 from kkl_gym.compiled import batch_step, single_step
@@ -29,25 +30,6 @@ solve_ivp = pytest.importorskip("scipy.integrate").solve_ivp
 DT = 0.01
 
 
-@dataclass(frozen=True)
-class Steered(System):
-    """Two inputs through a matrix that depends on the state (a unicycle with drift)."""
-
-    name = "steered"
-    X = ((-1, 1), (-1, 1), (-3, 3))
-    bounds = ((-10, 10), (-10, 10), (-30, 30))
-    u_max = (2.0, 3.0)
-
-    def f(self, x):
-        return -0.1 * x[1], 0.1 * x[0], 0.0 * x[2]
-
-    def g(self, x):
-        return (sin(x[2] + 1.5), 0.0), (sin(x[2]), 0.0), (0.0, 1.0)
-
-    def h(self, x):
-        return x[0], x[1]
-
-
 class Flushed(System):
     """A reactor whose input dilutes it: x' = -0.02 x + (1 - x) u, which the input alone makes fast."""
 
@@ -61,21 +43,6 @@ class Flushed(System):
 
     def g(self, x):
         return ((1.0 - x[0],),)
-
-    def h(self, x):
-        return (x[0],)
-
-
-@dataclass(frozen=True)
-class TwoInputs(System):
-    name = "two_inputs"
-    X = ((-1, 1), (-1, 1))
-    bounds = ((-50, 50), (-50, 50))
-    u_max = (1.0, 2.0)
-    G = ((1.0, 0.5), (-1.0, 2.0))
-
-    def f(self, x):
-        return x[1], -sin(x[0])
 
     def h(self, x):
         return (x[0],)
@@ -162,7 +129,7 @@ def one_by_one(system, x0, u, w, dt):
     return np.array(out)
 
 
-@pytest.mark.parametrize("system", [*(cls() for cls in SYSTEMS.values()), TwoInputs()], ids=lambda s: s.name)
+@pytest.mark.parametrize("system", [*map(get_system, SYSTEMS), Pendulum(), TwoInputs()], ids=lambda s: s.name)
 def test_scalar_and_batch_agree_to_rounding_in_each_step(system):
     rng, n, steps = np.random.default_rng(4), 20, 15
     x0 = rng.uniform(*system.box(2), (n, system.nx))
@@ -247,22 +214,19 @@ def test_number_of_substeps_is_limited():
             calls.append(x)
             return super().f(x)
 
-    system = Counting()
-    rate = system.rate((1.0, 1.0))
-    dt = MOST_EQUAL / (PER_RATE * rate)
-    assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 0.999)).all()
-    assert len(calls) == 7 * MOST_EQUAL
-    calls.clear()
-    assert np.isfinite(advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1.001)).all()  # of lengths by the rate
-    assert 7 * MOST_EQUAL / 3 < len(calls) < 7 * MOST_EQUAL * 1.01
-    calls.clear()
+    def counted(x, dt):
+        calls.clear()
+        return np.isfinite(advance(Counting(), x, (0.0,), (0.0, 0.0), dt)).all(), len(calls)
+
+    dt = MOST_EQUAL / (PER_RATE * Counting().rate((1.0, 1.0)))
+    assert counted((1.0, 1.0), dt * 0.999) == (True, 7 * MOST_EQUAL)
+    finite, substeps = counted((1.0, 1.0), dt * 1.001)  # of lengths by the rate
+    assert finite
+    assert 7 * MOST_EQUAL / 3 < substeps < 7 * MOST_EQUAL * 1.01
     with pytest.raises(SubstepsError, match=f"{MAX_SUBSTEPS} substeps are not enough"):
-        advance(system, (1.0, 1.0), (0.0,), (0.0, 0.0), dt * 1000)
+        counted((1.0, 1.0), dt * 1000)
     assert len(calls) == 7 * MAX_SUBSTEPS
-    calls.clear()
-    beyond = (1.0, 3000.0)  # the bounds, where a motion need not be followed
-    assert np.isnan(advance(system, beyond, (0.0,), (0.0, 0.0), dt)).all()
-    assert not calls
+    assert counted((1.0, 3000.0), dt) == (False, 0)  # beyond the bounds, where a motion need not be followed
 
 
 class Igniting(System):
@@ -322,7 +286,7 @@ def test_overflow_in_a_users_functions_is_an_escape():
         assert not np.isfinite(simulate(Exploding(), np.array([[800.0], [5.0]]), 3, 1.0)[-1]).any()
 
 
-@pytest.mark.parametrize("system", [Lorenz(), Steered(), TwoInputs()], ids=lambda s: s.name)
+@pytest.mark.parametrize("system", [Lorenz(), Pendulum(), TwoInputs()], ids=lambda s: s.name)
 def test_inputs_and_noise(system):
     rng, n, steps = np.random.default_rng(5), 2, 20
     x0 = rng.uniform(*system.box(), (n, system.nx))
