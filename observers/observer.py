@@ -54,11 +54,11 @@ class KKLObserver:
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
-        Whether single samples go through machine code, which takes some seconds to make, and then a third of the time,
-        or a twentieth where the observer tracks. True makes it here, such as before a loop in real time, and where the
-        observer is unpickled; it needs Numba, the extra ``fast``. False leaves them to NumPy. None is NumPy until a
-        :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is held up in its midst. The two
-        agree to rounding. Batches of 128 rows or more take Numba wherever it is.
+        Whether single samples go through machine code, which takes some seconds to make the first time, and then a
+        third of the time, or a twentieth where the observer tracks. True makes it here, such as before a loop in real
+        time, and where the observer is unpickled; it needs Numba, the extra ``fast``. False leaves them to NumPy. None
+        is NumPy until a :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is held up in its
+        midst. The two agree to rounding. Batches of 128 rows or more take Numba wherever it is.
 
     Raises
     ------

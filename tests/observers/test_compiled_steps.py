@@ -39,7 +39,7 @@ def forget():
         cache.cache_clear()
     for cache in (machine.active_kernel, machine.entering_kernel):
         cache.cache_clear()
-    for cache in (observers.sparse._kernel, observers.sparse.single_kernel, compiled_covariance._covary):
+    for cache in (observers.sparse._kernel, observers.sparse._single_kernel, compiled_covariance._covary):
         cache.cache_clear()
 
 
@@ -390,10 +390,10 @@ def test_inputs_that_are_read_only_or_have_strides():
     for observer in (one, other):
         observer.reset([0.5])
         observer.step([0.4], [0.1])
-    made = len(observers.sparse.single_kernel().signatures)
+    made = len(observers.sparse._single_kernel().signatures)
     for u in (held, frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0]):
         assert apart(one.step([0.4], u), other.step([0.4], u), one.artifact) < ACCURATE
-    assert len(observers.sparse.single_kernel().signatures) == made
+    assert len(observers.sparse._single_kernel().signatures) == made
 
 
 def test_a_batch_compiles_nothing_more_where_rows_restart():
