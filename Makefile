@@ -79,10 +79,10 @@ results: $(VENV)/ready  ## the accuracy in the README and in docs/
 	$(MAKE) figures
 
 figures: $(VENV)/ready  ## the pictures of the pages, light and dark, from the files in docs/results, two minutes
-	$(BIN)/python docs/figures/draw.py
+	$(BIN)/python -m examples.research.figures
 
 benchmark: $(VENV)/ready  ## every method on every system, hours on two cores; resumable
-	$(BIN)/kkl-gym benchmark
+	$(BIN)/python -m examples.research benchmark
 	mkdir -p docs/results/benchmark
 	cp $(addprefix runs/benchmark/cpu/,results.csv methods.csv table.md) docs/results/benchmark
 	$(MAKE) figures
@@ -92,7 +92,7 @@ ABLATION := ablation-spinn $(SPINN) ablation-transients ablation-noise ablation-
 	default ablation-tuned
 
 ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumable
-	$(BIN)/kkl-gym benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
+	$(BIN)/python -m examples.research benchmark --budget short --methods $(ABLATION) --out runs/benchmark/ablation
 	mkdir -p docs/results/ablation
 	cp $(addprefix runs/benchmark/ablation/,results.csv methods.csv table.md) docs/results/ablation
 	$(MAKE) figures
@@ -100,7 +100,7 @@ ablation: $(VENV)/ready  ## what each idea earns, an hour on two cores; resumabl
 CERTIFIED := $(STATIC) $(SYSTEMS:%=%-spinn)
 
 certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
-	$(BIN)/kkl-gym certify $(CERTIFIED)
+	$(BIN)/python -m examples.research certify $(CERTIFIED)
 	$(BIN)/kkl-gym faults
 	mkdir -p docs/results/certificates docs/results/faults
 	cp runs/certificates/table.md $(CERTIFIED:%=runs/certificates/%.json) docs/results/certificates
@@ -109,8 +109,8 @@ certificates: $(VENV)/ready  ## the certificates and the faults in docs/results
 
 # The one on y is what `kkl-gym agent train van_der_pol --information y` makes, for the picture of two agents side by side.
 agents: $(VENV)/ready  ## every agent in docs/guides/agents.md, and those that ship: an hour and a half on two cores; resumable
-	$(BIN)/kkl-gym agent compare
-	$(BIN)/kkl-gym agent compare --systems reverse_duffing van_der_pol --information x_hat_std --no-more-noise
+	$(BIN)/python -m examples.research agents
+	$(BIN)/python -m examples.research agents --systems reverse_duffing van_der_pol --information x_hat_std --no-more-noise
 	mkdir -p docs/results/agents training/agents/shipped
 	cp $(addprefix runs/agents/comparison/,results.csv table.md) docs/results/agents
 	for system in $(SYSTEMS); do cp runs/agents/comparison/jobs/$$system-0.5/x_hat/0/agent.safetensors \
@@ -122,26 +122,26 @@ HIDDEN := CartPole-v1 Pendulum-v1 MountainCarContinuous-v0 LunarLander-v3 Invert
 	InvertedDoublePendulum-v5 Reacher-v5 Hopper-v5 HalfCheetah-v5
 
 environments: $(VENV)/ready  ## agents that see a part of other environments, hours on two cores; resumable
-	$(BIN)/kkl-gym agent compare $(HIDDEN)
+	$(BIN)/python -m examples.research agents $(HIDDEN)
 	mkdir -p docs/results/environments
 	cp $(addprefix runs/agents/environments/,results.csv curves.csv table.md) docs/results/environments
-	$(BIN)/kkl-gym agent compare CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 \
+	$(BIN)/python -m examples.research agents CartPole-v1 Pendulum-v1 --noise 0.1 0.2 0.3 \
 		--information state x_hat stacked_x_hat z stacked recurrent --aggregate 4 --seeds 5 --out runs/agents/noise
 	cp runs/agents/noise/results.csv docs/results/environments/noise.csv
-	$(BIN)/kkl-gym agent compare InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
+	$(BIN)/python -m examples.research agents InvertedDoublePendulum-v5 --information state x_hat --seeds 10 \
 		--out runs/agents/double-pendulum
 	cp runs/agents/double-pendulum/results.csv docs/results/environments/double-pendulum.csv
-	$(BIN)/kkl-gym agent compare Pendulum-v1 --information z stacked --angles 0,1 --time-constants 1 --frames 2 \
+	$(BIN)/python -m examples.research agents Pendulum-v1 --information z stacked --angles 0,1 --time-constants 1 --frames 2 \
 		--no-past-actions --out runs/agents/short
 	cp runs/agents/short/results.csv docs/results/environments/short.csv
 	$(MAKE) figures
 
 speed: $(VENV)/ready  ## environments against Pendulum-v1 and CartPole-v1, one thread
-	OMP_NUM_THREADS=1 $(BIN)/kkl-gym speed
+	OMP_NUM_THREADS=1 $(BIN)/python -m examples.research speed
 
 sizes: $(VENV)/ready  ## errors of wider and narrower maps against their time, an hour on two cores; resumable
 	mkdir -p docs/results/sizes
-	for system in $(SYSTEMS); do OMP_NUM_THREADS=1 $(BIN)/kkl-gym sizes $$system || exit 1; \
+	for system in $(SYSTEMS); do OMP_NUM_THREADS=1 $(BIN)/python -m examples.research sizes $$system || exit 1; \
 		cp runs/sizes/$$system/sizes.csv docs/results/sizes/$$system.csv || exit 1; done
 
 # RLlib pins Gymnasium, and Tianshou what tyro needs: each has an environment of its own.

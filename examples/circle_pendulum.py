@@ -3,7 +3,6 @@
 The same from the command line::
 
     kkl-gym train examples/circle_pendulum.py:CirclePendulum
-    kkl-gym certify runs/circle_pendulum/circle_pendulum.safetensors --system examples/circle_pendulum.py:CirclePendulum
 
 docs/guides/your_system.md says more about such plants.
 """

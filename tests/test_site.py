@@ -25,7 +25,7 @@ def test_the_page_of_commands_is_new():
     for option in ("--preset", "--measurement-noise", "`--ekf`, `--no-ekf`"):
         assert option in page
     assert "| fast 128, paper 512 |\n" in page
-    assert "### `kkl-gym agent compare`" in page
+    assert "### `python -m examples.research agents`" in page
 
 
 @pytest.mark.parametrize("package", [kkl_gym, observers, training])

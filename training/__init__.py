@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from training.config import Config
-    from training.evaluation.certificates import Certificate, certify
     from training.evaluation.errors import errors, unseen_trajectories
     from training.evaluation.metrics import nrmse, smape
     from training.guided import GuidedKalmanFilter
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from training.teaching.monitor import calibrate
 
 __all__ = [
-    "Certificate",
     "Config",
     "GuidedKalmanFilter",
     "KKLTrainingCallback",
@@ -26,7 +24,6 @@ __all__ = [
     "Result",
     "adapt",
     "calibrate",
-    "certify",
     "errors",
     "identify",
     "learn",
@@ -39,7 +36,6 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Certificate": "evaluation.certificates",
     "Config": "config",
     "GuidedKalmanFilter": "guided",
     "KKLTrainingCallback": "rollouts.callback",
@@ -47,7 +43,6 @@ _MODULES = {
     "Result": "pipeline",
     "adapt": "identification.learning",
     "calibrate": "teaching.monitor",
-    "certify": "evaluation.certificates",
     "errors": "evaluation.errors",
     "identify": "identification.learning",
     "learn": "rollouts",

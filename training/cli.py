@@ -11,32 +11,30 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from importlib import import_module
 from typing import Any, NoReturn
 
-# The module under training.commands and the class in it that are behind each command.
-COMMANDS = {
-    "check": ("check", "Check"),
-    "observability": ("observability", "ObservabilityCommand"),
-    "record": ("record", "RecordCommand"),
-    "train": ("train", "Train"),
-    "identify": ("identify", "Identify"),
-    "adapt": ("identify", "Adapt"),
-    "errorbars": ("errorbars", "ErrorBars"),
-    "tracking": ("tracking", "Tracking"),
-    "evaluate": ("evaluate", "Evaluate"),
-    "benchmark": ("benchmark", "Benchmark"),
-    "agent": ("agent", "AgentCommand"),
-    "certify": ("certify", "Certify"),
-    "tune": ("tune", "Tune"),
-    "faults": ("faults", "Faults"),
-    "maps": ("maps", "Maps"),
-    "export": ("export", "ExportCommand"),
-    "demo": ("demo", "Demo"),
-    "speed": ("speed", "Speed"),
-    "sizes": ("sizes", "Sizes"),
+Commands = Mapping[str, tuple[str, str]]
+"""The module and the class in it that are behind each command."""
+
+COMMANDS: Commands = {
+    "check": ("training.commands.check", "Check"),
+    "observability": ("training.commands.observability", "ObservabilityCommand"),
+    "record": ("training.commands.record", "RecordCommand"),
+    "train": ("training.commands.train", "Train"),
+    "identify": ("training.commands.identify", "Identify"),
+    "adapt": ("training.commands.identify", "Adapt"),
+    "errorbars": ("training.commands.errorbars", "ErrorBars"),
+    "tracking": ("training.commands.tracking", "Tracking"),
+    "evaluate": ("training.commands.evaluate", "Evaluate"),
+    "agent": ("training.commands.agent", "AgentCommand"),
+    "tune": ("training.commands.tune", "Tune"),
+    "faults": ("training.commands.faults", "Faults"),
+    "maps": ("training.commands.maps", "Maps"),
+    "export": ("training.commands.export", "ExportCommand"),
+    "demo": ("training.commands.demo", "Demo"),
 }
 
 
@@ -45,13 +43,11 @@ AFTER_INTERRUPTION = {
     ("train",): "--resume goes on from the last checkpoint, if there is one",
     ("identify",): "--resume goes on from the last checkpoint, if there is one",
     ("adapt",): "--resume goes on from the last checkpoint, if there is one",
-    ("benchmark",): "the same command goes on",
-    ("sizes",): "the same command goes on",
     ("agent", "train"): "--resume goes on from the last checkpoint, if there is one",
-    ("agent", "compare"): "the same command goes on",
 }
 
 WIDE = 140  # columns of what is printed into a file or a pipe, where tables of 80 would be cut
+PROG = "kkl-gym"
 MISUSED, INTERRUPTED = 2, 130  # exit statuses; the second is 128 + SIGINT
 
 # Modules that an extra of the package brings.
@@ -78,27 +74,35 @@ EXTRAS = {
 }
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(
+    arguments: list[str] | None = None,
+    *,
+    prog: str = PROG,
+    commands: Commands = COMMANDS,
+    after_interruption: Mapping[tuple[str, ...], str] = AFTER_INTERRUPTION,
+) -> None:
     """Entry point of the ``kkl-gym`` command."""
     arguments = sys.argv[1:] if arguments is None else arguments
     with _noticing_interruptions() as interrupted:
         try:
             from rich.console import Console
 
-            read(arguments).run(Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE))
+            read(arguments, prog=prog, commands=commands).run(
+                Console(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDE)
+            )
         except BaseException as error:
             if interrupted or isinstance(error, KeyboardInterrupt):  # modules turn it into errors of their own
-                hints = [hint for words, hint in AFTER_INTERRUPTION.items() if tuple(arguments[: len(words)]) == words]
-                _end("; ".join(["interrupted", *hints]), INTERRUPTED)
+                hints = [hint for words, hint in after_interruption.items() if tuple(arguments[: len(words)]) == words]
+                _end(prog, "; ".join(["interrupted", *hints]), INTERRUPTED)
             if isinstance(error, ModuleNotFoundError):
                 module = (error.name or "").partition(".")[0]
                 extras = [f'pip install "kkl-gym[{extra}]"' for extra, modules in EXTRAS.items() if module in modules]
-                sys.exit(": ".join(["kkl-gym", str(error), *extras]))
+                sys.exit(": ".join([prog, str(error), *extras]))
             if isinstance(error, BrokenPipeError):  # who reads what is printed has seen enough, as head does
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 sys.exit(1)
             if isinstance(error, ValueError | OSError | FloatingPointError):
-                sys.exit(f"kkl-gym: {_message(error)}")
+                sys.exit(f"{prog}: {_message(error)}")
             raise
 
 
@@ -129,20 +133,20 @@ def _noticing_interruptions() -> Iterator[list[int]]:
         signal.signal(signal.SIGINT, before)
 
 
-def read(arguments: list[str]) -> Any:
+def read(arguments: list[str], *, prog: str = PROG, commands: Commands = COMMANDS) -> Any:
     """Read a command line, and run nothing."""
     import tyro
 
     called = arguments[:1]
     if called and called[0].startswith("--tyro"):  # completion of the shell wants to know all
-        called = list(COMMANDS)
-    commands = {name: (load if name in called else _described)(*behind) for name, behind in COMMANDS.items()}
+        called = list(commands)
+    classes = {name: (load if name in called else _described)(*behind) for name, behind in commands.items()}
     said = io.StringIO()
     try:
         with redirect_stderr(said):
             return tyro.extras.subcommand_cli_from_dict(
-                commands,
-                prog="kkl-gym",
+                classes,
+                prog=prog,
                 description="Learned KKL observers for Gymnasium environments.",
                 args=arguments,
                 config=(tyro.conf.DisallowNone,),
@@ -150,11 +154,11 @@ def read(arguments: list[str]) -> Any:
     except SystemExit as end:
         if end.code != MISUSED:
             raise
-        _end(_without_box(said.getvalue()), MISUSED)
+        _end(prog, _without_box(said.getvalue()), MISUSED)
 
 
-def _end(message: str, code: int) -> NoReturn:
-    print(f"kkl-gym: {message}", file=sys.stderr)
+def _end(prog: str, message: str, code: int) -> NoReturn:
+    print(f"{prog}: {message}", file=sys.stderr)
     sys.exit(code)
 
 
@@ -173,16 +177,19 @@ def _without_box(text: str) -> str:
 
 def load(module: str, name: str) -> Callable[..., Any]:
     """Import what is behind a command."""
-    found: Callable[..., Any] = getattr(import_module(f"training.commands.{module}"), name)
+    found: Callable[..., Any] = getattr(import_module(module), name)
     return found
 
 
 def _described(module: str, name: str) -> Callable[..., Any]:
     """In the place of a command that is not called: the summary of its class, read without importing the module."""
     import ast  # here, as is the next, so that an interruption soon finds somebody who notices it
-    from importlib.resources import files
+    from importlib.util import find_spec
+    from pathlib import Path
 
-    source = files("training.commands").joinpath(f"{module}.py").read_text(encoding="utf-8")
+    spec = find_spec(module)
+    assert spec is not None
+    source = Path(str(spec.origin)).read_text(encoding="utf-8")
     classes = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.ClassDef)}
 
     def command() -> None: ...

@@ -73,7 +73,7 @@ from dataclasses import replace
 
 import torch
 
-from training.methods import Method
+from examples.research.methods import Method
 
 
 class Line(Method):

@@ -10,8 +10,8 @@ from busy_jobs import Busy, alive, solve, until, work, write_here
 from rich.console import Console
 from safetensors.numpy import load_file
 
+from examples.research.benchmark.command import Benchmark
 from training import clusters
-from training.commands.benchmark import Benchmark
 from training.commands.running import Workers
 from training.parallel import engine
 

@@ -11,11 +11,11 @@ from linear_system import Oscillator
 from small_runs import toy
 
 import kkl_gym
+from examples.research.benchmark.protocol import run
 from kkl_gym.compiled import batch_step
 from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from training import errors, preset, train, unseen_trajectories
-from training.benchmark.protocol import run
 from training.jobs import describe
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter
 from training.smoothness import smooth_spectrum

@@ -7,10 +7,10 @@ from random_artifacts import random_artifact
 from scipy.linalg import expm
 
 import training
+from examples.research.benchmark.protocol import run
 from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import ArtifactError, KKLObserver
-from training.benchmark.protocol import run
 from training.guided import GuidedKalmanFilter
 from training.kalman import IteratedKalmanFilter, measurement_covariance
 

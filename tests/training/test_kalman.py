@@ -11,10 +11,10 @@ from filterpy.kalman import UnscentedKalmanFilter as FilterpyUKF
 from linear_system import Autonomous, C, F, Oscillator, TwoOutputs
 from scipy.linalg import expm
 
+from examples.research.benchmark.protocol import run
 from kkl_gym import get_system
 from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance, simulate
-from training.benchmark.protocol import run
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.trajectories.derivatives import jacobian
 

@@ -12,9 +12,9 @@ import pytest
 from small_runs import toy
 
 import kkl_gym
+from examples.research.benchmark.protocol import run
 from kkl_gym.simulate import simulate
 from training import train
-from training.benchmark.protocol import run
 from training.cli import main
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start

@@ -19,7 +19,6 @@ from training.agents.information import INFORMATION
 from training.agents.play import Episodes, play
 from training.agents.tasks import get_task, scores, successes
 from training.commands.agent_files import Export, Import, find
-from training.commands.compare import Compare
 from training.commands.environment import EnvironmentOptions, is_environment, show_returns, train_in_environment
 from training.commands.options import NoiseLevel
 from training.evaluation.levels import as_name, show_level
@@ -27,7 +26,7 @@ from training.jobs import locked
 from training.progress import LOG, ProgressBars, progress_bars
 from training.seeds import agent_evaluation_seed
 
-Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "stacked_x_hat", "ekf", "recurrent"]
+Knows = Literal["state", "x_hat", "x_hat_std", "z", "y", "stacked", "ekf", "recurrent"]
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Train:
     ]
     information: Annotated[Knows, tyro.conf.arg(aliases=["--knows"])] = "x_hat"
     """What the agent knows: docs/guides/agents.md explains each. In an environment: state, x_hat,
-    stacked_x_hat, z, stacked, recurrent or y (docs/results/partly_observed.md)."""
+    z, stacked, recurrent or y (docs/results/partly_observed.md)."""
     seed: int = 0
     """Seed of networks, exploration and episodes."""
     measurement_noise: NoiseLevel = None
@@ -60,7 +59,7 @@ class Train:
         str | None,
         tyro.conf.arg(metavar="MAP", help_behavior_hint="(default: the one of the system's profile, else the newest)"),
     ] = None
-    """A shipped map's name or a .safetensors file, for an agent that knows x_hat, x_hat_std, z or stacked_x_hat."""
+    """A shipped map's name or a .safetensors file, for an agent that knows x_hat, x_hat_std or z."""
     algorithm: Annotated[
         Literal["ppo", "sac", "td3", "tqc", "dqn", "a2c", "ppo_lstm"] | None,
         tyro.conf.arg(help_behavior_hint="(default: sac for reverse_duffing and where it is tuned, else ppo)"),
@@ -114,7 +113,7 @@ class Train:
             if self.information not in INFORMATION:
                 raise ValueError(
                     f"an agent of a system knows {', '.join(INFORMATION)}; got {self.information!r}, which is for "
-                    "environments, such as Pendulum-v1 (and recurrent agents of systems for kkl-gym agent compare)"
+                    "environments, such as Pendulum-v1"
                 )
             agent = learn(
                 task,
@@ -198,12 +197,11 @@ class Evaluate:
 
 @dataclass(frozen=True)
 class AgentCommand:
-    """Train, evaluate, compare and convert agents that act on what an observer shows."""
+    """Train, evaluate and convert agents that act on what an observer shows."""
 
     command: Annotated[
         Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-        | Annotated[Compare, tyro.conf.subcommand("compare")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Import, tyro.conf.subcommand("import")],
         tyro.conf.arg(name=""),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from linear_system import Oscillator
 
+from examples.research.methods.kalman import EKF
 from kkl_gym import SYSTEMS, VanDerPol, get_system
 from observers import load
 from training.agents.information import (
@@ -20,7 +21,6 @@ from training.agents.information import (
     output_deviation,
 )
 from training.agents.tasks import ControlTask
-from training.methods.kalman import EKF
 
 N = 3
 TASK = ControlTask("van_der_pol", measurement_noise=0.2, period=0.02, duration=0.2)

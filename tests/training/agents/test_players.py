@@ -13,20 +13,20 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from rich.console import Console
 
+from examples.research.agents.command import Compare
+from examples.research.environments.command import COLUMNS, unusual
+from examples.research.environments.comparison import Case, collect, planned, run_case
+from examples.research.environments.tables import cell, curves, write_table
 from observers import MLP, Artifact
 from observers.storage import checksum
 from training.agents.agent import AgentError
 from training.agents.any_environment import learning, observing
-from training.agents.any_environment.comparison import Case, collect, planned, run_case
 from training.agents.any_environment.information import ESTIMATES, SHOWN, Stacked, show
 from training.agents.any_environment.learning import hyperparameters, learn_to_play, settings_of
 from training.agents.any_environment.observing import Told, learn_observer, wander
 from training.agents.any_environment.player import Player
-from training.agents.any_environment.tables import cell, curves, write_table
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.commands.agent import Evaluate, Train
-from training.commands.compare import Compare
-from training.commands.compare_environments import COLUMNS, unusual
 from training.commands.environment import EnvironmentOptions
 from training.commands.record import RecordCommand
 from training.commands.running import Workers

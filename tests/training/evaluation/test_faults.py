@@ -8,9 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import examples.research.certificates.certificate
+import examples.research.certificates.gains
 import training.commands.faults
-import training.evaluation.certificates.certificate
-import training.evaluation.certificates.gains
 import training.evaluation.faults
 import training.teaching.monitor
 from kkl_gym import VanDerPol
@@ -78,7 +78,7 @@ def test_monitors_and_certificates_tell_the_map_the_process_noise(make_artifact,
     simulate_faults(calibrated, system, trajectories=2, duration=20.0, measurement_noise=0.5, seed=0)
     assert set(told) == {0.12}
     told.clear()
-    for module in (training.evaluation.certificates.certificate, training.evaluation.certificates.gains):
+    for module in (examples.research.certificates.certificate, examples.research.certificates.gains):
         monkeypatch.setattr(module, "decoder", spy)
     training.certify(artifact, system, measurement_noise=0.3, trajectories=4)
     assert set(told) == {(0.3, 0.12), (0.0, 0.0)}

@@ -9,11 +9,11 @@ from linear_system import Oscillator
 from rich.console import Console
 from tracking import DT, exact_motion, plain_observer, tracking_observer
 
+from examples.research.certificates.certificate import certify
 from kkl_gym import get_system
 from observers import MLP, Artifact, KKLObserver, Limits, load
 from observers.polynomial import monomials
 from training.commands.tracking import Tracking
-from training.evaluation.certificates.certificate import certify
 from training.evaluation.coverage import coverage
 from training.evaluation.errors import errors, unseen_trajectories
 from training.guided import GuidedKalmanFilter

@@ -16,24 +16,19 @@ from kkl_gym.identity import source_of
 from kkl_gym.signals import Inputs
 from kkl_gym.turning import turned
 from training.agents.any_environment.task import HiddenTask
-from training.agents.any_environment.window import WindowEstimator, WindowObservation
-from training.rollouts.playing import Recorder
 
-Shown = Literal["state", "x_hat", "stacked_x_hat", "z", "stacked", "recurrent", "y"]
+Shown = Literal["state", "x_hat", "z", "stacked", "recurrent", "y"]
 SHOWN: tuple[Shown, ...] = get_args(Shown)
-ESTIMATES: tuple[Shown, ...] = ("x_hat", "stacked_x_hat")  # what is learned from hidden signals
 
 
-def show(
-    task: HiddenTask, information: Shown, observer: str | None = None, *, keep: int | None = None
-) -> gym.Env[np.ndarray, Any]:
+def show(task: HiddenTask, information: Shown, observer: str | None = None) -> gym.Env[np.ndarray, Any]:
     """Make a task's environment in which an agent sees what ``information`` says."""
     if information not in SHOWN:
         raise ValueError(f"an agent is shown one of {', '.join(SHOWN)}, got {information!r}")
     if information == "state":
         return task.without_noise.make()
-    if information in ESTIMATES and observer is None:
-        raise ValueError(f"an agent that is shown {information} needs an observer")
+    if information == "x_hat" and observer is None:
+        raise ValueError("an agent that is shown x_hat needs an observer")
     env = task.make()
     if information == "x_hat":
         env = KKLObservation(env, observer, measurement_noise=task.measurement_noise)
@@ -42,8 +37,6 @@ def show(
     if information == "z":
         without = {} if task.past_actions else {"input_time_constants": ()}
         return KKLMemory(env, task.measured, angles=task.angles, time_constants=task.time_constants, **without)
-    if information == "stacked_x_hat":
-        return _stacked_estimates(task, env, WindowEstimator.read(str(observer)), keep)
     env = part_of(env, task.measured)
     if information == "y":
         return env
@@ -52,22 +45,6 @@ def show(
     at = task.measured.index
     angles = [(at(cosine), at(sine)) for cosine, sine in task.angles]
     return Stacked(env, task.frames, angles, actions=task.past_actions)
-
-
-def _stacked_estimates(
-    task: HiddenTask, env: gym.Env[np.ndarray, Any], estimator: WindowEstimator, keep: int | None
-) -> gym.Env[np.ndarray, Any]:
-    """Y and what a network estimates from stacked observations; under noise the estimates alone."""
-    whole: Any = env.observation_space
-    size = whole.shape[0]
-    entries = list(task.estimated_entries(size) if task.measurement_noise else task.told(size))
-    low, high = whole.low[entries], whole.high[entries]
-    if task.measurement_noise:  # estimates are not cut, as those of observers are not
-        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
-    if keep is not None:
-        env = Recorder(env, **task.signals(size), keep=keep)
-    stacked = Stacked(part_of(env, task.measured), task.frames)
-    return WindowObservation(stacked, task, estimator, gym.spaces.Box(low, high, dtype=np.float32))
 
 
 def part_of(env: gym.Env[np.ndarray, Any], entries: Sequence[int]) -> gym.Env[np.ndarray, Any]:
@@ -152,4 +129,4 @@ class Stacked(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorAr
         return np.concatenate([*parts, last], dtype=np.float32)
 
 
-__all__ = ["ESTIMATES", "SHOWN", "Shown", "Stacked", "part_of", "show"]
+__all__ = ["SHOWN", "Shown", "Stacked", "part_of", "show"]

@@ -24,11 +24,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from observers.storage import replacing
 from training.agents.agent import fingerprint
-from training.agents.any_environment.information import ESTIMATES, Shown, show
-from training.agents.any_environment.observing import KEPT, OBSERVER, Told, learn_observer, refitting, wander
+from training.agents.any_environment.information import Shown, show
+from training.agents.any_environment.observing import KEPT, KKL, OBSERVER, Estimation, Told, wander
 from training.agents.any_environment.player import Head, Player
 from training.agents.any_environment.task import HiddenTask
-from training.agents.any_environment.window_fit import WindowRefits, learn_window
 from training.agents.policy import linear, perceptron
 from training.progress import ProgressBars, progress_bars
 from training.records import Record
@@ -91,6 +90,7 @@ def learn_to_play(
     observer: str | None = None,
     observer_steps: int | None = None,
     aggregate: int = 0,
+    estimation: Estimation = KKL,
     progress: ProgressBars | None = None,
 ) -> BaseAlgorithm:
     """Train one agent.
@@ -98,7 +98,7 @@ def learn_to_play(
     Where an observer has to be learned, the agent's first steps are for both. As there are no estimates yet, the agent
     is told the truth in their place. The observer is learned from what happens, and the agent goes on with estimates.
     Under noise estimates are far from the truth; these steps are then fewer, and random actions, from which the
-    observer alone is learned. They count too.
+    observer alone is learned. They count too. With another ``estimation`` than that of KKL observers no agent is saved.
     """
     with show(task, "state") as env:
         actions, estimated = env.action_space, task.estimated(gym.spaces.flatdim(env.observation_space))
@@ -108,14 +108,14 @@ def learn_to_play(
     settings = hyperparameters(name, task.env_id, timesteps)
     _check_actions(name, actions, task.env_id)
     steps, began = settings["n_timesteps"], time.process_time()
-    if observer is not None and information not in ESTIMATES:
+    if observer is not None and information != "x_hat":
         raise ValueError(f"an agent that is shown {information!r} has no use for the observer {observer!r}")
-    if information in ESTIMATES and not estimated:
+    if information == "x_hat" and not estimated:
         raise ValueError(f"all entries of {task.env_id} are measured, without noise: nothing is left to estimate")
-    if aggregate and information not in ESTIMATES:
+    if aggregate and information != "x_hat":
         raise ValueError(f"an agent that is shown {information!r} has no observer to fit again")
     rehearsal = round(REHEARSAL * steps) if aggregate else 0
-    learns_observer, spent = information in ESTIMATES and observer is None, 0
+    learns_observer, spent = information == "x_hat" and observer is None, 0
     if learns_observer:
         share = WANDERED if task.measurement_noise else TOLD
         spent = round(share * steps) if observer_steps is None else observer_steps
@@ -126,11 +126,10 @@ def learn_to_play(
                 f"observer_steps must be some, and fewer than all {steps - rehearsal} of learning; got {spent}"
             )
     elif observer_steps is not None:
-        raise ValueError("observer_steps is for agents on x_hat or stacked_x_hat that are given no observer")
+        raise ValueError("observer_steps is for agents on x_hat that are given no observer")
     newest, description = folder / OBSERVER, f"{task.name} {information} {seed}"
     with progress_bars(progress) as bars:
-        learn = learn_window if information == "stacked_x_hat" else learn_observer
-        learned = partial(learn, task, folder=folder, seed=seed, progress=bars)
+        learned = partial(estimation.learn, task, folder=folder, seed=seed, progress=bars)
         curve, told, before = Curve(folder / CURVE, began=began), None, list[Record]()  # no random actions in refits
         if learns_observer and task.measurement_noise:  # what is right with the truth is not with estimates then
             observer = str(learned(wander(task, spent, seed=seed, progress=bars)))
@@ -139,7 +138,14 @@ def learn_to_play(
             told = Told(task, settings.get("n_envs", 1))
         left = steps - rehearsal - curve.spent
         keep = KEPT // settings.get("n_envs", 1) if aggregate else None
-        make = partial(show, task, information, observer, keep=keep) if told is None else told.make
+
+        def make() -> gym.Env[Any, Any]:
+            if told is not None and observer is None:
+                return told.make()
+            if information == "x_hat":
+                return estimation.show(task, str(observer), keep)
+            return show(task, information)
+
         with closing(_Learner(ALGORITHMS[name], settings, seed, make)) as learner:
             if told is not None:
                 with bars.phase(f"{description}, told the truth", spent) as report:
@@ -151,19 +157,15 @@ def learn_to_play(
                     )
                 observer = str(learned(told.records()))
                 before = told.oldest_first() if aggregate else []
-                learner.move(partial(show, task, information, observer, keep=keep))
+                learner.move(make)
             callbacks: list[BaseCallback] = [curve]
             if aggregate:
                 every = max(1, (left - learner.steps) // (aggregate + 1))
-                callbacks.append(
-                    WindowRefits(learned, every, rehearsal, before)
-                    if information == "stacked_x_hat"
-                    else refitting(task, every, rehearsal, newest, before)
-                )
+                callbacks.append(estimation.refits(task, learned, every, rehearsal, newest, before))
             with bars.phase(description, left) as report:
                 learner.learn(left, [Bar(report), *callbacks])
     model = learner.model
-    if name != RECURRENT:
+    if name != RECURRENT and estimation is KKL:
         if learns_observer or aggregate:
             observer = str(newest)  # which is what the agent has seen last
         how = {"algorithm": name, **settings, "seed": seed, "observer_steps": spent, "aggregate": aggregate}

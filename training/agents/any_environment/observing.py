@@ -1,14 +1,16 @@
 """An observer for an agent: from the first steps that it makes in an environment, and from later ones."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
 
-from training.agents.any_environment.information import part_of
+from training.agents.any_environment.information import part_of, show
 from training.agents.any_environment.task import CLEAN_Y, HiddenTask
 from training.maps.coordinates import SETTLED
 from training.progress import ProgressBars
@@ -102,14 +104,35 @@ def learn_observer(
     return path
 
 
-def refitting(
-    task: HiddenTask, every: int, rehearsal: int, path: Path, records: Sequence[Record] = ()
-) -> KKLTrainingCallback:
-    """Make what fits an observer again to an agent's own steps."""
+def refits(
+    task: HiddenTask,
+    learn: Callable[[Sequence[Record]], Path],
+    every: int,
+    rehearsal: int,
+    path: Path,
+    records: Sequence[Record],
+) -> BaseCallback:
+    """Make what fits an observer again to an agent's own steps, beside those of ``records``."""
     outputs = CLEAN_Y if task.measurement_noise else "y"
     return KKLTrainingCallback(
         every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
     )
 
 
-__all__ = ["KEPT", "OBSERVER", "Told", "learn_observer", "oldest_first", "refitting", "wander"]
+def show_estimates(task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
+    """Make the environment that shows an observer's estimates; :class:`KKLTrainingCallback` keeps the steps."""
+    return show(task, "x_hat", path)
+
+
+@dataclass(frozen=True)
+class Estimation:
+    """How estimates of hidden signals are learned from an agent's steps, shown to it, and learned again."""
+
+    learn: Callable[..., Path]
+    show: Callable[[HiddenTask, str, int | None], gym.Env[np.ndarray, Any]]
+    refits: Callable[..., BaseCallback]
+
+
+KKL = Estimation(learn_observer, show_estimates, refits)
+
+__all__ = ["KEPT", "KKL", "OBSERVER", "SETTINGS", "Estimation", "Told", "learn_observer", "oldest_first", "wander"]

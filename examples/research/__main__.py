@@ -1,0 +1,15 @@
+"""``python -m examples.research``: a table of commands, read as ``kkl-gym`` reads its own."""
+
+from training.cli import main
+
+COMMANDS = {
+    "benchmark": ("examples.research.benchmark.command", "Benchmark"),
+    "certify": ("examples.research.certificates.command", "Certify"),
+    "agents": ("examples.research.agents.command", "Compare"),
+    "speed": ("examples.research.speed.speed", "Speed"),
+    "sizes": ("examples.research.speed.sizes", "Sizes"),
+}
+GOES_ON: dict[tuple[str, ...], str] = {(name,): "the same command goes on" for name in ("benchmark", "agents", "sizes")}
+
+if __name__ == "__main__":
+    main(prog="python -m examples.research", commands=COMMANDS, after_interruption=GOES_ON)

@@ -1,0 +1,1 @@
+"""Agents on our systems that know different things, compared."""

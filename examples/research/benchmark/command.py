@@ -1,0 +1,139 @@
+"""``python -m examples.research benchmark``."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from kkl_gym.systems import SYSTEMS, get_system
+from observers.checks import noise_levels
+from observers.storage import clear_unfinished
+from training.commands.options import NoiseLevels
+from training.commands.running import Workers, run_missing
+from training.evaluation.levels import multiple, show_level
+from training.progress import LOG, progress_bars
+from training.seeds import Stream, generator
+
+if TYPE_CHECKING:
+    from examples.research.benchmark.jobs import Job
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """Compare observers: train every method on every system, measure all on the same unseen trajectories.
+
+    Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
+    OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
+    trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
+    work. What is missing from the full set is said in table and figure.
+    """
+
+    budget: Literal["short", "cpu", "paper"] = "cpu"
+    """cpu: 400,000 points and 300 CPU seconds for each training. short: a half of that, 40 s. paper: 8 million
+    points, networks of 4 x 512, an hour each; wants a GPU."""
+    quick: bool = False
+    """In place of the budget: trainings of 300 batches, no search, few and short test trajectories; a matter of
+    minutes, with the same results each time."""
+    systems: tuple[str, ...] = tuple(SYSTEMS)
+    """Names, or classes of yours as script.py:Class or module:Class."""
+    methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(help_behavior_hint="(default: all of these)")] = None
+    """default, spinn, ae, dmf, dmf-noise, node, node-noise, gru, kalmannet, rkn, ekf, ukf, ekf-wrong, default-wrong,
+    spinn-wrong, ekf-untuned; or, with the maps that ship, guided, shipped, shipped-spinn, shipped-static; or classes
+    of yours as script.py:Class or module:Class. Those that end in -wrong believe in parameters 10 % too large; a system
+    must have some."""
+    measurement_noise: NoiseLevels = None
+    """Standard deviations of the noise on each sample of y. 0.1,0.3 is one for each output."""
+    out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/benchmark/BUDGET)")] = None
+    """Folder of results."""
+    workers: tyro.conf.OmitArgPrefixes[Workers] = field(default_factory=Workers)
+    seed: int = 0
+    """Seed of the test trajectories; training's is always 0."""
+    beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
+    """Folder with results.csv and methods.csv of the same benchmark, such as docs/results/benchmark: the rows of its
+    other observers are taken over, so that new ones stand beside them without training those again."""
+    report: bool = False
+    """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
+
+    def run(self, console: Console) -> Path:
+        """Run what is missing, then report."""
+        from examples.research.benchmark.jobs import run_job, time_steps  # torch takes seconds to import
+        from examples.research.benchmark.results import check_results, collect, report
+
+        name = "quick" if self.quick else self.budget
+        out = self.out or Path("runs") / "benchmark" / name
+        if self.beside is not None:
+            check_results(self.beside)
+        clear_unfinished(out)
+        with progress_bars(console, out / LOG) as progress:
+            failures = list[str]()
+            if not self.report:
+                jobs = self._jobs(name, out)
+                failures = run_missing(run_job, jobs, workers=self.workers, what="observers", progress=progress)
+                trained = [job for job in jobs if job.done]
+                for job in progress.track(trained, description="timing steps"):
+                    try:
+                        time_steps(job)
+                    except Exception as error:  # as in a job: whatever a method does wrong, the others go on
+                        failures.append(f"{job.name}, timing: {error}")
+                if trained:
+                    collect(out, self.beside)
+            if self.report or trained:
+                with progress.phase("drawing the table and the figure"):
+                    note = report(out)
+                progress.say(f"wrote results.csv, methods.csv, table.md and heatmap.png in {out}. {note}")
+        if failures:
+            raise ValueError(f"{len(failures)} of {len(jobs)} jobs failed; the first: {failures[0]}")
+        return out
+
+    def _jobs(self, name: str, out: Path) -> "list[Job]":
+        """What is to be done; ValueError if an option makes no sense."""
+        import torch
+
+        from examples.research.benchmark.jobs import Job
+        from examples.research.methods import METHODS, WrongParameters, get_method
+        from examples.research.speed.size_errors import (
+            BUDGETS,
+            PROTOCOL,
+            QUICK_PROTOCOL,
+            SEARCH,
+            VALIDATION,
+            paced_budget,
+        )
+        from examples.research.speed.size_errors import paced_protocol as paced
+
+        methods, levels = tuple(METHODS) if self.methods is None else self.methods, self.measurement_noise
+        if not self.systems or not methods or levels == ():
+            raise ValueError("give at least one system, method and noise level")
+        generator(Stream.EVALUATION, self.seed)  # refuses some seeds, now rather than when all is trained
+        named = [[get_system(name).name for name in self.systems], [get_method(name).name for name in methods]]
+        for names in (*named, [show_level(level) for level in levels or ()]):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{names} has one of them twice")
+        protocol = replace(QUICK_PROTOCOL if self.quick else PROTOCOL, seed=self.seed)
+        budget = BUDGETS[name]
+        search = None if self.quick else SEARCH * budget.cpu_seconds
+        device = "cuda" if name == "paper" and torch.cuda.is_available() else "cpu"
+        jobs = []
+        for given in self.systems:
+            system = get_system(given)
+            noise = tuple(noise_levels("measurement_noise", level, system.ny) for level in levels or ())
+            noise = noise or tuple(dict.fromkeys([0.0, multiple(system, 1.0)]))
+            for method in methods:
+                found = get_method(method)
+                if self.methods is None and isinstance(found, WrongParameters) and not system.parameters:
+                    continue
+                found.believed(system)  # refuses some systems, now rather than when its turn comes
+                job = Job(
+                    system=given,
+                    method=method,
+                    folder=out / "jobs" / system.name / found.name,
+                    budget=paced_budget(budget, system),
+                    protocol=replace(paced(protocol, system), measurement_noise=noise),
+                    search=search,
+                    validation=replace(paced(VALIDATION, system), measurement_noise=noise),
+                    device=device,
+                )
+                jobs.append(job)
+        return jobs

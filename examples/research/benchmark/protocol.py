@@ -1,0 +1,140 @@
+"""What every observer of the benchmark is measured on."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from examples.research.methods import CausalObserver, Method
+from kkl_gym.simulate import simulate
+from kkl_gym.system import System
+from training.evaluation.errors import TRANSIENT, Domain, UnseenTrajectories, starts, unseen_trajectories
+from training.evaluation.levels import Level, as_cell, multiple
+from training.evaluation.metrics import by_state, component_smape, nrmse, rmse, settling_time, smape
+from training.seeds import Stream, generator
+
+UNTIMED, TIMED = 100, 400  # samples of each round, in the first of which observers find their way
+LOST = 50.0  # % of SMAPE after the transient, above which a trajectory counts as lost
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """Trajectories to test on."""
+
+    domains: tuple[Domain, ...] = ("X", "1.5X", "2X")
+    measurement_noise: tuple[Level, ...] = (0.0, 0.5)
+    trajectories: int = 100
+    duration: float = 50.0
+    seed: int = 0
+
+
+def run(observer: CausalObserver, y: np.ndarray) -> np.ndarray:
+    """Give an observer one sample of y after the other.
+
+    Shapes: ``y`` (steps + 1, n, ny); returns (steps + 1, n, nx).
+    """
+    first = observer.reset(y[0])
+    out = np.empty((len(y), *first.shape))
+    out[0] = first
+    for k in range(1, len(y)):
+        out[k] = observer.step(y[k])
+    return out
+
+
+def with_shared_noise(
+    system: System, runs: UnseenTrajectories, *, measurement_noise: Level, n: int, seed: tuple[Stream, *tuple[int, ...]]
+) -> np.ndarray:
+    """Outputs with noise on every sample, the same for every method.
+
+    Shapes: ``measurement_noise`` of length ny; returns (steps + 1, trajectories inside bounds, ny).
+    """
+    unit = generator(*seed).standard_normal((n, len(runs.x), system.ny))
+    v = np.asarray(measurement_noise) * unit[: len(runs.inside)][runs.inside].swapaxes(0, 1)
+    y: np.ndarray = system.output(runs.x) + v
+    return y
+
+
+def measure(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> pd.DataFrame:
+    """Measure an observer on test trajectories."""
+    n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
+    frames = []
+    for i, domain in enumerate(protocol.domains):
+        seed = (Stream.EVALUATION, protocol.seed, 1, i)
+        runs = unseen_trajectories(
+            system, dt, n=protocol.trajectories, duration=protocol.duration, seed=protocol.seed, domain=domain
+        ).first(n)
+        skip = round(TRANSIENT * len(runs.x))
+        for noise in protocol.measurement_noise:
+            y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
+            x_hat = run(method.observer(trained, system, dt, noise), y)
+            late = smape(runs.x, x_hat, skip)
+            errors = pd.DataFrame(
+                {
+                    "trajectory": np.flatnonzero(runs.inside),
+                    "smape": smape(runs.x, x_hat),
+                    "smape_late": late,
+                    "component_late": component_smape(runs.x, x_hat, skip),
+                    "rmse": rmse(runs.x, x_hat),
+                    "rmse_late": rmse(runs.x, x_hat, skip),
+                    "settling": settling_time(runs.x, x_hat, dt),
+                    "lost": ((late > LOST) | ~np.isfinite(x_hat).all((0, 2))).astype(float),
+                    **by_state(nrmse(runs.x, x_hat, skip)),
+                }
+            )
+            frame = pd.DataFrame({"starts": domain, "noise": as_cell(noise), "trajectory": range(n)})
+            frame["escaped"] = (~runs.inside).astype(int)
+            frames.append(frame.merge(errors, how="left", on="trajectory"))
+    return pd.concat(frames, ignore_index=True)
+
+
+def tuned_for(method: Method[Any], system: System) -> tuple[Level, ...] | None:
+    """Levels of noise at which a method's configurations are compared; None for those of the test."""
+    return None if method.tuned_for is None else tuple(multiple(system, factor) for factor in method.tuned_for)
+
+
+def validate(method: Method[Any], trained: Any, system: System, *, dt: float, protocol: Protocol) -> float:
+    """Score a configuration on validation trajectories from X: smaller is better."""
+    n = min(protocol.trajectories, method.trajectories or protocol.trajectories)
+    everyone = unseen_trajectories(
+        system,
+        dt,
+        n=protocol.trajectories,
+        duration=protocol.duration,
+        seed=protocol.seed,
+        domain="X",
+        stream=Stream.VALIDATION,
+    )
+    runs = everyone.first(n)
+    if not runs.inside.any():
+        raise ValueError(f"every validation trajectory of {system.name} left its bounds; widen them or shrink X")
+    seed = (Stream.VALIDATION, protocol.seed, 1)
+    medians = []
+    for noise in tuned_for(method, system) or protocol.measurement_noise:
+        y = with_shared_noise(system, runs, measurement_noise=noise, n=protocol.trajectories, seed=seed)
+        x_hat = run(method.observer(trained, system, dt, noise), y)
+        medians.append(np.median(smape(runs.x, x_hat)))
+    return float(np.exp(np.mean(np.log(np.maximum(medians, 1e-6)))))
+
+
+def step_time(
+    method: Method[Any], trained: Any, *, system: System, dt: float, batch: int, seconds: float = 0.3
+) -> float:
+    """Time one step of a whole batch along motions from X, once an observer has followed them for a while."""
+    observer = method.observer(trained, system, dt, system.measurement_noise)
+    x = simulate(system, starts(system, "X", batch, np.random.default_rng(0)), UNTIMED + TIMED, dt)
+    y = np.nan_to_num(system.output(x))
+    best = np.inf
+    for _ in range(5):
+        observer.reset(y[0])
+        for sample in y[1 : UNTIMED + 1]:
+            observer.step(sample)
+        steps, began = 0, time.process_time()
+        for sample in y[UNTIMED + 1 :]:
+            observer.step(sample)
+            steps += 1
+            if (spent := time.process_time() - began) >= seconds / 5:
+                break
+        best = min(best, spent / steps)
+    return 1e6 * best

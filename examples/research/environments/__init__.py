@@ -1,0 +1,1 @@
+"""Agents in environments of others that are shown different things, compared."""

@@ -1,0 +1,307 @@
+"""Draw the figures of the pages, on a light ground and on a dark one: ``make figures``.
+
+Each is drawn from the files in docs/results, or from what is simulated here in seconds, by the functions that the
+commands call. NAME-dark.png lies beside NAME.png, and moving pictures likewise; docs/site/hooks.py shows readers the
+one that suits them. ``python -m examples.research.figures figures/portraits.gif`` draws one alone.
+
+What is not drawn here is light everywhere: docs/figures/qube.png needs records that are not part of this project, and a
+training (examples/qube.py). docs/figures/kkl.svg is drawn by hand; its colours alone are changed.
+"""
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pandas as pd
+from PIL import Image
+
+from examples.research.agents.command import draw_results as draw_agents
+from examples.research.benchmark.results import draw_results as draw_benchmark
+from examples.research.certificates import command as certify
+from examples.research.certificates.settled import record_settled
+from examples.research.environments.tables import draw_curves, draw_scores
+from examples.research.speed import sizes
+from kkl_gym import SYSTEMS
+from observers import Artifact, load
+from observers.names import resolve
+from observers.spread import deviations
+from observers.storage import replacing, write
+from training.agents import picture
+from training.agents.agent import Agent
+from training.agents.play import Episodes, play
+from training.commands import coverage, demo, faults
+from training.commands.agent_files import find
+from training.commands.options import shown
+from training.commands.portraits import animate
+from training.evaluation.errors import estimates as estimates_of
+from training.evaluation.errors import kalman_estimates, unseen_trajectories
+from training.evaluation.metrics import percentage_error
+from training.figures import ESTIMATE, MEASURED, RIVAL, TARGET, TRUTH, Theme, drawing, style
+from training.maps.regions import chi_square
+from training.seeds import agent_evaluation_seed
+from training.systems import ControlTask
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+RESULTS = DOCS / "results"
+Draw = Callable[[Path], object]
+COLOURS = 256  # of a picture, which a third of the bytes then holds
+SEED = 7  # of the moving pictures
+RIVALS = {"ekf": "tuned EKF", "ukf": "tuned UKF", "gru": "GRU"}  # of the benchmark, in the figure of noise
+BAND = 0.9  # of the errors lie in a band
+LEVELS = (0.0, 0.5)  # of measurement noise, in the figure of errors over time
+SMALLEST = 0.01  # percent that is shown of errors under noise
+QUANTILES = (0.1, 0.5, 0.9)  # of the runs, in the same figure
+AGENTS = {"the agent sees the noisy output y": "van_der_pol-y", "the agent sees the estimate": "van_der_pol"}
+FIRST = 1.0  # s, in which bands may be wider than their panels
+# What the colours of docs/figures/kkl.svg are on a dark ground.
+DARK = {
+    "#fdfcf8": "#1e2129", "#ddd8c8": "#363b47", "#f1efe6": "#2a2f3a", "#e9f1fa": "#1f3044", "#fbecea": "#402523",
+    "#333": "#c9ccd3", "#222": "#eceae4", "#555": "#b4b8c0", "#777": "#9aa0aa", "#888": "#8a909c",
+    "#2b6cb0": "#4aa3df", "#1d4e89": "#8cc4ee", "#b03a2e": "#e0756a", "#d08a82": "#9c574f", "#8c2d23": "#f0978d",
+}  # fmt: skip
+
+
+def estimates(duration: float = 15.0) -> Draw:
+    """States and estimates of all systems: ``kkl-gym demo --duration 15``."""
+    episodes = [demo.play(one, round(duration / one.system.dt), None, seed=0) for one in shown(None, None)]
+    return lambda path: demo.draw(path, episodes)
+
+
+def portraits(name: str | None = None, duration: float = 12.0) -> Draw:
+    """Phase portraits that move: ``kkl-gym demo --gif --seed 7 --duration 12``, of one system or all."""
+    episodes = [demo.play(one, round(duration / one.system.dt), None, seed=SEED) for one in shown(name, None)]
+    return lambda path: animate(path, [episode.motion for episode in episodes])
+
+
+def agents() -> tuple[ControlTask, Mapping[str, Episodes]]:
+    """The first episode of ``kkl-gym agent evaluate``, of an agent that sees y and of one that sees an estimate."""
+    played = {}
+    for title, name in AGENTS.items():
+        player = Agent.read(find(name))
+        played[title] = play(player.make(1), player, steps=player.task.steps, seed=agent_evaluation_seed(0, 1))
+    return player.task, played
+
+
+def agents_moving() -> Draw:
+    """Phase portraits of both agents, which move."""
+    task, played = agents()
+    return lambda path: picture.animate(task, played, path)
+
+
+def agents_over_time() -> Draw:
+    """States, outputs and inputs of both agents."""
+    task, played = agents()
+    return lambda path: picture.draw_agents(task, played, path)
+
+
+def certificate(name: str, trajectories: int = 200) -> Draw:
+    """What ``python -m examples.research certify`` draws of a map that ships."""
+    artifact = Artifact.read(resolve(name))
+    system = SYSTEMS[artifact.system]()
+    noise: dict[str, Any] = {"measurement_noise": artifact.measurement_noise, "process_noise": system.process_noise}
+    motion = record_settled(artifact, system, **noise, trajectories=trajectories, seed=0)
+    return lambda path: certify.draw(path, artifact, system, name=name, noise=noise, motion=motion)
+
+
+def error_bars(name: str = "van_der_pol", duration: float = 8.0) -> Draw:
+    """Each state, its estimate and the band that holds nine errors in ten, in the run of ``kkl-gym demo``."""
+    (environment,) = shown(name, None)
+    episode = demo.play(environment, round(duration / environment.system.dt), None, seed=0)
+    observer = load(name, environment.system.measurement_noise)
+    width = chi_square(BAND, 1)[()] ** 0.5 * deviations(observer.estimate_covariance(episode.y))
+    return partial(draw_bands, episode=episode, width=width)
+
+
+def draw_bands(path: Path, *, episode: demo.Episode, width: np.ndarray) -> None:
+    """Draw states, estimates with bands of a width, and outputs; and below them the errors in the same bands."""
+    motion = episode.motion
+    t = np.arange(len(motion.x)) * motion.dt
+    with drawing(path, 9, 4.6) as figure:
+        axes = figure.subplots(2, motion.system.nx, sharex=True, height_ratios=[3, 2], squeeze=False)
+        for i, (above, below) in enumerate(axes.T):
+            if i == 0:  # what is measured
+                above.plot(t, motion.y[:, 0], ".", ms=1.5, color=MEASURED, label="measured")
+            for ax, middle, label in ((above, motion.x_hat[:, i], f"{100 * BAND:.0f} % band"), (below, 0 * t, None)):
+                ax.fill_between(
+                    t, middle - width[:, i], middle + width[:, i], color=ESTIMATE, alpha=0.3, lw=0, label=label
+                )
+            above.plot(t, motion.x[:, i], color=TRUTH, label="true")
+            above.plot(t, motion.x_hat[:, i], "--", color=ESTIMATE, lw=1.0, label="estimate")
+            below.plot(t, motion.x[:, i] - motion.x_hat[:, i], color=TRUTH, lw=0.8)
+            margin, largest = 0.2 * np.ptp(motion.x[:, i]), 1.2 * width[t > FIRST, i].max()
+            name = motion.system.state_names[i]
+            above.set(ylabel=name, ylim=(motion.x[:, i].min() - margin, motion.x[:, i].max() + margin))
+            below.set(xlabel="t in s", ylabel=f"error of {name}", ylim=(-largest, largest))
+        axes[0, 0].legend(loc="lower right", ncols=2, markerscale=4)
+
+
+def noise_levels() -> Draw:
+    """Errors by level of noise, of the maps that ship and of some of the benchmark's observers."""
+    files = [RESULTS / "accuracy.csv", RESULTS / "tracking" / "accuracy.csv"]
+    files += [RESULTS / "noise_levels" / f"{name}.csv" for name in SYSTEMS]
+    ours = pd.concat(map(pd.read_csv, files))
+    rivals = pd.read_csv(RESULTS / "benchmark" / "results.csv")
+    return partial(draw_noise_levels, ours=ours, rivals=rivals)
+
+
+def draw_noise_levels(path: Path, *, ours: pd.DataFrame, rivals: pd.DataFrame) -> None:
+    """Draw median errors from starts in X by level of noise, a panel for each system."""
+    medians = ours[(ours.starts == "X") & ~ours.driven].groupby(["observer", "measurement_noise"]).smape.median()
+    others = rivals[rivals.starts == "X"].groupby(["system", "method", "noise"]).smape.median()
+    with drawing(path, 10, 3.2) as figure:
+        axes = figure.subplots(1, len(SYSTEMS), sharey=True)
+        for ax, name in zip(axes, SYSTEMS, strict=True):
+            for observer, line, color, label in (
+                (name, "o-", ESTIMATE, "default maps"),
+                (f"{name}-static", "o:", ESTIMATE, "T_inv alone"),
+                (f"{name}-spinn", "o-", TARGET, "SPINN"),
+            ):
+                ax.plot(medians[observer], line, color=color, label=label)
+            for (method, label), marker in zip(RIVALS.items(), ("x", "+", "^"), strict=True):
+                if (name, method) in others.index:
+                    ax.plot(others[name, method], marker, ms=6, mfc="none", color=RIVAL, label=label)
+            levels = medians[f"{name}-static"].index
+            ax.set_xscale("symlog", linthresh=levels[1], linscale=0.4)
+            ax.set_xticks(levels, [f"{level:g}" for level in levels], fontsize="small")
+            ax.minorticks_off()
+            ax.set(yscale="log", title=name.replace("_", " "), xlabel="noise on each sample of y")
+        axes[0].set_ylabel("median SMAPE in %")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3 + len(RIVALS))
+
+
+def errors_over_time(trajectories: int = 100, duration: float | None = None) -> Draw:
+    """Errors at each step of the runs of ``kkl-gym evaluate SYSTEM --ekf`` from X, whose means the tables have."""
+    found = {}
+    for name, kind in SYSTEMS.items():
+        system, artifact = kind(), Artifact.read(resolve(name))
+        dt, seconds = artifact.filter.dt, duration or system.duration
+        runs = unseen_trajectories(system, dt, n=trajectories, duration=seconds, seed=0)
+        for level in LEVELS:
+            how: dict[str, Any] = {"measurement_noise": level, "seed": 0}
+            ours = estimates_of(artifact, system, runs, **how)
+            kalman = kalman_estimates(system, runs, dt, **how)
+            found[name, level] = percentage_error(runs.x, ours), percentage_error(runs.x, kalman)
+    return partial(draw_errors_over_time, found=found, dt=dt)
+
+
+def draw_errors_over_time(
+    path: Path, *, found: Mapping[tuple[str, float], tuple[np.ndarray, np.ndarray]], dt: float
+) -> None:
+    """Draw medians and bands of errors, (steps, n) of observer and Kalman filter: a column a system, a row a level."""
+    with drawing(path, 10, 4.6) as figure:
+        axes = figure.subplots(len(LEVELS), len(SYSTEMS), sharex=True, sharey="row")
+        for row, level in zip(axes, LEVELS, strict=True):
+            for ax, name in zip(row, SYSTEMS, strict=True):
+                for errors, color, label in zip(
+                    found[name, level], (ESTIMATE, RIVAL), ("observer", "EKF with the exact equations"), strict=True
+                ):
+                    t = dt * np.arange(1, len(errors))
+                    low, middle, high = np.quantile(errors[1:], QUANTILES, axis=1)
+                    ax.fill_between(t, low, high, color=color, alpha=0.25, lw=0)
+                    ax.plot(t, middle, color=color, lw=0.9, label=label)
+                ax.set(xscale="log", yscale="log", ylim=(SMALLEST if level else SMALLEST / 100, 200.0))
+                ax.xaxis.set_major_formatter("{x:g}")
+                ax.yaxis.set_major_formatter("{x:g}")
+        for ax, name in zip(axes[0], SYSTEMS, strict=True):
+            ax.set_title(name.replace("_", " "))
+        for ax in axes[-1]:
+            ax.set_xlabel("t in s")
+        for ax, level in zip(axes[:, 0], LEVELS, strict=True):
+            ax.set_ylabel(f"error in %, noise {level:g}" if level else "error in %, no noise")
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+
+
+def tracking(trajectories: int = 100, duration: float | None = None) -> Draw:
+    """Errors at each step at noise 0.5, of observers that track beside those that do not."""
+    found = {}
+    for name, kind in SYSTEMS.items():
+        system, dt = kind(), Artifact.read(resolve(name)).filter.dt
+        runs = unseen_trajectories(system, dt, n=trajectories, duration=duration or system.duration, seed=0)
+        how: dict[str, Any] = {"measurement_noise": LEVELS[-1], "seed": 0}
+        x_hats = [estimates_of(Artifact.read(resolve(one)), system, runs, **how) for one in (f"{name}-static", name)]
+        x_hats.append(kalman_estimates(system, runs, dt, **how))
+        found[name] = [np.median(percentage_error(runs.x, x_hat), axis=1) for x_hat in x_hats]
+    return partial(draw_tracking, found=found, dt=dt)
+
+
+def draw_tracking(path: Path, *, found: Mapping[str, Sequence[np.ndarray]], dt: float) -> None:
+    """Draw median errors (steps,) of T_inv alone, of tracking and of a Kalman filter: a panel for each system."""
+    labels = "T_inv alone", "tracking", "EKF with the exact equations"
+    with drawing(path, 10, 3.2) as figure:
+        axes = figure.subplots(1, len(SYSTEMS), sharey=True)
+        for ax, name in zip(axes, SYSTEMS, strict=True):
+            for errors, color, label in zip(found[name], (TARGET, ESTIMATE, RIVAL), labels, strict=True):
+                ax.plot(dt * np.arange(1, len(errors)), errors[1:], color=color, lw=0.9, label=label)
+            ax.set(xscale="log", yscale="log", title=name.replace("_", " "), xlabel="t in s", ylim=(0.1, 200.0))
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.yaxis.set_major_formatter("{x:g}")
+        axes[0].set_ylabel("median error in %")
+        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(labels))
+
+
+FIGURES: Mapping[str, Callable[[], Draw]] = {
+    "figures/estimates.png": estimates,
+    "figures/portraits.gif": portraits,
+    **{f"figures/{name}.gif": partial(portraits, name) for name in SYSTEMS},
+    "figures/agents.gif": agents_moving,
+    "figures/agents.png": agents_over_time,
+    "figures/errors_over_time.png": errors_over_time,
+    "figures/tracking.png": tracking,
+    "figures/error_bars.png": error_bars,
+    "results/noise_levels/noise_levels.png": noise_levels,
+    "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
+    "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
+    "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
+    "results/agents/scores.png": lambda: partial(draw_agents, RESULTS / "agents"),
+    "results/environments/scores.png": lambda: partial(
+        draw_scores, results=pd.read_csv(RESULTS / "environments" / "results.csv")
+    ),
+    "results/environments/curves.png": lambda: partial(
+        draw_curves, found=pd.read_csv(RESULTS / "environments" / "curves.csv")
+    ),
+    "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
+    "results/sizes/sizes.png": lambda: (
+        lambda path: sizes.draw(path, *map(pd.read_csv, sorted((RESULTS / "sizes").glob("*.csv"))))
+    ),
+    "results/error_bars/van_der_pol.png": lambda: partial(
+        coverage.draw, rows=pd.read_csv(RESULTS / "error_bars" / "van_der_pol-static.csv")
+    ),
+}
+
+
+def in_theme(name: str, theme: Theme) -> str:
+    """The name of a picture in a theme."""
+    return name if theme == "light" else str(Path(name).with_stem(f"{Path(name).stem}-dark"))
+
+
+def shrink(path: Path) -> None:
+    """Leave a picture fewer colours."""
+    reduced = Image.open(path).convert("RGB").quantize(COLOURS, kmeans=1, dither=Image.Dither.NONE)
+    with replacing(path) as temporary:
+        reduced.save(temporary, optimize=True)
+
+
+def main(names: Sequence[str] = (), out: Path = DOCS) -> None:
+    """Draw figures in both themes."""
+    if unknown := [name for name in names if name not in FIGURES]:
+        raise SystemExit(f"there is no figure {', '.join(unknown)}; there are {', '.join(FIGURES)}")
+    for name in names or FIGURES:
+        draw = FIGURES[name]()
+        for theme in get_args(Theme):
+            path = out / in_theme(name, theme)
+            with style(theme):
+                draw(path)
+            if path.suffix == ".png":
+                shrink(path)
+            print(f"wrote {path} ({path.stat().st_size / 1e3:.0f} kB)")
+    sketch = (DOCS / "figures" / "kkl.svg").read_text(encoding="utf-8")
+    for light, dark in DARK.items():
+        sketch = sketch.replace(f'"{light}"', f'"{dark}"')
+    write(out / "figures" / "kkl-dark.svg", sketch)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

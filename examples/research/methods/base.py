@@ -1,0 +1,194 @@
+"""What a method of the benchmark is: trained from a system and a budget, it makes observers that step causally."""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+import torch
+from torch import nn
+
+from kkl_gym.system import System
+from observers import storage
+from training.evaluation.levels import Level
+from training.evaluation.plants import off_by
+from training.jobs import describe
+from training.maps.optimise import Loss, Stage, optimise
+from training.progress import progress_bars
+from training.seeds import Stream, generator
+from training.trajectories.record import recording_ages, trajectories
+
+_KEY = "kkl-gym-method"
+
+WRONG = 0.1  # by what share every parameter is too large for methods that believe in wrong ones
+
+Trained = TypeVar("Trained")
+Configuration = Mapping[str, Any]
+Arrays = dict[str, np.ndarray]
+
+
+class CausalObserver(Protocol):
+    """x_hat_0 = reset(y_0), x_hat_k+1 = step(y_k+1); outputs (n, ny) in, estimates (n, nx) out."""
+
+    def reset(self, y0: np.ndarray) -> np.ndarray:
+        """Forget the past and take in the first sample.
+
+        Shapes: ``y0`` (n, ny); returns (n, nx).
+        """
+        ...
+
+    def step(self, y: np.ndarray) -> np.ndarray:
+        """Take in the next sample.
+
+        Shapes: ``y`` (n, ny); returns (n, nx).
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What every method is given for a training."""
+
+    name: str
+    trajectories: int
+    duration: float
+    samples: int
+    cpu_seconds: float
+    width: int = 128
+    depth: int = 3
+    activation: str = "tanh"
+    dt: float = 0.01
+    steps: int = 10**9
+
+
+@dataclass(frozen=True)
+class Data:
+    """Noise-free training trajectories.
+
+    Shapes: ``ages`` (m,), ``x`` (m, n, nx), ``y`` (steps + 1, n, ny).
+    """
+
+    ages: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+
+
+@lru_cache(maxsize=1)
+def simulated(system: System, n: int, *, duration: float, samples: int, dt: float, seed: int) -> Data:
+    """Simulate the training data of a system; the same for every method."""
+    rng = generator(Stream.TRAINING, seed)
+    steps = max(1, round(duration / dt))
+    ages = recording_ages(steps, samples)
+    xs, ys = [], []
+    for x, *_ in trajectories(system, n=n, steps=steps, dt=dt, rng=rng):
+        xs.append(x[ages])
+        ys.append(system.output(x).astype(np.float32))
+    return Data(ages, np.concatenate(xs, 1), np.concatenate(ys, 1))
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training."""
+
+    system: System
+    budget: Budget
+    folder: Path
+    seed: int = 0
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+
+    @cached_property
+    def data(self) -> Data:
+        """Training trajectories, simulated when first asked for."""
+        budget = self.budget
+        return simulated(
+            self.system,
+            budget.trajectories,
+            duration=budget.duration,
+            samples=budget.samples,
+            dt=budget.dt,
+            seed=self.seed,
+        )
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """A fresh generator; the same one at every call."""
+        return generator(Stream.TRAINING, self.seed, 1)
+
+    def fit(self, name: str, module: nn.Module, loss: Loss, learning_rate: float, share: float = 1.0) -> None:
+        """Minimise a loss by Adam; goes on from a checkpoint if there is one."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        identity = json.dumps([describe(self.system), asdict(self.budget), self.seed], sort_keys=True)
+        stage = Stage(
+            name=name,
+            steps=self.budget.steps,
+            learning_rate=learning_rate,
+            folder=self.folder,
+            fingerprint=identity,
+            seed=self.seed,
+            cpu_seconds=self.budget.cpu_seconds * share,
+        )
+        with progress_bars(None) as progress:
+            optimise(stage, module, loss, progress, resume=True)
+
+
+class Method(ABC, Generic[Trained]):
+    """A contender of the benchmark: a way to make observers. docs/results/benchmark.md says how to add one."""
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    trajectories: ClassVar[int | None] = None
+    tuned_for: ClassVar[tuple[float, ...] | None] = None
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Propose at most three; the benchmark takes the one that does best on validation trajectories."""
+        return ({},)
+
+    def believed(self, system: System) -> System:
+        """Say what it is trained on and takes for the truth: the system, unless a method is to be wrong about it."""
+        return system
+
+    def settled(self, configuration: Configuration, trained: Trained) -> Configuration:
+        """Say what the full training is given, after a short one did best."""
+        return configuration
+
+    @abstractmethod
+    def train(self, task: Task, configuration: Configuration) -> Trained:
+        """Learn what the observer needs."""
+
+    @abstractmethod
+    def observer(self, trained: Trained, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
+        """Make an observer. The arguments are given by position, so that a class may name them as it likes.
+
+        Shapes: ``measurement_noise`` of length ny.
+        """
+
+    def save(self, trained: Trained, path: Path) -> None:
+        """Write what was trained, whole or not at all; by default a dictionary of arrays."""
+        if not isinstance(trained, dict):
+            raise TypeError(f"{type(self).__name__} trains a {type(trained).__name__}: override save and load")
+        storage.save(path, trained, key=_KEY, described={"method": self.name})
+
+    def load(self, path: Path) -> Trained:
+        """Read what :meth:`save` wrote."""
+        try:
+            arrays, described = storage.read(path, key=_KEY, error=ValueError, what="a trained method")
+        except ValueError as error:
+            raise ValueError(f"{error}; remove it to train anew") from error
+        if described.get("method") != self.name:
+            raise ValueError(f"{path} was written by method {described.get('method')!r}, not {self.name!r}")
+        return arrays  # type: ignore[return-value]
+
+
+class WrongParameters:
+    """First base of a method that is another one with every parameter too large; its second base is the other one.
+
+    Its configurations are compared on trajectories of the true system.
+    """
+
+    def believed(self, system: System) -> System:
+        """The same equations with other parameters."""
+        return off_by(system, WRONG)

@@ -1,0 +1,141 @@
+"""The methods that make KKL observers in the package's own format: its default, and the paper's SPINN."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import ClassVar
+
+from examples.research.methods.base import Budget, CausalObserver, Configuration, Method, Task, WrongParameters
+from kkl_gym.system import System
+from observers import Artifact, KKLObserver
+from observers.names import resolve
+from training.config import Config
+from training.evaluation.levels import Level
+from training.pipeline import train
+from training.presets import preset
+from training.spectrum import evenly_spaced
+
+# Intervals of the eigenvalues of A in 1/s among which methods with a real spectrum choose; the first is the paper's.
+SPECTRA = ((-3.0, -1.5), (-8.0, -1.0), (-20.0, -2.0))
+# Those of SPINN, which needs a smooth T: the paper's, and two so fast that z depends on little of the past.
+SMOOTH_SPECTRA = ((-3.0, -1.5), (-20.0, -2.0), (-40.0, -6.0))
+
+
+def spectrum(system: System, fastest: float, slowest: float) -> tuple[float, ...]:
+    """Space 2 nx + 1 eigenvalues for each output evenly in the logarithm."""
+    return evenly_spaced(2 * system.nx + 1, slowest / system.pace, fastest / system.pace)
+
+
+class KKLMethod(Method[Artifact]):
+    """Whatever trains an artifact."""
+
+    def observer(self, trained: Artifact, system: System, dt: float, measurement_noise: Level, /) -> CausalObserver:
+        """The observer of the package, told the noise level as far as it was trained for it, and no process noise."""
+        return KKLObserver(trained, trained.inverse.within(measurement_noise), process_noise=0.0)
+
+    def save(self, trained: Artifact, path: Path) -> None:
+        """As an artifact that ``observers.load`` reads."""
+        trained.save(path)
+
+    def load(self, path: Path) -> Artifact:
+        """The artifact."""
+        return Artifact.read(path)
+
+
+def within(config: Config, budget: Budget, seed: int) -> Config:
+    """Give a configuration of the package the benchmark's data, networks and limit of CPU time."""
+    return replace(
+        config,
+        dt=budget.dt,
+        trajectories=budget.trajectories,
+        duration=budget.duration,
+        samples=budget.samples,
+        width=budget.width,
+        depth=budget.depth,
+        activation=budget.activation,  # type: ignore[arg-type]
+        forward_steps=budget.steps if config.forward_steps else 0,
+        inverse_steps=budget.steps,
+        cpu_seconds=budget.cpu_seconds if math.isfinite(budget.cpu_seconds) else None,
+        seed=seed,
+    )
+
+
+class Default(KKLMethod):
+    """The package's own: T_inv(z_y, z_u, noise levels, age) along driven, noisy trajectories (``kkl-gym train``).
+
+    It simulates trajectories of its own, as many as everyone gets for each of its two inverses: free ones, some of
+    which start where inputs have led from X, and driven ones. Each inverse has half of the time, though the
+    benchmark sees the one of free motion only. One configuration: the preset, which was chosen during the package's
+    development.
+    """
+
+    name: ClassVar[str] = "default"
+    label: ClassVar[str] = "T_inv alone"
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        config = within(preset(task.system, "input-aware", "fast"), task.budget, task.seed)
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class WrongDefault(WrongParameters, Default):
+    """The package's own, trained with every parameter 10 % too large."""
+
+    name: ClassVar[str] = "default-wrong"
+    label: ClassVar[str] = "T_inv alone, model 10 % off"
+
+
+class Shipped(KKLMethod):
+    """The maps that ship, whatever they cost: ``--methods shipped``."""
+
+    name: ClassVar[str] = "shipped"
+    label: ClassVar[str] = "default maps, as shipped"
+    suffix: ClassVar[str] = ""
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """Nothing is trained."""
+        return Artifact.read(resolve(task.system.name + self.suffix))
+
+
+class ShippedSPINN(Shipped):
+    """The SPINN maps that ship, likewise: ``--methods shipped-spinn``."""
+
+    name: ClassVar[str] = "shipped-spinn"
+    label: ClassVar[str] = "SPINN, as shipped"
+    suffix: ClassVar[str] = "-spinn"
+
+
+class ShippedStatic(Shipped):
+    """T_inv alone, likewise: ``--methods shipped-static``."""
+
+    name: ClassVar[str] = "shipped-static"
+    label: ClassVar[str] = "T_inv alone, as shipped"
+    suffix: ClassVar[str] = "-static"
+
+
+class SPINN(KKLMethod):
+    """The paper's: a physics-informed T, then T_inv on z' = T(x') (``kkl-gym train --pipeline spinn``).
+
+    It simulates as many trajectories as everyone gets, from starts in X as theirs.
+    """
+
+    name: ClassVar[str] = "spinn"
+    label: ClassVar[str] = "SPINN"
+
+    def configurations(self, system: System) -> tuple[Configuration, ...]:
+        """Three spectra."""
+        return tuple({"spectrum": list(interval)} for interval in SMOOTH_SPECTRA)
+
+    def train(self, task: Task, configuration: Configuration) -> Artifact:
+        """The package's pipeline."""
+        fastest, slowest = configuration["spectrum"]
+        changes = {"eigenvalues": spectrum(task.system, fastest, slowest), "pairs": (), "box_factor": 1.0}
+        config = within(preset(task.system, "spinn", "fast", changes=changes), task.budget, task.seed)
+        return train(task.system, config, task.folder, resume=True, device=task.device).artifact
+
+
+class WrongSPINN(WrongParameters, SPINN):
+    """The paper's, trained with every parameter 10 % too large."""
+
+    name: ClassVar[str] = "spinn-wrong"
+    label: ClassVar[str] = "SPINN, model 10 % off"
