@@ -49,9 +49,9 @@ class KKLObserver:
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
         Whether single samples run compiled by Numba (the extra ``fast``), in a third of the time, or a twentieth where
-        the observer tracks; compilation takes seconds, once. True compiles here, such as before a loop in real time, and
-        after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree to
-        rounding. Batches of 128 rows or more always use Numba where it is installed.
+        the observer tracks; compilation takes seconds, once. True compiles here, such as before a loop in real time,
+        and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
+        to rounding. Batches of 128 rows or more always use Numba where it is installed.
 
     Raises
     ------
