@@ -495,7 +495,7 @@ class KKLObserver:
             As :attr:`covariance`, which also raises the same.
         """
         if self._tracker is not None:  # its artifact has error bars
-            z = self.z
+            z, _ = self._moment(None)  # not a copy: the tracker knows by it whether T_inv was asked already
             covariance = self._tracker.covariance(z, self._age)
             return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
         self.artifact.require_spread()
