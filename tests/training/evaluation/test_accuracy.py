@@ -23,7 +23,7 @@ PROMISED = {
     "rossler": (0.8, 1.8, 1.0, 0.6),
     "lorenz": (0.5, 0.9, 0.6, 0.3),
 }
-# The first three of SPINN. The notebooks that were released with the paper print 1.96, 0.35, 4.77 and 8.64 for the last.
+# The first three of SPINN. The notebooks released with the paper print 1.96, 0.35, 4.77 and 8.64 for the last.
 PROMISED_OF_SPINN = {
     "reverse_duffing": (0.8, 7.0, 0.3),
     "van_der_pol": (0.35, 5.0, 0.2),
