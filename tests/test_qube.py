@@ -87,6 +87,7 @@ def test_an_arm_sticks_until_it_is_pushed_while_the_pendulum_swings():
     assert turned[-1, 0] > 0.05 + 3 * QUBE["ENCODER"]
 
 
+@pytest.mark.slow
 def test_parameters_are_found_again(tmp_path):
     write_runs(tmp_path, MODEL)
     found = QUBE["fitted"](QUBE["read"](tmp_path, (1, 2, 4, 5))).parameters
@@ -114,6 +115,7 @@ def test_where_pendulums_rest(tmp_path):
     assert QUBE["rest"](records) == pytest.approx(0.002)
 
 
+@pytest.mark.slow
 def test_a_filter_that_is_started_remembers_and_is_taken_back(tmp_path, monkeypatch):
     """From estimates that are opposite at first, and later off by 0.3 rad, which is no reason."""
     write_runs(tmp_path, STICKS)

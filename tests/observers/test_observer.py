@@ -68,7 +68,7 @@ def test_estimate_in_chunks_is_the_same(make_artifact, monkeypatch):
     y, u = record(observer, 23, 3)
     whole = observer.estimate(y, u)
     for chunk in (1, 12, 22, 69):
-        monkeypatch.setattr(observers.observer, "_CHUNK", chunk)
+        monkeypatch.setattr(observers.replay, "_CHUNK", chunk)
         assert np.allclose(observer.estimate(y, u), whole, **CLOSE)
 
 

@@ -389,7 +389,7 @@ def test_a_job_that_another_process_works_on_is_left_alone(toy, tmp_path):
     job = Job("lorenz", name, tmp_path / "job", TINY, SHORT, None, SHORT)
     job.folder.mkdir()
     with FileLock(job.folder / ".lock"):
-        ((_, failure, _),) = run_all([job], 1)
+        ((_, failure),) = run_all([job], 1)
     assert "another process is at work" in failure
     assert not trainings.exists()
 
@@ -399,7 +399,7 @@ def test_a_training_that_blows_up_leaves_no_checkpoint(toy, tmp_path):
     script = Path(name.rpartition(":")[0])
     script.write_text(script.read_text() + EXPLOSIVE)
     job = Job("lorenz", f"{script}:Explosive", tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    ((_, failure, _),) = run_all([job], 1)
+    ((_, failure),) = run_all([job], 1)
     assert "is not a number" in failure
     assert not any(path.is_dir() for path in job.folder.iterdir())
 
@@ -410,7 +410,7 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
     with claimed_job(job.folder, job.identity, OTHER):
         pass
     (job.folder / "configuration-0.json").write_text('{"configuration": {"shift": 1.0}, "score": 1e-9}')
-    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
+    assert [failure for _, failure in run_all([job], 1)] == [None]
     # The others, what was settled in a short training of the best (its file is missing), and the full training.
     assert trainings.read_text().split() == ["lorenz", "0.0", "lorenz", "2.0", "lorenz", "1.0", "lorenz", "1.0"]
 
@@ -421,10 +421,10 @@ def test_a_search_goes_on_where_it_stopped(toy, tmp_path):
 ])  # fmt: skip
 def test_what_an_earlier_run_left_damaged_is_named(file, text, toy, tmp_path):
     job = Job("lorenz", toy[0], tmp_path / "job", TINY, SHORT, 1.0, SHORT)
-    assert [failure for _, failure, _ in run_all([job], 1)] == [None]
+    assert [failure for _, failure in run_all([job], 1)] == [None]
     (job.folder / "errors.csv").unlink()
     (job.folder / file).write_text(text)
-    ((_, failure, _),) = run_all([job], 1)
+    ((_, failure),) = run_all([job], 1)
     assert str(job.folder / file) in failure
 
 
@@ -536,7 +536,7 @@ def test_worker_processes_do_what_one_process_does(toy, tmp_path):
         for workers in (1, 2)
     }
     for workers, mine in jobs.items():
-        assert [failure for _, failure, _ in run_all(mine, workers)] == [None, None]
+        assert [failure for _, failure in run_all(mine, workers)] == [None, None]
     for alone, together in zip(*jobs.values(), strict=True):
         assert (alone.folder / "errors.csv").read_bytes() == (together.folder / "errors.csv").read_bytes()
 

@@ -140,7 +140,7 @@ def test_scores_that_are_damaged_are_named(text, tmp_path):
 def test_an_interrupted_comparison_still_reports(tmp_path, monkeypatch):
     def interrupted(engine, run, jobs):
         run(jobs[0])
-        yield jobs[0], None, []
+        yield jobs[0], None
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Engine, "run", interrupted)

@@ -65,7 +65,8 @@ def test_few_batches_and_a_limit_of_time_are_taken_as_they_are(monkeypatch):
     assert short == {"simulating": 3.0, "solving": 7.0, "inverse": 2.3}
 
 
-def test_a_dry_run_says_what_the_papers_sizes_take_and_writes_nothing(tmp_path, capsys):
+def test_a_dry_run_says_what_the_papers_sizes_take_and_writes_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(training.dry_run, "CPU_SECONDS", 0.2)
     sizes = ["--trajectories", "5", "--duration", "12", "--width", "16", "--batch", "64", "--samples", "50"]
     out = ["--out", str(tmp_path / "run")]
     main(["train", "reverse_duffing", "--pipeline", "spinn", "--preset", "paper", "--dry-run", *sizes, *out])

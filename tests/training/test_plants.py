@@ -139,6 +139,7 @@ def test_sensitivity_under_an_input_matrix_that_depends_on_the_state():
     np.testing.assert_allclose(last[0, 4:].reshape(4, 4), ((ends[:4] - ends[4:]) / (2 * step)).T, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
@@ -147,7 +148,6 @@ def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsy
     path = "runs/circle_pendulum/circle_pendulum.safetensors"
     sizes = {
         "evaluate": "--trajectories 4 --duration 6 --noise 0 --csv errors.csv",
-        "certify": "--trajectories 4 --measurement-noise 0.1",
         "faults": "--trajectories 4 --duration 6 --measurement-noise 0.1",
     }
     for command, small in sizes.items():

@@ -69,7 +69,7 @@ def test_backward_quadrature_solves_the_pde():
 @pytest.mark.parametrize("box_factor", [1.0, 2.0])
 def test_shipped_forward_map_of_reverse_duffing_against_backward_quadrature(box_factor):
     artifact, system = Artifact.read(resolve("reverse_duffing-spinn")), ReverseDuffing()
-    x = np.random.default_rng(0).uniform(*system.box(box_factor), (60, 2))
+    x = np.random.default_rng(0).uniform(*system.box(box_factor), (24, 2))
     x = x[(np.abs(x) > 2.0).any(1)] if box_factor > 1 else x
     truth = np.array([backward_quadrature(point, artifact.filter.A.diagonal()) for point in x])
     error = artifact.forward(x) - truth
@@ -120,14 +120,14 @@ def test_solved_output_layer_minimises_the_risk_over_it(unit):
 def test_adaptive_points_are_drawn_in_proportion_to_the_residual_and_its_median():
     problem, _ = problem_of_the_oscillator(adaptive=True)
     generator = torch.Generator().manual_seed(0)
-    rows = torch.cat([problem._drawn(generator) for _ in range(400)])
+    rows = torch.cat([problem._drawn(generator) for _ in range(100)])
     with torch.no_grad():
         size = problem._weighted_residual(problem._points).norm(dim=-1).numpy()
     drawn = np.bincount(rows.numpy(), minlength=len(size))
     strong, weak = size > np.quantile(size, 0.9), size < np.quantile(size, 0.1)
     expected = (size[strong] + np.median(size)).mean() / (size[weak] + np.median(size)).mean()
     assert expected > 1.5
-    assert drawn[strong].mean() / drawn[weak].mean() == pytest.approx(expected, rel=0.05)
+    assert drawn[strong].mean() / drawn[weak].mean() == pytest.approx(expected, rel=0.1)
 
 
 def test_one_point_with_a_huge_residual_does_not_take_the_batches():

@@ -91,7 +91,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
     whiten = sampler.coordinates.whiten
     expected = whiten @ noise_covariance(linear, data.ages)[:, 0] @ whiten.T
     sums, counts = np.zeros_like(expected), np.zeros(len(data.ages))
-    for _ in range(150):
+    for _ in range(100):
         inputs, _, _, _ = sampler(generator)
         level = 0.02 * torch.expm1(inputs[:, -2:-1]).double().numpy()
         age = AGE_UNIT * linear.dt * np.expm1(inputs[:, -1].double().numpy())
@@ -102,7 +102,7 @@ def test_batches_hold_the_noise_that_the_filter_would_pass_on(sampler, monkeypat
     measured = sums / counts[:, None, None]
     size = np.sqrt(np.einsum("aii,ajj->aij", expected, expected))
     loud = np.ix_(range(len(data.ages)), gain > 1e-3, gain > 1e-3)
-    assert np.abs((measured - expected)[loud] / size[loud]).max() < 0.1
+    assert np.abs((measured - expected)[loud] / size[loud]).max() < 0.12
 
 
 @functools.cache

@@ -175,8 +175,6 @@ def test_what_is_refused(plain, barred, tracking, records, tmp_path):
         learn_recorded_tracking(plain, records)
     with pytest.raises(ArtifactError, match=r"holds no flow; kkl-gym tracking NAME_OR_FILE --data FILE"):
         plain.require_flow()
-    with pytest.raises(ValueError, match=r"this observer tracks, and its flow rests on the error bars"):
-        learn_recorded_error_bars(tracking, records)
     with pytest.raises(ValueError, match=r"hidden are speed, but the observer's position, speed"):
         learn_recorded_tracking(barred, [swing(0)])
     with pytest.raises(ValueError, match=r"no hidden states were recorded"):
