@@ -190,7 +190,8 @@ def test_calibration_is_judged(make_artifact, saved):
         "ekf": True,
         "csv": Path("coverage.csv"),
     }
-    found = Evaluate(("map.safetensors",), **options).run(console := Console(width=200, record=True))
+    console = Console(width=200, record=True)
+    found = Evaluate(("map.safetensors",), **options, csv=Path("coverage.csv")).run(console)
     assert len(found) == 3 * 6 * 2 * 2  # cases, levels, spans, and both who estimate
     assert found["90"].between(0, 100).all()
     assert set(found.observer) == {"KKL", "EKF"}
