@@ -30,7 +30,7 @@ def test_all_that_ship(tmp_path, capsys):
 def test_a_system_of_ones_own(saved, tmp_path, capsys):
     system = f"{linear_system.__file__}:Autonomous"
     observer = saved(system=system, dt=0.02)
-    main(["demo", system, "--observer", observer, "--out", ".", "--duration", "1", "--noise", "0.2"])
+    main(["demo", system, "--observer", observer, "--out", ".", "--duration", "1", "--measurement-noise", "0.2"])
     out = capsys.readouterr().out
     assert " autonomous " in out
     assert "observer" in out

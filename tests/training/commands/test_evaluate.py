@@ -72,7 +72,7 @@ def printed(observers, **options):
 
 def test_every_column_of_the_csv_file_holds_one_thing(saved):
     path = saved()
-    options = "--trajectories 2 --duration 2 --noise 0 0.3 --process-noise 0.1 --csv new/errors.csv"
+    options = "--trajectories 2 --duration 2 --measurement-noise 0 0.3 --process-noise 0.1 --csv new/errors.csv"
     main(["evaluate", path, *options.split()])
     assert Path("new/errors.csv").read_text().splitlines()[0] == f"{COLUMNS},nrmse1,nrmse2"
     found = pd.read_csv("new/errors.csv")
@@ -141,15 +141,15 @@ def test_levels_of_each_output(capsys):
     linear_system.exact_observer(0.01, np.eye(2), "two-outputs").save("two.safetensors")
     command = ["evaluate", "two.safetensors", "--system", f"{linear_system.__file__}:TwoOutputs"]
     command += ["--trajectories", "2", "--duration", "2"]
-    main([*command, "--noise", "0", "0.2,0.1", "0.4", "--csv", "errors.csv"])
+    main([*command, "--measurement-noise", "0", "0.2,0.1", "0.4", "--csv", "errors.csv"])
     assert pd.read_csv("errors.csv").measurement_noise.unique().tolist() == ["0.0", "0.2, 0.1", "0.4"]
     assert "│ X      │ 0.2, 0.1 │" in capsys.readouterr().out
     main(command)
     assert "│ X      │ 0.1, 0.3 │" in capsys.readouterr().out  # the system's own
     with pytest.raises(SystemExit, match="one number, or one for each of 2 outputs"):
-        main([*command, "--noise", "1,2,3"])
+        main([*command, "--measurement-noise", "1,2,3"])
     with pytest.raises(SystemExit):
-        main([*command, "--noise", "loud"])
+        main([*command, "--measurement-noise", "loud"])
     assert "write a number, or one for each output, as in 0.1,0.3" in " ".join(capsys.readouterr().err.split())
 
 

@@ -13,7 +13,7 @@ def export(kind, *options):
 
 
 def test_c(tmp_path, capsys, monkeypatch):
-    export("c", "--noise", "0.3")
+    export("c", "--measurement-noise", "0.3")
     assert {path.name for path in tmp_path.iterdir()} == {"lorenz_spinn.c", "lorenz_spinn.h", "lorenz_spinn_main.c"}
     assert "#define LORENZ_SPINN_MEASUREMENT_NOISE 0.3\n" in (tmp_path / "lorenz_spinn.c").read_text()
     wrote, size = capsys.readouterr().out.splitlines()
@@ -25,7 +25,7 @@ def test_c(tmp_path, capsys, monkeypatch):
 
 
 def test_javascript(tmp_path, capsys):
-    export("js", "--noise", "0.3")
+    export("js", "--measurement-noise", "0.3")
     constants, module = tmp_path / "lorenz_spinn_step.safetensors", tmp_path / "kkl_observer.js"
     assert "export class Observer" in module.read_text()
     kilobytes = f"{constants.stat().st_size / 1e3:.0f} kB"

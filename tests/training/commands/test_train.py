@@ -104,7 +104,7 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(monk
     assert "no limits" not in capsys.readouterr().out
     path, system = "runs/falling_in_a_script/falling_in_a_script.safetensors", ["--system", "own.py:Falling"]
     for command in (
-        ["evaluate", path, *system, *["--trajectories", "4", "--duration", "6", "--noise", "0", "--csv", "errors.csv"]],
+        ["evaluate", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0", "--csv", "errors.csv"]],
         ["faults", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0.01"]],
     ):
         with pytest.raises(SystemExit, match="--policy"):
@@ -117,7 +117,7 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(monk
 
 def test_the_systems_own_controller_needs_no_option():
     main(["train", "own.py:Falling", "--policy", "controller", "--no-monitor", *SIZES, "--out", "."])
-    small = "--trajectories 5 --duration 6 --noise 0 --csv errors.csv --system own.py:Falling"
+    small = "--trajectories 5 --duration 6 --measurement-noise 0 --csv errors.csv --system own.py:Falling"
     main(["evaluate", "falling_in_a_script.safetensors", *small.split()])
     assert (pd.read_csv("errors.csv").starts == "X").sum() == 10
 

@@ -44,7 +44,7 @@ def test_monitors_are_given_the_process_noise_of_the_runs(make_artifact, monkeyp
 
 
 def test_the_command_and_its_report(tmp_path, capsys):
-    main(["faults", "lorenz", "--runs", "12", "--duration", "16", "--out", str(tmp_path)])
+    main(["faults", "lorenz", "--trajectories", "12", "--duration", "16", "--out", str(tmp_path)])
     assert "noticed" in capsys.readouterr().out
     found = pd.read_csv(tmp_path / "faults.csv")
     assert ",".join(found) == COLUMNS
@@ -115,7 +115,7 @@ def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path,
         main(["faults", path])
     options = ["--system", OSCILLATOR, "--trajectories", "4", "--duration", "12", "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit, match=f"nothing is left of {path}"):
-        main(["faults", path, "--noise", "1.5", *options])
+        main(["faults", path, "--measurement-noise", "1.5", *options])
     assert f"{path}, left out: measurement noise 1.5 is beyond the map's range, 0 to 1" in capsys.readouterr().out
     main(["faults", path, *options])
     found = pd.read_csv(tmp_path / "out" / "faults.csv")

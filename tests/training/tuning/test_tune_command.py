@@ -86,7 +86,7 @@ class Saddle(Oscillator):
 
 
 def test_plants_that_run_away_take_a_policy(tmp_path, capsys):
-    tune = ["tune", f"{__file__}:Saddle", "--noise", "0", "--duration", "6", "--modes", "2"]
+    tune = ["tune", f"{__file__}:Saddle", "--measurement-noise", "0", "--duration", "6", "--modes", "2"]
     with pytest.raises(SystemExit, match=r"of 80 motions from X only 0 stayed within the bounds; .* \(--policy\)"):
         main(tune)
     main([*tune, "--policy", "controller"])
