@@ -32,8 +32,9 @@ def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
     np.testing.assert_allclose(on_tensors_too, T(inside), atol=1e-4)
 
 
-@pytest.mark.parametrize("unit", [1.0, 1e-14])
-@pytest.mark.parametrize("spectrum", [Spectrum((-1.0, -2.0, -3.0)), Spectrum((-1.0,), ((-0.5, 2.0),))])
+@pytest.mark.parametrize(
+    ("spectrum", "unit"), [(Spectrum((-1.0, -2.0, -3.0)), 1.0), (Spectrum((-1.0,), ((-0.5, 2.0),)), 1e-14)]
+)
 def test_solved_forward_map_of_a_linear_system(spectrum, unit):
     linear, rng = spectrum.filter(1, 0.01), np.random.default_rng(0)
     T = solve_forward(Oscillator(), linear, features=100, points=unit * rng.uniform(-1, 1, (2000, 2)), rng=rng)
