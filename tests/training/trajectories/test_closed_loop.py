@@ -69,5 +69,5 @@ def test_the_shares_of_a_run_reach_its_closed_loop(monkeypatch, tmp_path):
 
     monkeypatch.setattr(training.pipeline, "record_closed_loop", spy)
     shares = {"noise_free_share": 0.35, "high_noise_emphasis": 1.5, "process_noise_share": 0.25}
-    train(VanDerPol(), toy(VanDerPol(), closed_loop_trajectories=20, inverse_steps=2, **shares), tmp_path)
+    train(VanDerPol(), toy(VanDerPol(), closed_loop_trajectories=10, inverse_steps=2, duration=1.0, **shares), tmp_path)
     assert told == [shares]
