@@ -65,7 +65,7 @@ def test_any_environment_agent(capsys):
 
 def test_own_system(tmp_path, monkeypatch):
     monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
-    assert example("own_system")(inverse_steps=500, trajectories=100, out=tmp_path) < 20.0
+    assert example("own_system")(inverse_steps=100, trajectories=30, out=tmp_path) < 40.0
 
 
 # What makes each of the commands for a system of one's own a matter of seconds.

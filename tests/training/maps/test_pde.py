@@ -29,7 +29,7 @@ def points(system, n=20):
     return torch.as_tensor(np.random.default_rng(0).uniform(*system.box(), (n, system.nx)))
 
 
-@pytest.mark.parametrize("system", ["reverse_duffing", "van_der_pol", "rossler", "lorenz", *KINKED], ids=str)
+@pytest.mark.parametrize("system", ["lorenz", *KINKED], ids=str)
 def test_equations_on_tensors_are_those_on_arrays(system):
     system = get_system(system)
     x = points(system)
@@ -81,26 +81,6 @@ def test_the_solution_leaves_nothing_and_another_map_what_it_is_off_by():
     wrong = M + 0.1
     expected = x @ (wrong @ torch.as_tensor(F) - A @ wrong - B @ torch.as_tensor(C)).T - 0.2 * A.sum(1)
     np.testing.assert_allclose(residual(lambda x: x @ wrong.T + 0.2, x, **given), expected, atol=1e-14)
-
-
-def test_the_residual_can_be_trained():
-    system, x = Oscillator(), points(Oscillator())
-    M = torch.zeros(3, 2, dtype=torch.float64, requires_grad=True)
-    f, h = on_tensors(system.f, x), on_tensors(system.h, x)
-
-    def risk():
-        return residual(lambda x: x @ M.T, x, f=f, h=h, A=A, B=B).square().mean()
-
-    optimiser = torch.optim.LBFGS([M], max_iter=200, tolerance_grad=1e-12, tolerance_change=1e-14)
-
-    def closure():
-        optimiser.zero_grad()
-        loss = risk()
-        loss.backward()
-        return loss
-
-    optimiser.step(closure)
-    np.testing.assert_allclose(M.detach(), sylvester(A.numpy(), B.numpy()), atol=1e-6)
 
 
 def test_the_residual_is_the_same_in_training_and_in_a_certificate():

@@ -25,7 +25,7 @@ def doubted(where, errors):
 def gaussian(where, scale=1.0, outliers=0.0, thin=1.0):
     """Errors whose covariance is said too small by a factor, some of them far off; all, along a diagonal and across."""
     rng = np.random.default_rng(0)
-    shape = (len(where.ages), 20_000)
+    shape = (len(where.ages), 8_000)
     root = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2) * np.sqrt([1.0, thin])
     error = np.sqrt(scale) * rng.standard_normal((*shape, 2)) @ root.T
     error[rng.random(shape) < outliers] *= np.sqrt(50.0)
@@ -36,7 +36,7 @@ def gaussian(where, scale=1.0, outliers=0.0, thin=1.0):
 def drawn(where, scale=1.0, outliers=0.0):
     """Squared distances of Gaussian errors whose covariance is said too small by a factor, some of them far off."""
     rng = np.random.default_rng(0)
-    distance = scale * rng.chisquare(where.nx, (len(where.ages), 20_000))
+    distance = scale * rng.chisquare(where.nx, (len(where.ages), 8_000))
     return np.where(rng.random(distance.shape) < outliers, 50.0 * distance, distance)
 
 

@@ -98,9 +98,7 @@ def test_a_run_is_not_resumed_under_a_changed_policy(tmp_path):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ("return x", r"shape \(20, 1\)"),
         ("return 3.0 * (x[:, :1] > 0)", r"\[-1, 1\]"),
-        ("return x[:, :1] * float('nan')", r"\[-1, 1\]"),
         ("return x.nothing", "AttributeError"),
     ],
 )
@@ -110,7 +108,7 @@ def test_functions_that_are_no_policy(tmp_path, body, message):
         named_policy(SYSTEM, f"{tmp_path / 'bad.py'}:act")
 
 
-@pytest.mark.parametrize("name", ["nothing", "numpy:nothing", "nowhere.py:act", "math:pi"])
+@pytest.mark.parametrize("name", ["nothing", "nowhere.py:act", "math:pi"])
 def test_names_of_no_policy(name):
     with pytest.raises(ValueError, match=name.rpartition(":")[2]):
         named_policy(SYSTEM, name)
