@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,6 +71,10 @@ class Certify:
             if reason := beyond(artifact, level):
                 console.print(f"{name}, left out: {reason}", markup=False, highlight=False, soft_wrap=True)
                 continue
+            title = name
+            if artifact.flow is not None:
+                artifact, title = replace(artifact, flow=None), f"{name}, T_inv alone"
+                console.print(f"{name} tracks; the certificate is that of its T_inv alone", markup=False, highlight=False)
             process_noise = system.process_noise if self.process_noise is None else self.process_noise
             KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now
             noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
@@ -92,12 +96,12 @@ class Certify:
                     trajectories=self.trajectories,
                     delta=self.delta,
                     seed=self.seed,
-                    name=name,
+                    name=title,
                     recorded=motion,
                     report=report,
                 )
                 write(self.out / f"{name}.json", json.dumps(certificate.as_json(), indent=1, allow_nan=False) + "\n")
-                draw(self.out / f"{name}.png", artifact, system, name=name, noise=noise, motion=motion)
+                draw(self.out / f"{name}.png", artifact, system, name=title, noise=noise, motion=motion)
             found.append(certificate)
         if not found:
             raise ValueError(f"nothing is left to certify of {', '.join(names)}: the lines above say why")

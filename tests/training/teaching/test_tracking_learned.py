@@ -9,7 +9,6 @@ from linear_system import Oscillator
 from rich.console import Console
 from tracking import DT, exact_motion, plain_observer, tracking_observer
 
-from examples.research.certificates.certificate import certify
 from kkl_gym import get_system
 from observers import MLP, Artifact, KKLObserver, Limits, load
 from observers.polynomial import monomials
@@ -269,8 +268,6 @@ def _bare():
 
 def test_who_needs_t_inv_alone_says_so():
     artifact = tracking_observer()
-    with pytest.raises(ValueError, match="tracks"):
-        certify(artifact, Noiseless())
     with pytest.raises(ValueError, match="tracks"):
         learn_error_bars(artifact, Noiseless())
     guided = GuidedKalmanFilter(Noiseless(), artifact=artifact, measurement_noise=0.2)
