@@ -18,11 +18,10 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
-from examples.research.agents.command import draw_results as draw_agents
+from examples.research.agents.tables import draw_curves, draw_environments, draw_systems
 from examples.research.benchmark.results import draw_results as draw_benchmark
 from examples.research.certificates import command as certify
 from examples.research.certificates.settled import record_settled
-from examples.research.environments.tables import draw_curves, draw_scores
 from examples.research.speed import sizes
 from kkl_gym import SYSTEMS
 from observers import Artifact, load
@@ -255,12 +254,12 @@ FIGURES: Mapping[str, Callable[[], Draw]] = {
     "results/certificates/rossler-spinn.png": partial(certificate, "rossler-spinn"),
     "results/benchmark/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "benchmark"),
     "results/ablation/heatmap.png": lambda: partial(draw_benchmark, RESULTS / "ablation"),
-    "results/agents/scores.png": lambda: partial(draw_agents, RESULTS / "agents"),
+    "results/agents/scores.png": lambda: partial(draw_systems, RESULTS / "agents"),
     "results/environments/scores.png": lambda: partial(
-        draw_scores, results=pd.read_csv(RESULTS / "environments" / "results.csv")
+        draw_environments, results=pd.read_csv(RESULTS / "environments" / "results.csv")
     ),
     "results/environments/curves.png": lambda: partial(
-        draw_curves, found=pd.read_csv(RESULTS / "environments" / "curves.csv")
+        draw_curves, learned=pd.read_csv(RESULTS / "environments" / "curves.csv")
     ),
     "results/faults/scores.png": lambda: partial(faults.draw, found=pd.read_csv(RESULTS / "faults" / "faults.csv")),
     "results/sizes/sizes.png": lambda: (

@@ -74,7 +74,7 @@ class Certify:
             title = name
             if artifact.flow is not None:
                 artifact, title = replace(artifact, flow=None), f"{name}, T_inv alone"
-                console.print(f"{name} tracks; the certificate is that of its T_inv alone", markup=False, highlight=False)
+                console.print(f"{name} tracks; this is the certificate of its T_inv alone", markup=False)
             process_noise = system.process_noise if self.process_noise is None else self.process_noise
             KKLObserver(artifact, level, process_noise=process_noise)  # refuses bad levels now
             noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}

@@ -140,7 +140,6 @@ class Method(ABC, Generic[Trained]):
 
     name: ClassVar[str]
     label: ClassVar[str]
-    trajectories: ClassVar[int | None] = None
     tuned_for: ClassVar[tuple[float, ...] | None] = None
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
