@@ -73,7 +73,7 @@ class Compare:
     beside: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: nothing)")] = None
     """Folder with results.csv and curves.csv of an earlier comparison in environments. Its rows of other environments
     and of other agents are taken over, so that new ones stand beside them without training those again. Give it each
-    time: tables are written anew. Both must have been made with the same settings, which is not checked."""
+    time: tables are written again. Both must have been made with the same settings, which is not checked."""
     measurement_noise: Annotated[tuple[float, ...], tyro.conf.arg(metavar="LEVEL [LEVEL ...]")] = (0.0,)
     """Standard deviations of the noise on the measured signals of environments; each level is a task of its own."""
     environment: tyro.conf.OmitArgPrefixes[EnvironmentOptions] = field(default_factory=EnvironmentOptions)
@@ -135,7 +135,10 @@ class Compare:
         observers: dict[str, str] = {}
         names = {get_system(name).name for name in self.systems}
         for observer in self.observers:
-            system = Artifact.read(resolve(observer)).system
+            artifact = Artifact.read(resolve(observer))
+            system = artifact.system
+            if not artifact.nu:
+                raise ValueError(f"the observer {observer} takes in no inputs, by which agents act")
             if system not in names or system in observers:
                 raise ValueError(
                     f"the observer {observer} is for {system}: name one for each of {', '.join(names)} at most"

@@ -28,7 +28,7 @@ class Benchmark:
     Writes OUT/results.csv (one row for each trajectory), OUT/methods.csv (what each method cost), OUT/table.md and
     OUT/heatmap.png. Each method on each system is one job with a folder under OUT/jobs that keeps its
     trained observer. A run that was interrupted goes on where it stopped. --systems and --methods do a part of the
-    work. What is missing from the full set is said in table and figure.
+    work; table and figure then name the missing observers.
     """
 
     budget: Literal["short", "cpu", "paper"] = "cpu"
@@ -58,7 +58,7 @@ class Benchmark:
     """Only write table and figure again from OUT/results.csv and OUT/methods.csv."""
 
     def run(self, console: Console) -> Path:
-        """Run what is missing, then report."""
+        """Run the missing jobs, then report."""
         from examples.research.benchmark.results import check_results, collect, report  # pandas takes a second
 
         name = "quick" if self.quick else self.budget

@@ -30,7 +30,7 @@ WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 @dataclass(frozen=True)
 class Certificate:
-    """What :func:`certify` found. Errors are of the whole state in its own units; bounds are of their squares.
+    """The result of :func:`certify`. Errors are of the whole state in its own units; bounds are of their squares.
 
     Shapes: ``measurement_noise`` of length ny, ``noise_bound`` of length ny, ``nrmse``, ``noisy_nrmse`` of length nx,
     ``lipschitz_at`` of length of the filter's state.
@@ -65,7 +65,7 @@ class Certificate:
     forward: Forward | None
 
     def as_json(self) -> dict[str, Any]:
-        """For json.dumps; what is infinite becomes None."""
+        """For json.dumps; infinite values become None."""
         return {key: _plain(value) for key, value in asdict(self).items()}
 
 
@@ -114,7 +114,7 @@ def certify(
     report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*informed.mlp.weights, *informed.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
-        free = informed  # a map that is not told the noise is bounded once
+        free = informed  # a map without noise among its inputs is bounded once
     linear = artifact.filter
     gain = theorem_gain(linear)
     l_h = output_lipschitz(system, system.draw_starts(generator(Stream.CERTIFICATE, seed, 1), 2_000))
@@ -161,7 +161,7 @@ def certify(
             artifact,
             system,
             sample,
-            told=Inverse(informed, upper),
+            informed=Inverse(informed, upper),
             noise_free=Inverse(free, upper if free is informed or artifact.forward is None else lipschitz_upper(free)),
             noise_error=noise_error,
             psi=psi,

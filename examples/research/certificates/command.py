@@ -53,7 +53,7 @@ class Certify:
     seed: int = 0
     """Seed of starts and noise."""
     out: Path = Path("runs/certificates")
-    """Folder for what is written."""
+    """Folder of results."""
 
     def run(self, console: Console) -> "list[Certificate]":
         """Certify."""
@@ -112,7 +112,7 @@ class Certify:
 
 
 def lines(found: "Certificate") -> list[dict[str, str]]:
-    """What a certificate says, in sections: label to value."""
+    """The lines of a certificate in sections, by label."""
     from examples.research.certificates.forward import QUANTILES
 
     forward = found.forward

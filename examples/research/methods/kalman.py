@@ -48,7 +48,7 @@ class EKF(Method[Arrays]):
         return {"diffusion": np.array([configuration["diffusion"]])}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter, told the noise level."""
+        """The filter for a noise level."""
         Q = diffusion_intensity(trained, system)
         R = measurement_covariance(system, noise)
         return self.filter(self.believed(system), dt, Q=Q, R=R)
@@ -69,7 +69,7 @@ class Guided(EKF):
     label: ClassVar[str] = "UKF, guided by the shipped map"
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter and the map, told the noise level."""
+        """The filter and the map for a noise level."""
         Q = diffusion_intensity(trained, system)
         return GuidedKalmanFilter(system, dt=dt, measurement_noise=noise, process_noise=0.0, Q=Q)
 
@@ -89,7 +89,7 @@ class UntunedEKF(EKF):
     label: ClassVar[str] = "EKF, untuned"
 
     def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """The one that nobody chose."""
+        """The only one."""
         return ({},)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
@@ -97,7 +97,7 @@ class UntunedEKF(EKF):
         return {}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter, told nothing."""
+        """The filter with identity covariances."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))

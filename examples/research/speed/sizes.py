@@ -34,7 +34,7 @@ class Sizes:
 
     The widths are those of hidden layers; all else is as `kkl-gym train SYSTEM` has it. Errors are medians over unseen
     motions from X, over all steps. Times are CPU time of one thread: run it with OMP_NUM_THREADS=1, on an idle machine.
-    Observers that are there already are not trained again, so that times can be taken anew.
+    Observers that are there already are not trained again, so that times can be taken again.
 
     Writes OUT/NAME-WIDTH.safetensors, OUT/sizes.csv and OUT/sizes.png.
     """
@@ -53,7 +53,7 @@ class Sizes:
     seed: int = 0
     """Seed of the motions and the noise."""
     out: Annotated[Path | None, tyro.conf.arg(help_behavior_hint="(default: runs/sizes/NAME)")] = None
-    """Folder for what is written."""
+    """Folder of results."""
 
     def run(self, console: Console) -> "pd.DataFrame":
         """Train, measure and draw."""
