@@ -1,7 +1,6 @@
 """How far to trust an observer: risks, sensitivities and the paper's bounds, from fresh samples."""
 
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -24,8 +23,6 @@ from training.evaluation.metrics import nrmse
 from training.maps.smooth import decoder
 from training.seeds import Stream, generator
 from training.trajectories.controllers import Controller
-
-WITHOUT_T, WITH_T = 3, 10  # parts of the work
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,6 @@ def certify(
     name: str = "",
     policy: Controller | None = None,
     recorded: SettledTrajectories | None = None,
-    report: Callable[[float], object] = lambda done: None,
 ) -> Certificate:
     """Bound how far an observer is to be trusted, on samples that its training never saw.
 
@@ -105,13 +101,10 @@ def certify(
     noise: dict[str, Any] = {"measurement_noise": level, "process_noise": process_noise}
     if recorded is None:
         recorded = record_settled(artifact, system, **noise, trajectories=trajectories, seed=seed, policy=policy)
-    report(1)
     measured, sample = recorded.halves()
     informed = decoder(artifact, **noise)
     lower, at = lipschitz_lower(informed, recorded.z)
-    report(2)
     upper = lipschitz_upper(informed)
-    report(WITHOUT_T)
     free = decoder(artifact, 0.0)
     if all(map(np.array_equal, (*informed.mlp.weights, *informed.mlp.biases), (*free.mlp.weights, *free.mlp.biases))):
         free = informed  # a map without noise among its inputs is bounded once
@@ -168,14 +161,8 @@ def certify(
             error=float(losses.mean()),
             delta=delta,
             rng=generator(Stream.CERTIFICATE, seed, 2),
-            report=lambda share: report(WITHOUT_T + (WITH_T - WITHOUT_T) * share),
         ),
     )
-
-
-def parts(artifact: Artifact) -> int:
-    """Number of parts, of about the same length, that the work of :func:`certify` has."""
-    return WITHOUT_T if artifact.forward is None else WITH_T
 
 
 def _nrmse(x: np.ndarray, x_hat: np.ndarray) -> tuple[float, ...]:

@@ -1,7 +1,7 @@
 """The part of a certificate that needs a learned T: its risks, its residual and the paper's bounds."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +77,6 @@ def certify_forward(
     error: float,
     delta: float,
     rng: np.random.Generator,
-    report: Callable[[float], object] = lambda share: None,
 ) -> Forward | None:
     """Certify what rests on T; None if the artifact has no T."""
     if artifact.forward is None:
@@ -96,12 +95,8 @@ def certify_forward(
     same = informed.T_inv is noise_free.T_inv
 
     def sharp(used: Inverse) -> tuple[float, float, float, float]:
-        first = 0.0 if used is noise_free else 0.5
         some = np.linspace(0, len(z) - 1, min(SEGMENTS, len(z))).astype(int)
-        found = segment_lipschitz(
-            used.T_inv, images[some], z[some], lambda share: report(first + share / (1 if same else 2))
-        )
-        between = np.minimum(found, used.lipschitz)
+        between = np.minimum(segment_lipschitz(used.T_inv, images[some], z[some]), used.lipschitz)
         reconstruction = float(squared(recorded.x - used.T_inv(images)).mean())
         steep = float((between**2 * data_losses[some]).mean())
         return reconstruction, float(between.max()), steep, (math.sqrt(reconstruction) + math.sqrt(steep)) ** 2
