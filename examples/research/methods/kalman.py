@@ -82,22 +82,18 @@ class WrongEKF(WrongParameters, EKF):
     diffusion: ClassVar[tuple[float, ...]] = WRONG_DIFFUSION
 
 
-class UntunedEKF(EKF):
+class UntunedEKF(Method[Arrays]):
     """The exact model with the covariances that filterpy starts from: P, Q (per sample) and R are the identity."""
 
     name: ClassVar[str] = "ekf-untuned"
     label: ClassVar[str] = "EKF, untuned"
-
-    def configurations(self, system: System) -> tuple[Configuration, ...]:
-        """The only one."""
-        return ({},)
 
     def train(self, task: Task, configuration: Configuration) -> Arrays:
         """Nothing to learn."""
         return {}
 
     def observer(self, trained: Arrays, system: System, dt: float, noise: Level) -> CausalObserver:
-        """The filter with identity covariances."""
+        """The filter, whatever the noise."""
         x0, _ = unknown_start(system)
         eye = np.eye(system.nx)
         return ExtendedKalmanFilter(system, dt, Q=eye / dt, R=np.eye(system.ny), start=(x0, eye))
