@@ -186,7 +186,7 @@ def errors_of_runs(
     """
     errors = {}
     for name, kind in SYSTEMS.items():
-        system, how = kind(), {"measurement_noise": level, "seed": 0}
+        system, how = kind(), dict[str, Any](measurement_noise=level, seed=0)
         runs = unseen_trajectories(system, DT, n=trajectories, duration=duration or system.duration, seed=0)
         x_hats = [estimates_of(Artifact.read(resolve(name + suffix)), system, runs, **how) for suffix in suffixes]
         x_hats.append(kalman_estimates(system, runs, DT, **how))

@@ -110,8 +110,9 @@ class EnvironmentAgent(Job):
         observer, rows = str(self.folder / OBSERVER), min(ROWS, self.episodes)
         env: Any = make_vec_env(lambda: self._environment(observer), rows, seed=AGENT_EVALUATION_SEED)
         try:
+            policy: Any = RandomActions(env) if model is None else model
             returns: Any = evaluate_policy(
-                RandomActions(env) if model is None else model,
+                policy,
                 env if model is None else _scaled(env, model),
                 n_eval_episodes=self.episodes,
                 return_episode_rewards=True,

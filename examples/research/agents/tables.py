@@ -106,7 +106,7 @@ def report_systems(out: Path) -> None:
 def draw_systems(out: Path, path: Path) -> None:
     """Draw the scores from results.csv."""
     rows, partial = _on_systems(out)
-    kinds = {kind: ON_SYSTEMS[kind] for kind in _kinds_on_systems(rows)}
+    kinds: dict[str, str] = {kind: ON_SYSTEMS[kind] for kind in _kinds_on_systems(rows)}
     draw_scores(path, rows, kinds, f"What agents know and how well they act.{partial}")
 
 

@@ -120,9 +120,9 @@ class Sizes:
                 report(done)
         with progress.phase("timing", len(tasks) * (TURNS + 1)) as report:
             seconds = in_turns(tasks, TURNS, report)
-        for row in rows:
+        for row, width in zip(rows, artifacts, strict=True):
             for name, n in (("us_single", 1), ("us_a_row", self.num_envs)):
-                row[name] = 1e6 * float(np.median(seconds[row["width"], name])) / n
+                row[name] = 1e6 * float(np.median(seconds[width, name])) / n
         return rows
 
 

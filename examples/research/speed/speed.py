@@ -109,7 +109,7 @@ class Speed:
                 many.step(np.zeros((n, artifact.ny)), np.full((n, artifact.nu), 1e-3))
                 products, operations = limit(artifact.inverse, n)
                 tasks |= {f"{n}, {key}": task for key, task in batch.items()}
-                tasks |= {"network": lambda many=many: _seconds(many.decode, 10), "products": products}
+                tasks |= {"network": partial(_seconds, many.decode, 10), "products": products}
                 report = progress.bar(f"timing {name} alone", len(tasks) * (self.turns + 1))
                 seconds = {key: float(np.median(of)) for key, of in in_turns(tasks, self.turns, report).items()}
                 rows = table_rows(
