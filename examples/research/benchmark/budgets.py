@@ -1,4 +1,4 @@
-"""How much the benchmark gives each method, and how it is measured: what is behind ``--budget`` and ``--quick``.
+"""The budgets of trainings and the test protocols behind ``--budget`` and ``--quick``.
 
 Times are at the pace of the shipped systems; other systems are given as many samples of their own.
 """

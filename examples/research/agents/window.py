@@ -1,6 +1,12 @@
-"""Fitting the network that estimates hidden signals from stacked observations."""
+"""The rival of observers: a network that estimates hidden signals from stacked observations.
 
+It learns from the same steps as an observer does, with as many batches, the same loss and as large a network. What an
+observer's filter is worth is the difference between the two.
+"""
+
+import os
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +15,8 @@ import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
 
-from examples.research.environments.window import WindowEstimator, show_window
-from observers import MLP
+from observers import MLP, storage
+from training.agents.any_environment.information import Stacked, part_of
 from training.agents.any_environment.observing import KEPT, OBSERVER, SETTINGS, Estimation, oldest_first
 from training.agents.any_environment.task import HiddenTask
 from training.maps.inverse import InverseProblem
@@ -21,23 +27,92 @@ from training.progress import ProgressBars
 from training.recorded.config import RecordedConfig
 from training.records import Record
 from training.rollouts.callback import rehearsed
+from training.rollouts.playing import Recorder
 
-DEFAULT = RecordedConfig(eigenvalues=(-1.0,), dt=1.0, measurement_noise_max=1.0)  # as large a network as an observer's
+KEY = "kkl-gym-window"
+DEFAULT = RecordedConfig(eigenvalues=(-1.0,), dt=1.0, measurement_noise_max=1.0)  # for the size of its network
+
+
+@dataclass(frozen=True)
+class WindowEstimator:
+    """A network from the last outputs, each with the input before it, to hidden signals.
+
+    Shapes: ``mean``, ``scale`` (inputs,).
+    """
+
+    network: MLP
+    mean: np.ndarray
+    scale: np.ndarray
+
+    def __call__(self, stack: np.ndarray) -> np.ndarray:
+        """Estimate.
+
+        Shapes: ``stack`` (..., inputs); returns (..., outputs).
+        """
+        return self.network((stack - self.mean) / self.scale)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to one safetensors file, whole or not at all."""
+        tensors: dict[str, np.ndarray] = {"mean": self.mean, "scale": self.scale}
+        storage.put_mlp(tensors, "", self.network)
+        storage.save(path, tensors, key=KEY, described={"activation": self.network.activation})
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> "WindowEstimator":
+        """Read what :meth:`save` wrote."""
+        tensors, described = storage.read(path, key=KEY, error=ValueError, what="an estimator on stacked observations")
+        with storage.explained(path, ValueError):
+            network = storage.get_mlp(tensors, "", described["activation"])
+            return cls(network, tensors["mean"], tensors["scale"])
+
+
+class WindowObservation(gym.ObservationWrapper[np.ndarray, Any, np.ndarray]):
+    """Shows y and the estimates from stacked observations; under noise the estimates alone."""
+
+    def __init__(self, env: gym.Env[np.ndarray, Any], task: HiddenTask, estimator: WindowEstimator) -> None:
+        super().__init__(env)
+        self._estimator = estimator
+        stacked = gym.spaces.flatdim(env.observation_space)
+        latest = stacked - stacked // task.frames
+        self._outputs = slice(latest, latest if task.measurement_noise else latest + len(task.measured))
+
+    def replace_estimator(self, estimator: WindowEstimator) -> None:
+        """Go on with another estimator for the same task."""
+        self._estimator = estimator
+
+    def observation(self, observation: np.ndarray) -> np.ndarray:
+        """Show the latest outputs of a stack, and estimates."""
+        shown = np.concatenate([observation[self._outputs], self._estimator(observation)])
+        space: Any = self.observation_space
+        return np.clip(shown, space.low, space.high, dtype=np.float32)
+
+
+def show_window(task: HiddenTask, path: str | os.PathLike[str], *, keep: int | None = None) -> gym.Env[np.ndarray, Any]:
+    """Make a task's environment with the estimator of a file; ``keep`` records so many of the last steps."""
+    env = task.make()
+    whole: Any = env.observation_space
+    size = whole.shape[0]
+    entries = list(task.estimated_entries(size) if task.measurement_noise else task.told(size))
+    low, high = whole.low[entries], whole.high[entries]
+    if task.measurement_noise:  # estimates are not clipped, as those of observers are not
+        low, high = np.full_like(low, -np.inf), np.full_like(high, np.inf)
+    if keep is not None:
+        env = Recorder(env, **task.signals(size), keep=keep)
+    stacked = Stacked(part_of(env, task.measured), task.frames)
+    shown = WindowObservation(stacked, task, WindowEstimator.read(path))
+    shown.observation_space = gym.spaces.Box(low, high, dtype=np.float32)
+    return shown
 
 
 def learn_window(
     task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
 ) -> Path:
-    """Fit an estimator on stacked observations to an agent's first steps, by what an observer is fitted with.
-
-    That is the same number of batches of the same size, the same optimiser and the same loss, and a network of the same
-    width and depth. Noise of the task's level is added to the outputs, in each batch anew.
-    """
+    """Fit an estimator to an agent's first steps; each batch draws noise of the task's level on the outputs."""
     torch.manual_seed(seed)
     stacks = Stacks(task, records)
     width, depth, activation = DEFAULT.width, DEFAULT.depth, DEFAULT.activation
     network = Network(len(stacks.mean), len(stacks.x_mean), width=width, depth=depth, activation=activation)
-    sampler: Any = stacks  # of batches as those of observers are
+    sampler: Any = stacks
     problem = InverseProblem(network, sampler, torch.device("cpu"))
     optimise_at_once(
         f"estimates from {task.frames} observations",
@@ -49,8 +124,7 @@ def learn_window(
         seed=seed,
     )
     path = folder / OBSERVER
-    found = stacks.in_units(network.export())
-    WindowEstimator(found, stacks.mean, stacks.scale, WindowEstimator.made_for(task)).save(path)
+    WindowEstimator(stacks.in_units(network.export()), stacks.mean, stacks.scale).save(path)
     return path
 
 
@@ -69,8 +143,8 @@ class Stacks:
             assert record.u is not None
             assert record.x is not None
             y = record.y
-            if noise:  # what is measured is among the states, as it was before any noise
-                estimated = task.estimated_entries(record.x.shape[1])  # which are all, where the task names none
+            if noise:  # the measured signals are among the states, without noise
+                estimated = task.estimated_entries(record.x.shape[1])
                 y = record.x[:, [estimated.index(entry) for entry in task.measured]]
             acted = np.concatenate([np.zeros_like(record.u[:1]), record.u[:-1]])  # before each output
             entries.append(np.concatenate([y, acted], axis=1))
@@ -93,7 +167,7 @@ class Stacks:
         """Draw a batch."""
         rows = self._known[torch.randint(len(self._known), (DEFAULT.batch,), generator=generator)]
         begins = self._begins[rows]
-        stack = torch.maximum(rows[:, None] - self._back, begins[:, None])  # before an episode there was its first row
+        stack = torch.maximum(rows[:, None] - self._back, begins[:, None])  # an episode's first row stands before it
         seen = self._table[stack]
         if self._noise.any():
             noise = torch.randn(seen.shape, generator=generator)
@@ -104,7 +178,7 @@ class Stacks:
         return Batch(seen.flatten(1), self._x[rows], torch.ones(len(rows)), cell)
 
     def in_units(self, network: MLP) -> MLP:
-        """A network of scaled signals, in units of these."""
+        """A network whose outputs are scaled signals, with outputs in their units."""
         (*weights, weight), (*biases, bias) = network.weights, network.biases
         scale = self.x_scale
         return MLP([*weights, weight * scale[:, None]], [*biases, bias * scale + self.x_mean], network.activation)
@@ -117,7 +191,7 @@ class WindowRefits(BaseCallback):
     """
 
     def __init__(
-        self, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, records: Sequence[Record] = ()
+        self, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, records: Sequence[Record]
     ) -> None:
         super().__init__()
         self._learn, self._every, self._rehearsal, self._records = learn, every, rehearsal, list(records)
@@ -134,7 +208,7 @@ class WindowRefits(BaseCallback):
 
     def _on_training_end(self) -> None:
         for _ in rehearsed(self.model, self._rehearsal):
-            pass  # the environments keep what happens
+            pass  # the environments record the steps
         self._refit()
 
     def _refit(self) -> None:
@@ -163,12 +237,9 @@ STACKED = Estimation(learn_window, _show, _refits)
 
 
 def _or_one(scale: np.ndarray) -> np.ndarray:
-    """Of signals that never change, one."""
+    """Standard deviations as scales: 1 where nothing varies."""
     return np.where(scale > 1e-9, scale, 1.0)
 
 
 def _tensor(values: np.ndarray) -> torch.Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
-
-
-__all__ = ["STACKED", "Stacks", "WindowRefits", "learn_window"]
