@@ -99,9 +99,7 @@ def test_where_takes_conditions_only(wrong):
 
 EXTREMES = [
     ("exp", 1000.0, math.inf),
-    ("exp", -1000.0, 0.0),
     ("log", 0.0, -math.inf),
-    ("log", -1.0, math.nan),
     ("sqrt", -1.0, math.nan),
     ("sin", math.inf, math.nan),
     ("tanh", math.inf, 1.0),

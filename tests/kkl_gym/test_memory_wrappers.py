@@ -177,21 +177,17 @@ def test_under_and_over_other_wrappers():
 
 
 def test_stable_baselines3_takes_it_as_it_is():
-    env_util = pytest.importorskip("stable_baselines3.common.env_util")
-    env = pendulum(measured=[0, 1])
-    expected = [env.reset(seed=0)[0]]
-    envs = env_util.make_vec_env(
-        "Pendulum-v1", n_envs=2, seed=0, wrapper_class=KKLMemory, wrapper_kwargs={"measured": [0, 1]}
-    )
-    seen = [envs.reset()[0]]
+    env_util, env = pytest.importorskip("stable_baselines3.common.env_util"), pendulum(measured=[0, 1])
+    how = {"wrapper_class": KKLMemory, "wrapper_kwargs": {"measured": [0, 1]}}
+    envs = env_util.make_vec_env("Pendulum-v1", n_envs=2, seed=0, **how)
+    assert np.array_equal(envs.reset()[0], env.reset(seed=0)[0])
     for k in range(200):
         action = np.array([np.sin(k)], np.float32)
-        expected.append(env.step(action)[0])
         obs, _, done, infos = envs.step(np.array([action] * 2))
-        seen.append(infos[0]["terminal_observation"] if done[0] else obs[0])
+        seen = infos[0]["terminal_observation"] if done[0] else obs[0]
+        assert np.allclose(seen, env.step(action)[0], rtol=1e-5, atol=1e-6)
     assert done.all()
     assert not obs[:, 2:].any()
-    assert np.allclose(seen, expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("poison", [np.nan, -1e20])

@@ -108,12 +108,6 @@ def test_order_six():
     assert ((orders > 5.5) & (orders < 7.0)).all()
 
 
-def test_quadrature_is_exact_to_order_six():
-    """x' = 6 t^5 with t as a second state."""
-    t, x = runge_kutta(2)(lambda s: (1.0, 6.0 * s[0] ** 5), (0.0, 0.0), (0.0, 0.0), 1.0, 1)
-    assert (t, x) == pytest.approx((1.0, 1.0), rel=1e-13)
-
-
 def test_energy_is_conserved():
     x0 = np.random.default_rng(3).uniform(*ReverseDuffing().box(2), (20, 2))
     x = simulate(ReverseDuffing(), x0, 1000, DT)
@@ -306,7 +300,6 @@ def test_inputs_and_noise(system):
 
 def test_rates_that_do_not_depend_on_the_state():
     assert np.allclose(simulate(Drift(), [[0.0], [1.0]], 4, 0.5)[:, :, 0].T, [[0, 1, 2, 3, 4], [1, 2, 3, 4, 5]])
-    assert np.allclose(advance(Drift(), (0.0,), (), (0.0,), 0.5), [1.0])
 
 
 def test_no_starts_no_steps_and_signals_that_are_left_out():

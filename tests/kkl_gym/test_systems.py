@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from linear_system import Oscillator
 
 from kkl_gym import SYSTEMS, Lorenz, ReverseDuffing, Rossler, System, VanDerPol, get_system
 
@@ -128,18 +129,8 @@ def test_bad_parameters_are_named(parameters, match):
 
 
 def test_system_without_parameters_says_so():
-    class Bare(System):
-        name = "bare"
-        X, bounds = ((-1, 1),), ((-2, 2),)
-
-        def f(self, x):
-            return (-x[0],)
-
-        def h(self, x):
-            return (x[0],)
-
-    with pytest.raises(ValueError, match="bare has no parameter 'mu'; it has none"):
-        get_system(Bare, {"mu": 1.0})
+    with pytest.raises(ValueError, match="oscillator has no parameter 'mu'; it has none"):
+        get_system(Oscillator, {"mu": 1.0})
 
 
 def test_systems_are_frozen_values():

@@ -410,16 +410,6 @@ def test_a_blind_map_under_action(saved):
     assert np.isfinite(env.step(np.ones((N, 1)))[0]).all()
 
 
-def test_masks_as_lists_and_full_masks(saved):
-    env = VectorActionRepeat(KKLVectorObservation(vector("van_der_pol", "Disabled"), saved()), 2)
-    obs, _ = env.reset(seed=0, options={"reset_mask": [True] * N})
-    assert (env.reset(seed=0)[0] == obs).all()
-    env.step(np.zeros((N, 1)))
-    again, _ = env.reset(seed=0, options={"reset_mask": [True, False, False, True]})
-    assert (again[[0, 3]] == obs[[0, 3]]).all()
-    env.step(np.zeros((N, 1)))
-
-
 def test_stepping_past_an_episodes_end_says_so(saved):
     class SteppingOn(gym.vector.VectorWrapper):
         """Steps on after the end, as Gymnasium's asynchronous vectors do."""

@@ -9,7 +9,6 @@ import pytest
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import SyncVectorEnv
-from gymnasium.wrappers import RecordEpisodeStatistics
 
 import kkl_gym
 from kkl_gym import ENV_IDS, ActionRepeat, KKLEnv, KKLObservation, KKLVectorEnv, KKLVectorObservation
@@ -54,29 +53,21 @@ def test_checkers_are_content(name, estimate, options, saved):
 def test_estimates_are_timed_as_the_observers(name, noise, inputs, saved, make_artifact):
     """The wrapper's x_hat, from y_k+1 and the u_k that led to it, equals the bare observer fed from the infos."""
     env = wrapped(saved, name, env={"measurement_noise": noise}, inputs=inputs, ignore_input=True)
+    bare, space = KKLObserver(make_artifact(name, inputs=inputs), noise), env.unwrapped.plant.state_space
     obs, info = env.reset(seed=1)
-    infos, shown = [info], [obs]
+    infos, x_hat = [info], bare.reset(info["y"])
     for action in actions(60):
-        obs, _, terminated, _, info = env.step(2 * action)  # some are clipped
-        assert not terminated
+        assert np.array_equal(info["x_hat"], x_hat)
+        assert np.array_equal(info["z"], bare.z)
+        assert np.array_equal(obs, np.clip(x_hat, space.low, space.high).astype(np.float32))
+        obs, _, _, _, info = env.step(2 * action)  # some are clipped
         infos.append(info)
-        shown.append(obs)
-    y, x_hat, z = (np.array([info[key] for info in infos]) for key in ("y", "x_hat", "z"))
+        x_hat = bare.step(info["y"], info["u"] if inputs else None)
+    y, found = (np.array([info[key] for info in infos]) for key in ("y", "x_hat"))
     u = np.array([info["u"] for info in infos[1:]]) if inputs else None
-    bare = KKLObserver(make_artifact(name, inputs=inputs), noise)
-    expected = [bare.reset(y[0])]
-    expected_z = [bare.z]
-    for k in range(60):
-        expected.append(bare.step(y[k + 1], u[k] if inputs else None))
-        expected_z.append(bare.z)
-    assert np.array_equal(x_hat, expected)
-    assert np.array_equal(z, expected_z)
-    assert np.allclose(bare.estimate(y, u), x_hat, rtol=1e-5, atol=1e-4)
-    assert x_hat.dtype == z.dtype == np.float64
-    space = env.unwrapped.plant.state_space
-    assert np.array_equal(shown, np.clip(x_hat, space.low, space.high).astype(np.float32))
+    assert np.allclose(bare.estimate(y, u), found, rtol=1e-5, atol=1e-4)
     if inputs:
-        assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), x_hat, rtol=1e-3)  # a shift by one would show
+        assert not np.allclose(bare.estimate(y, np.roll(u, 1, 0)), found, rtol=1e-3)  # a shift by one would show
 
 
 @pytest.mark.parametrize("estimate", ["x", "z"])
@@ -204,15 +195,9 @@ def test_noise_beyond_the_maps_range(saved):
     assert KKLObservation(KKLEnv("lorenz", measurement_noise=0.3), path).observer.measurement_noise == 0.3
 
 
-def two_outputs(make_artifact, path):
-    """A system with two outputs by its name, and the file of an observer that is told a level for each."""
-    system = f"{linear_system.__file__}:TwoOutputs"
-    dataclasses.replace(make_artifact(outputs=2), system="two-outputs", parameters={}).save(path)
-    return system, str(path)
-
-
 def test_each_output_has_its_level(make_artifact, tmp_path):
-    system, path = two_outputs(make_artifact, tmp_path / "two.safetensors")
+    system, path = f"{linear_system.__file__}:TwoOutputs", str(tmp_path / "two.safetensors")
+    dataclasses.replace(make_artifact(outputs=2), system="two-outputs", parameters={}).save(path)
     plain = gym.make("kkl_gym:kkl_gym/Own-v0", system=system)
     assert KKLObservation(plain, path).observer.measurement_noise == (0.1, 0.3)  # the environment's
     env = KKLObservation(plain, path, measurement_noise=np.array([0.2, 0.4]))
@@ -342,10 +327,9 @@ def test_action_repeat_sums_rewards(saved):
 
 
 def test_action_repeat_stops_where_the_episode_is_cut(saved):
-    env = RecordEpisodeStatistics(ActionRepeat(wrapped(saved, "lorenz", env={"max_episode_steps": 10}), 4))
+    env = ActionRepeat(wrapped(saved, "lorenz", env={"max_episode_steps": 10}), 4)
     env.reset(seed=0)
-    ends = [env.step(np.zeros(1, np.float32))[3] for _ in range(3)]
-    assert ends == [False, False, True]
+    assert [env.step(np.zeros(1, np.float32))[3] for _ in range(3)] == [False, False, True]
 
 
 def test_escapes_end_repeats(saved):
@@ -365,17 +349,14 @@ def test_escapes_end_repeats(saved):
     assert reward == pytest.approx(total)
 
 
-@pytest.mark.parametrize("repeat", [0, 1.5, "2"])
-def test_wrong_repeats(repeat):
-    with pytest.raises(ValueError, match="repeat must be a positive integer"):
-        ActionRepeat(KKLEnv("lorenz"), repeat)
-
-
-def test_a_wrapper_inside_that_skips_samples_is_noticed(saved):
-    env = KKLObservation(ActionRepeat(gym.make("KKLVanDerPol-v0"), 5), saved(system="van_der_pol"))
-    env.reset(seed=0)
+def test_wrong_repeats(saved):
+    for repeat in (0, 1.5, "2"):
+        with pytest.raises(ValueError, match="repeat must be a positive integer"):
+            ActionRepeat(KKLEnv("lorenz"), repeat)
+    inside = KKLObservation(ActionRepeat(gym.make("KKLVanDerPol-v0"), 5), saved(system="van_der_pol"))
+    inside.reset(seed=0)
     with pytest.raises(ValueError, match="outside KKLObservation"):
-        env.step(np.zeros(1, np.float32))
+        inside.step(np.zeros(1, np.float32))
 
 
 def test_render_shows_the_estimate_and_the_input(saved):
