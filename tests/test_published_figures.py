@@ -97,6 +97,17 @@ def test_errors_of_what_ships(where, label, conditions, suffix, file):
         assert row(f"{label}, {title}", of_evaluation(file(kind), suffix, column, *chosen)) in page(where)
 
 
+def test_the_page_on_the_benchmark_has_errors_on_other_plants():
+    for title, column, starts, driven in (
+        ("starts in X, all steps", "smape", "X", False),
+        ("starts in X, after 20 %", "smape_late", "X", False),
+        ("starts in 2X \\ X, all steps", "smape", "2X \\ X", False),
+        ("starts in X, driven, after 5 s", "smape_late", "X", True),
+    ):
+        pairs = zip(*(of_evaluation("plant-error", "-static", column, starts, driven, noise) for noise in (0.0, 0.5)))
+        assert row(title, map(" / ".join, pairs)) in page("docs/results/benchmark.md")
+
+
 def test_the_page_on_agents_has_the_commands_table():
     rows = [line for line in page("docs/results/agents/table.md").splitlines() if line.startswith("|")]
     assert len(rows) == 11

@@ -2,11 +2,13 @@
 
 import functools
 import importlib.util
+import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import linear_system
 import numpy as np
 import pytest
 from linear_system import Autonomous, Oscillator
@@ -21,6 +23,7 @@ from kkl_gym.elementary import sqrt
 from kkl_gym.simulate import advance_batch
 from training.checking import FIRST, THEN, check, dynamics
 from training.checking.subject import Subject
+from training.cli import main
 from training.systems import controller
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
@@ -101,6 +104,19 @@ def test_a_linear_system_has_its_numbers():
     assert found["bounds"] == "all of 200 motions of 20 s stay within them, from X and 2X, free and driven"
 
 
+def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    options = ["--dt", "0.05", "--duration", "2", "--policy", "controller", "--json", str(tmp_path / "found.json")]
+    main(["check", f"{linear_system.__file__}:Oscillator", *options])
+    shown = [line for line in capsys.readouterr().out.splitlines() if not line.startswith("checking ")]  # if it is slow
+    assert shown[-1] == "no problems, no notes"
+    for line, finding in zip(shown[:-1], json.loads((tmp_path / "found.json").read_text()), strict=True):
+        assert line.split()[0] == finding["verdict"] == "ok"
+        assert finding["check"] in line
+        assert finding["found"] in line
+    assert any("under the policy" in line for line in shown)
+
+
 @dataclass(frozen=True)
 class Rotation(System):
     """The oscillator in discrete time, started on a circle."""
@@ -139,24 +155,34 @@ def test_discrete_time_and_starts_of_its_own():
 # Equations.
 
 
+@dataclass(frozen=True)
 class Branching(Oscillator):
-    name = "branching"
+    gain: float = 1.0
+
+    name: ClassVar[str] = "branching"
 
     def f(self, x):
         if x[0] > 0:
             return x[1], -x[0]
-        return x[1], -2.0 * x[0]
+        return x[1], -self.gain * x[0]
 
 
-def test_an_if_on_the_state():
-    found = findings(Branching())
-    (wrong,) = (one for one in found if one.verdict == "problem")
-    assert wrong.check == "equations"
-    assert "on arrays: f(x) of 'branching' failed in" in wrong.found
-    assert "(`if x[0] > 0:`)" in wrong.found
-    assert "kkl_gym.elementary.where" in wrong.found
-    assert wrong.advice == "as it is, batches, training and evaluation do not run"
-    assert found[-1].found == "all other checks are left out"
+def test_an_if_on_the_state_is_a_problem_and_ends_the_command_with_status_1(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1000")
+    with pytest.raises(SystemExit) as end:
+        main(["check", f"{__file__}:Branching", "--parameters", "gain", "2", "--json", str(tmp_path / "found.json")])
+    assert end.value.code == 1
+    shown = capsys.readouterr().out
+    assert "gain = 2" in shown
+    assert "→ as it is, batches, training and evaluation do not run" in shown
+    assert shown.splitlines()[-1] == "1 problem, 3 notes"
+    found = json.loads((tmp_path / "found.json").read_text())
+    (wrong,) = (one["found"] for one in found if one["verdict"] == "problem")
+    assert wrong in shown  # square brackets are no markup
+    assert "on arrays: f(x) of 'branching' failed in" in wrong
+    assert "(`if x[0] > 0:`)" in wrong
+    assert "kkl_gym.elementary.where" in wrong
+    assert found[-1]["found"] == "all other checks are left out"
 
 
 def test_functions_of_other_modules():
