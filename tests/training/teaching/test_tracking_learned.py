@@ -164,12 +164,6 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent, thin, widths):
         assert (found.polynomial != 0).sum(1).tolist() == [5, 5]
 
 
-def test_degrees_are_as_high_as_sixty_terms_allow_and_then_as_high_as_twice_as_many_do():
-    found = [flow.possible_degrees(n) for n in (1, 2, 3, 4, 5, 6, 9, 10, 40)]
-    assert [usual for usual, *_ in found] == [5, 5, 5, 3, 3, 2, 2, 1, 1]
-    assert [higher for _, *higher in found] == [[6, 7], [6, 7], [6, 7], [4], [], [3], [], [2], []]
-
-
 def test_where_a_degree_leaves_much_the_next_one_is_tried_and_its_terms_that_do_not_matter_are_left_out():
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(5000, 2)), rng.uniform(-1, 1, (5000, 1))
