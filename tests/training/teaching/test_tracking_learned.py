@@ -42,7 +42,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def learned():
-    return learn_tracking(plain_observer(), Noiseless(), steps=200, trajectories=200)
+    return learn_tracking(plain_observer(), Noiseless(), steps=20, trajectories=200)
 
 
 def test_a_linear_flow_is_found_exactly(learned):
