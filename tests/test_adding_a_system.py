@@ -44,11 +44,11 @@ def test_following_the_page_adds_a_system(tmp_path):
         shutil.copytree(ROOT / package, root / package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "examples" / "research", root / "examples" / "research")
     shutil.copy(ROOT / "pyproject.toml", root)
-    command = root / "bin" / "kkl-gym"
-    command.parent.mkdir()
-    command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m training "$@"\n')
-    command.chmod(0o755)
-    (command.parent / "python").symlink_to(sys.executable)
+    (root / "bin").mkdir()
+    for name, called in (("kkl-gym", f'"{sys.executable}" -m training'), ("python", f'"{sys.executable}"')):
+        command = root / "bin" / name
+        command.write_text(f'#!/bin/sh\nexec {called} "$@"\n')
+        command.chmod(0o755)
     path = os.pathsep.join([str(command.parent), os.environ["PATH"]])
     environment = os.environ | {"PATH": path, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
 

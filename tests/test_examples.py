@@ -145,7 +145,7 @@ def test_unstable_plants_as_the_page_says(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (commands,) = re.findall(r"```sh\n(.*?)```", OTHER_PLANTS, re.DOTALL)
     for line in commands.splitlines():
-        do(line, {"train": ["--no-monitor"], "evaluate": ["--noise", "0"]})
+        do(line, {"train": ["--no-monitor"], "evaluate": ["--measurement-noise", "0"]})
     with pytest.raises(SystemExit, match="--policy"):
         main(["evaluate", "runs/balance/cart_pole.safetensors", "--system", "examples/cart_pole.py:CartPole"])
     assert "wrote runs/balance/cart_pole.safetensors" in capsys.readouterr().out.replace("\n", " ")

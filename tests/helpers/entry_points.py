@@ -184,7 +184,7 @@ def environments():
 
 # Observers
 
-PATH = str(Path(observers.__file__).parent / "maps" / f"{observers.shipped()['van_der_pol']}.safetensors")
+PATH = str(Path(observers.__file__).parent / "maps" / "van_der_pol.safetensors")
 ARTIFACT = Artifact.read(PATH)
 Y, U = np.full((5, 1), 0.3), np.full((4, 1), 0.1)
 

@@ -82,11 +82,6 @@ def test_names_are_a_sequence(wrong):
         resolved(wrong, PLAIN, role="measured", source="Env-v0")
 
 
-def test_images_are_refused():
-    with pytest.raises(ValueError, match=r"Env-v0, 'camera', is an image.*encoder"):
-        Reader(KEYED, names("camera[0]", space=KEYED), source="Env-v0")
-
-
 @pytest.mark.parametrize(
     ("name", "info", "told"),
     [

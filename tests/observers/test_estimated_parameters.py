@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kkl_gym import KKLObservation, KKLVectorObservation
-from observers import Artifact, ArtifactError, KKLObserver
+from observers import ArtifactError, KKLObserver
 
 
 def records(artifact, *batch, steps=30):
@@ -96,13 +96,6 @@ def test_parameters_alone_make_no_observer(make_artifact):
 def test_a_map_of_states_alone_is_itself(make_artifact):
     inverse = make_artifact("lorenz").inverse
     assert inverse.part(slice(3)) is inverse
-
-
-def test_files_of_observers_that_estimate_no_parameters_are_of_an_earlier_format(make_artifact, tmp_path):
-    ranged = dataclasses.replace(make_artifact(), parameter_ranges={"mu": (2.0, 4.0)})
-    ranged.save(tmp_path / "ranged.safetensors")
-    assert b'"format":1' in (tmp_path / "ranged.safetensors").read_bytes().replace(b" ", b"").replace(b"\\", b"")
-    assert Artifact.read(tmp_path / "ranged.safetensors").parameter_ranges == {"mu": (2.0, 4.0)}
 
 
 def test_wrappers_show_parameters(saved):

@@ -479,10 +479,10 @@ def test_generalisation_terms():
     expected = (d * (q + 1)) ** 2 + 11 * d * (q + 1) * (t + np.log2(9 * d * (q + 1)))
     assert pseudo_dimension_bound(mlp) == pytest.approx(expected)
     assert generalisation_term(2.0, pseudo_dimension=100, samples=99, delta=0.05) == np.inf
-    new = {"trajectories": 10, "samples": 20, "forward_samples": 700, "inverse_samples": 900}
-    old = {"trajectories": 10, "samples": 20}
-    assert (forward_samples(new), inverse_samples(new)) == (700, 900)
-    assert (forward_samples(old), inverse_samples(old), forward_samples({})) == (200, 200, 0)
+    counted = {"trajectories": 10, "samples": 20, "forward_samples": 700, "inverse_samples": 900}
+    recorded = {"trajectories": 10, "samples": 20}
+    assert (forward_samples(counted), inverse_samples(counted)) == (700, 900)
+    assert (forward_samples(recorded), inverse_samples(recorded), forward_samples({})) == (200, 200, 0)
     by_hand = 2 * np.sqrt(200 * np.log(np.e * 100) / 1e4) + 2 * np.sqrt(np.log(20) / 2e4)
     assert generalisation_term(2.0, pseudo_dimension=100, samples=10_000, delta=0.05) == pytest.approx(by_hand)
 

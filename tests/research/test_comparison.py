@@ -196,7 +196,7 @@ def test_wrong_numbers(tmp_path):
     for wrong, message in (
         ({"systems": ("mine.py:Mine",)}, "no file mine.py"),
         ({"observers": ("rossler",)}, "the observer rossler is for rossler: name one for each of lorenz at most"),
-        ({"observers": ("lorenz", "lorenz-v2")}, "the observer lorenz-v2 is for lorenz"),
+        ({"observers": ("lorenz", "lorenz-small")}, "the observer lorenz-small is for lorenz"),
     ):
         with pytest.raises(ValueError, match=message):
             toy(tmp_path, **wrong).run(Console())

@@ -118,7 +118,7 @@ def test_every_command_takes_a_system_on_the_circle(tmp_path, monkeypatch, capsy
     assert "no limits" not in capsys.readouterr().out
     path = "runs/circle_pendulum/circle_pendulum.safetensors"
     sizes = {
-        "evaluate": "--trajectories 4 --duration 6 --noise 0 --csv errors.csv",
+        "evaluate": "--trajectories 4 --duration 6 --measurement-noise 0 --csv errors.csv",
         "faults": "--trajectories 4 --duration 6 --measurement-noise 0.1",
     }
     for command, small in sizes.items():

@@ -231,7 +231,7 @@ def test_errors_that_grow_with_how_far_the_state_moves_are_found(learned):
 
 
 def test_the_command_writes_it(tmp_path, monkeypatch):
-    console, source = Console(width=200, record=True), tmp_path / "map-v3.safetensors"
+    console, source = Console(width=200, record=True), tmp_path / "map.safetensors"
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
         "training.commands.teaching.read_observers", lambda *_: [("map", plain_observer(), Noiseless())]
