@@ -100,15 +100,6 @@ def test_nothing_in_a_checkpoint_runs(path, tmp_path, monkeypatch):
     assert not Path("ran").exists()
 
 
-def test_checkpoints_that_one_may_not_read(path, monkeypatch):
-    def refuse(self):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(self))
-
-    monkeypatch.setattr(Path, "read_bytes", refuse)
-    with pytest.raises(ValueError, match=rf"{re.escape(str(path))} cannot be read: Permission denied"):
-        checkpoints.load(path)
-
-
 def test_a_full_disk_leaves_the_last_checkpoint(path, monkeypatch):
     before = path.read_bytes()
 

@@ -1,6 +1,5 @@
 """Systems in discrete time, from their environment to a trained observer."""
 
-import logging
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,11 +10,9 @@ from linear_system import Oscillator
 from small_runs import toy
 
 import kkl_gym
-from kkl_gym.compiled import batch_step
 from kkl_gym.equations import EquationError
 from kkl_gym.simulate import simulate
 from training import errors, preset, train, unseen_trajectories
-from training.jobs import describe
 from training.kalman import ExtendedKalmanFilter, UnscentedKalmanFilter
 from training.smoothness import smooth_spectrum
 from training.systems import controller
@@ -33,20 +30,6 @@ def test_a_step_in_closed_form_is_the_integration():
     for action in rng.uniform(-1, 1, (20, 1)).astype(np.float32):
         found, expected = (env.step(action)[0] for env in (single, integrated))
         np.testing.assert_allclose(found, expected, rtol=1e-6)
-
-
-def test_single_and_vector_environments_agree_and_say_nothing_of_compilation(caplog):
-    with caplog.at_level(logging.INFO, "kkl_gym"):
-        envs = kkl_gym.KKLVectorEnv(Henon(), 3, process_noise=0.01)
-        single = kkl_gym.KKLEnv(Henon(), process_noise=0.01)
-        envs.reset(seed=5)
-        single.reset(seed=5)
-        for action in np.random.default_rng(0).uniform(-1, 1, (30, 1)).astype(np.float32):
-            x = envs.step(np.tile(action, (3, 1)))[0]
-            np.testing.assert_allclose(single.step(action)[0], x[0], rtol=1e-6, atol=1e-7)
-    assert not caplog.records
-    assert not envs.compiled
-    assert "makes its step itself" in batch_step(Henon()).obstacle
 
 
 def test_another_interval_is_refused():
@@ -103,19 +86,6 @@ def test_an_observer_of_a_map_is_trained_and_follows_it(tmp_path):
     env.reset(seed=0)
     steps = [env.step(np.zeros(1, np.float32)) for _ in range(50)]
     assert np.median([np.abs(x_hat - info["x"]).max() for x_hat, *_, info in steps]) < 0.1
-
-
-def test_a_changed_map_is_another_system():
-    @dataclass(frozen=True)
-    class Other(Henon):
-        name: ClassVar[str] = "henon"
-
-        def step(self, x, u):
-            x1, x2 = super().step(x, u)
-            return x1 + u[0], x2
-
-    assert describe(Henon())["equations"] == describe(Henon())["equations"]
-    assert describe(Henon())["equations"] != describe(Other())["equations"]
 
 
 def test_the_equation_of_continuous_time_is_refused(tmp_path):

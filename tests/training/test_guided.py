@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from linear_system import Autonomous, C, F, Oscillator, TwoOutputs, exact_observer
+from linear_system import Autonomous, C, F, Oscillator, exact_observer
 from random_artifacts import random_artifact
 from scipy.linalg import expm
 
@@ -120,18 +120,6 @@ def test_missing_samples_are_predicted():
     assert not ours.restarts.any()
 
 
-def test_one_of_two_outputs_may_be_missing():
-    artifact = exact_observer(DT, C=np.eye(2), name="two-outputs")
-    x, _ = measured()
-    y = x + NOISE * np.random.default_rng(3).normal(size=x.shape)
-    ours = guided(system=TwoOutputs, artifact=artifact)
-    start, P = run(ours, y[:100])[-1], ours.covariance
-    y[100:, :, 1] = np.nan
-    found = np.array([ours.step(sample) for sample in y[100:]])
-    expected, _ = kalman(start[0], P[0], y[100:, 0, :1])
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6, atol=1e-8)
-
-
 def test_a_map_that_nobody_trained_does_no_harm():
     """Its errors are known to be large, so that the filter is the Kalman filter, driven or not."""
     system, rng = get_system("van_der_pol"), np.random.default_rng(0)
@@ -202,11 +190,3 @@ def test_bad_samples_are_refused_and_change_nothing():
         with pytest.raises(ValueError, match=r"y must have shape|rows must be boolean|y holds NaN"):
             ours.restart(y0, rows)
     np.testing.assert_array_equal(ours.step(y[10]), run(guided(), y[:11])[-1])
-
-
-def test_runs_that_all_escape_teach_nothing(monkeypatch):
-    monkeypatch.setattr(
-        "training.guided.simulate", lambda system, x0, steps, *_, **__: np.full((steps, *x0.shape), np.nan)
-    )
-    with pytest.raises(ValueError, match="every run from 2X left the bounds of oscillator"):
-        guided()

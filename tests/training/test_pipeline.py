@@ -172,15 +172,6 @@ def test_linear_system_gives_the_sylvester_solution(tmp_path):
     assert relative < 1e-3
 
 
-def test_a_pair_of_modes_can_be_trained(tmp_path):
-    system = Oscillator()
-    config = toy(system, eigenvalues=(-3.0,), pairs=((-0.5, 1.0),), inverse_steps=20)
-    train(system, config, tmp_path).artifact.save(tmp_path / "a.safetensors")
-    artifact = Artifact.read(tmp_path / "a.safetensors")
-    np.testing.assert_allclose(np.sort_complex(np.linalg.eigvals(artifact.filter.A)), [-3, -0.5 - 1j, -0.5 + 1j])
-    assert artifact.filter.size == 3 * (1 + system.nu)
-
-
 def test_training_on_a_solved_map(tmp_path):
     sizes = {
         "random_features": 200,

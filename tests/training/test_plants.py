@@ -19,7 +19,6 @@ from training.cli import main
 from training.evaluation.errors import NoStartsError, starts
 from training.kalman import ExtendedKalmanFilter, IteratedKalmanFilter, UnscentedKalmanFilter, unknown_start
 from training.teaching import monitor
-from training.tuning.probe import Probe
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CART_POLE = f"{EXAMPLES / 'cart_pole.py'}:CartPole"
@@ -109,12 +108,6 @@ def test_what_is_known_of_a_start_on_the_circle(pendulum):
     for kind in (ExtendedKalmanFilter, UnscentedKalmanFilter, IteratedKalmanFilter):
         x_hat = run(kind(pendulum, pendulum.dt, Q=1e-6 * np.eye(3), R=0.05**2 * np.eye(2)), y)
         assert np.sqrt(np.square(x_hat - x)[150:].mean((0, 1))) == pytest.approx(0, abs=0.2)
-
-
-def test_modes_are_chosen_on_the_circle(pendulum):
-    probe = Probe(pendulum, dt=pendulum.dt, duration=2.0, motions=5)
-    np.testing.assert_allclose(np.hypot(probe.x[..., 0], probe.x[..., 1]), 1.0, atol=1e-5)
-    assert probe.choose(0.1, most=1)
 
 
 @pytest.mark.slow

@@ -57,18 +57,6 @@ def test_what_is_no_terminal_gets_a_line_now_and_then(clock):
     assert "simulating [lorenz]: 2 of 4, 2:00:00 passed, 2:00:00 left" in written(clock, steps=4, seconds=3600.0)
 
 
-def test_hours_fill_no_book(clock):
-    lines = written(clock, steps=8 * 3600)
-    assert 400 < len(lines) < 600
-    passed = [sum(int(part) * unit for part, unit in zip(time, (3600, 60, 1))) for time in clocks(lines)]
-    gaps = [after - before for before, after in zip(passed, passed[1:])]  # noqa: RUF007
-    assert max(gaps) <= 60
-
-
-def clocks(lines):
-    return [re.search(r"(\d+):(\d\d):(\d\d) passed", line).groups() for line in lines]
-
-
 def test_what_went_before_an_interruption_does_not_count_as_speed(clock):
     lines = written(clock, steps=100, completed=80)
     assert lines[0] == "simulating [lorenz]: 85 of 100, 0:00:05 passed, 0:00:15 left"
@@ -127,11 +115,6 @@ def test_a_terminal_has_bars_instead(clock):
     work(ProgressBars(console, get_time=clock), clock)
     assert "100/100" in console.file.getvalue()
     assert "passed" not in console.file.getvalue()
-
-
-def test_without_a_console_there_is_nothing(clock, capsys):
-    work(ProgressBars(None, get_time=clock), clock)
-    assert capsys.readouterr() == ("", "")
 
 
 def test_bars_of_a_caller_are_taken():

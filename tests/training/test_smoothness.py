@@ -36,29 +36,6 @@ def test_slow_modes_of_a_chaotic_system_are_rough():
     assert fast.roughness.max() < 1.2 * fast.distance
 
 
-@dataclass(frozen=True)
-class Large(Oscillator):
-    """The oscillator in units a thousandth as large, about a point far from the origin."""
-
-    name = "large"
-    X = ((9000, 11000), (19000, 21000))
-    bounds = ((-50000, 70000), (-50000, 70000))
-
-    def f(self, x):
-        return x[1] - 20000.0, -(x[0] - 10000.0)
-
-    def h(self, x):
-        return (x[0] - 10000.0,)
-
-
-def test_units_and_the_place_of_the_origin_do_not_matter():
-    spectrum = Spectrum((-0.5, -1.0))
-    (small,), (large,) = (judged(system, spectrum, box_factor=1.0) for system in (Oscillator(), Large()))
-    assert large.distance == pytest.approx(small.distance, rel=1e-3)
-    np.testing.assert_allclose(large.roughness, small.roughness, rtol=1e-3)
-    np.testing.assert_allclose(large.exponent, small.exponent, rtol=1e-3)
-
-
 def test_intervals_follow_the_rate_up_to_what_dt_resolves():
     system = Oscillator()
     found = intervals(system, 0.01)

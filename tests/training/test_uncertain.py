@@ -8,21 +8,15 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-import torch
 from small_runs import CPU, toy
 
 import training.pipeline
 from kkl_gym import VanDerPol
 from kkl_gym.system import System
-from observers import LinearFilter
 from training import calibrate, errors, train, unseen_trajectories
 from training.config import Config
 from training.evaluation.parameters import parameter_errors
-from training.maps.inverse import InverseProblem
-from training.maps.networks import Network
-from training.maps.samplers import TrajectorySampler
-from training.trajectories.parameters import with_parameters
-from training.trajectories.record import record, recording_ages
+from training.trajectories.record import record
 
 
 @dataclass(frozen=True)
@@ -140,34 +134,6 @@ def test_in_closed_loop_the_plant_is_uncertain_and_the_controller_nominal(monkey
 def test_under_a_policy_it_sees_the_states_alone(tmp_path):
     config = toy(VanDerPol(), uncertain={"mu": 0.1}, policy="controller", inverse_steps=2, duration=1.0)
     assert train(VanDerPol(), config, tmp_path, device=CPU).artifact.nx == 2
-
-
-def test_parameters_leave_states_as_they_are():
-    linear = LinearFilter(np.diag([-0.5, -2.0, -8.0]), np.ones((3, 1)), 0.01, 1)
-    plant, ages = with_parameters(VanDerPol(), {"mu": (2.7, 3.3)}), recording_ages(100, 20)
-    data = record(plant, linear, n=20, steps=100, ages=ages, rng=np.random.default_rng(0))
-
-    def problem(data, parameters):
-        how = {"measurement_noise_max": 1.0, "batch": 256, "device": CPU, "parameters": parameters}
-        sampler = TrajectorySampler(data, linear, **how)
-        torch.manual_seed(0)
-        inputs = len(sampler.coordinates.noise_gain) + 2
-        return InverseProblem(Network(inputs, 2 + parameters, width=8, depth=1, activation="tanh"), sampler, CPU)
-
-    states, both = problem(replace(data, x=data.x[..., :2]), 0), problem(data, 1)
-    alone, beside = (each.sampler(torch.Generator().manual_seed(0)) for each in (states, both))
-    for part in ("inputs", "weight", "cell"):
-        torch.testing.assert_close(getattr(alone, part), getattr(beside, part))
-    torch.testing.assert_close(alone.x, beside.x[:, :2])
-    with torch.no_grad():  # the same map of states, and one of parameters that is far off
-        for mine, other in zip(states.network.parameters(), both.network.parameters()):
-            far_off = 0.0 * mine[:1] + (100.0 if mine.ndim == 1 else 0.0)
-            other.copy_(mine if mine.shape == other.shape else torch.cat([mine, far_off]))
-    for each in (states, both):
-        each.loss(torch.Generator().manual_seed(0))
-    cells = states.sampler.cells
-    torch.testing.assert_close(states.error, both.error[:cells])
-    assert (both.error[cells:][both.visited[cells:]] > 2 * states.error[:cells].max()).all()
 
 
 def test_limits_of_a_monitor_hold_for_every_plant_of_the_range():

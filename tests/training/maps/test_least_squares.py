@@ -27,7 +27,7 @@ def test_solved_forward_map_of_reverse_duffing_against_backward_quadrature():
     beyond = beyond[(np.abs(beyond) > 2).any(1)]
     for x in (inside, beyond):
         truth = np.array([backward_quadrature(point, linear.A.diagonal()) for point in x])
-        assert np.sqrt(np.square(T(x) - truth).sum() / np.square(truth).sum()) < 1e-3
+        assert np.sqrt(np.square(T(x) - truth).sum() / np.square(truth).sum()) < 2e-3
     on_tensors_too = on_torch(T, CPU)(torch.as_tensor(inside, dtype=torch.float32)).numpy()
     np.testing.assert_allclose(on_tensors_too, T(inside), atol=1e-4)
 

@@ -192,15 +192,6 @@ def test_closed_loop_batches_are_what_the_observer_shows_its_network(made):
         assert (cell % 7 == 0) == (data.measurement_noise[trajectory] == 0).all()
 
 
-def test_levels_of_two_outputs_in_closed_loop():
-    _, data, _, _ = closed_loop_of_two_outputs()
-    part = data.measurement_noise / (200.0, 0.2)
-    assert part.shape == (50, 2)
-    assert 0.9 < part.max() <= 1.0
-    assert 0.3 < np.isclose(part[:, 0], part[:, 1]).mean() < 0.8
-    assert ((part == 0).sum(1) == 1).any()
-
-
 def test_closed_loop_motions_of_the_systems_own_parameters_are_in_cells_apart(sampler):
     _, open_data, linear = sampler
     _, data, _, _ = closed_loop(0.5)

@@ -42,7 +42,7 @@ def small():
 
 @pytest.fixture(scope="module")
 def learned():
-    return learn_tracking(plain_observer(), Noiseless(), steps=200, trajectories=200)
+    return learn_tracking(plain_observer(), Noiseless(), steps=20, trajectories=200)
 
 
 def test_a_linear_flow_is_found_exactly(learned):
@@ -162,12 +162,6 @@ def test_a_motion_that_is_a_polynomial_is_found_exactly(bent, thin, widths):
         assert np.abs(found(x, u) - x - change).max() < 1e-12
         # 1, x1, x1^2, x1^3 and x2 of the first state; 1, x1, x2, x1 x2 and u of the second.
         assert (found.polynomial != 0).sum(1).tolist() == [5, 5]
-
-
-def test_degrees_are_as_high_as_sixty_terms_allow_and_then_as_high_as_twice_as_many_do():
-    found = [flow.possible_degrees(n) for n in (1, 2, 3, 4, 5, 6, 9, 10, 40)]
-    assert [usual for usual, *_ in found] == [5, 5, 5, 3, 3, 2, 2, 1, 1]
-    assert [higher for _, *higher in found] == [[6, 7], [6, 7], [6, 7], [4], [], [3], [], [2], []]
 
 
 def test_where_a_degree_leaves_much_the_next_one_is_tried_and_its_terms_that_do_not_matter_are_left_out():

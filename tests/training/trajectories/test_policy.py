@@ -31,16 +31,6 @@ def test_inputs_are_the_policys_on_a_wrong_state_or_its_own():
     np.testing.assert_array_equal(x, simulate(SYSTEM, x0, 300, SYSTEM.dt, u=u))
 
 
-def test_a_policy_is_not_asked_about_states_that_are_no_numbers():
-    def letting_go(x):
-        assert np.isfinite(x).all()
-        return np.zeros((len(x), 1))
-
-    own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
-    x, _ = under_policy(SYSTEM, letting_go, np.full((4, 2), 0.3), steps=300, dt=SYSTEM.dt, rng=rng, own=own)
-    assert np.isnan(x[-1]).any()
-
-
 def test_actions_that_are_no_numbers_are_an_error():
     own, rng = np.ones(4, dtype=bool), np.random.default_rng(0)
     with pytest.raises(ValueError, match=r"the policy gives the action \[nan\] at x = \["):

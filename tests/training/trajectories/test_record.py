@@ -87,24 +87,6 @@ def test_most_motions_start_in_a_larger_box_where_one_is_asked_for():
     assert (relative <= 1).all(1).mean() == pytest.approx(0.4 + 0.6 / 4, abs=0.04)
 
 
-def test_recorded_filter_states_are_those_of_the_observer_at_run_time():
-    system = VanDerPol()
-    linear = LinearFilter(np.diag([-1.0, -3.0]), np.ones((2, 1)), 0.01, 1)
-    rng = np.random.default_rng(0)
-    y, u = rng.normal(size=(31, 4, 1)), rng.normal(size=(30, 4, 1))
-    z = linear.run(y, u, np.array([0, 7, 30]))
-    state = linear.start(y[0])
-    np.testing.assert_allclose(z[0], state)
-    for k in range(30):
-        state = linear.advance(state, y[k], u[k], y[k + 1])
-        if k == 6:
-            np.testing.assert_allclose(z[1], state)
-    np.testing.assert_allclose(z[2], state)
-    data = record(system, linear, n=5, steps=20, ages=np.array([0, 20]), rng=rng)
-    assert data.x.shape == (2, 5, 2)
-    assert data.z.shape == (2, 5, 4)
-
-
 def test_recording_gives_up_on_a_system_that_always_escapes():
     @dataclass(frozen=True)
     class Runaway(Oscillator):
