@@ -49,9 +49,9 @@ class KKLObserver:
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
         Whether single samples run compiled by Numba (the extra ``fast``), in a third of the time, or a twentieth where
-        the observer tracks; compilation takes seconds. True compiles here, such as before a loop in real time, and
-        after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree to
-        rounding. Batches of 128 rows or more always use Numba where it is installed.
+        the observer tracks; compilation takes seconds, once. True compiles here, such as before a loop in real time,
+        and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
+        to rounding. Batches of 128 rows or more always use Numba where it is installed.
 
     Raises
     ------
@@ -495,7 +495,7 @@ class KKLObserver:
             As :attr:`covariance`, which also raises the same.
         """
         if self._tracker is not None:  # its artifact has error bars
-            z = self.z
+            z, _ = self._moment(None)  # not a copy: the tracker knows by it whether T_inv was asked already
             covariance = self._tracker.covariance(z, self._age)
             return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
         self.artifact.require_spread()

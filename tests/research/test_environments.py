@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+from examples.research.environments.command import COLUMNS, unusual
+from examples.research.environments.comparison import KINDS, RANDOM, Case, planned
+from examples.research.environments.tables import cell, write_table
 from rich.console import Console
 from small_agents import make_small
 
 from examples.research.agents.command import Compare
-from examples.research.environments.command import COLUMNS, unusual
-from examples.research.environments.comparison import KINDS, RANDOM, Case, planned
-from examples.research.environments.tables import cell, write_table
 from training.agents.any_environment.learning import hyperparameters, settings_of
 from training.agents.any_environment.task import HIDDEN_VELOCITIES
 from training.commands.environment import EnvironmentOptions

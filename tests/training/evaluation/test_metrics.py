@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from training import nrmse, smape
-from training.evaluation.metrics import percentage_error
+from training.evaluation.metrics import component_smape, percentage_error, rmse, settling_time
 
 
 def test_smape_by_hand():
@@ -69,3 +69,17 @@ def test_one_norm_of_mixed_units_says_nothing_of_the_small_state():
     x_hat[..., 1] += 0.02e-3 * np.cos(t)
     assert smape(x, x_hat)[0] == pytest.approx(0.01, rel=0.01)
     assert nrmse(x, x_hat)[0] == pytest.approx([100 * 0.03 / (20 / np.sqrt(2)), 2.0])
+
+
+def test_all_other_measures_by_hand():
+    x = np.array([[[3.0, 4.0]], [[3.0, 4.0]], [[3.0, 4.0]], [[0.0, 0.0]]])
+    x_hat = np.array([[[0.0, 0.0]], [[3.0, 0.0]], [[3.0, 4.0]], [[0.0, 0.0]]])
+    assert smape(x, x_hat) == pytest.approx([100 * (2 + 2 * 4 / 8 + 0 + 0) / 4])
+    assert smape(x, x_hat, skip=1) == pytest.approx([100 * (2 * 4 / 8 + 0 + 0) / 3])
+    assert component_smape(x, x_hat) == pytest.approx([100 * (2 + 2 + 0 + 2 + 0 + 0 + 0 + 0) / 8])
+    assert rmse(x, x_hat) == pytest.approx([math.sqrt((25 + 16) / 4)])
+    # The root mean square of |x| is sqrt(75 / 4); errors 5 and 4 are above a tenth of it, 0 is below.
+    assert settling_time(x, x_hat, dt=0.5) == pytest.approx([1.0])
+    assert settling_time(x, x[::-1], dt=0.5) == pytest.approx([math.inf])
+    x_hat[3, 0, 0] = np.nan
+    assert (smape(x, x_hat)[0] > 50.0, rmse(x, x_hat).tolist()) == (True, [math.inf])
