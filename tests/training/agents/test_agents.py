@@ -226,7 +226,7 @@ def test_hyperparameters(script):
         learn(lorenz, "y", None, timesteps=0)
 
 
-def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
+def test_a_recurrent_policy_remembers_within_an_episode(tmp_path):
     policy = learn_recurrent(TASK, "y", tmp_path, timesteps=1)
     obs = np.ones((3, 2), np.float32)  # y and the action before
     first = policy()

@@ -66,7 +66,7 @@ def seeds(monkeypatch):
 
 
 @pytest.mark.parametrize(("algorithm", "rollouts"), [("ppo", 2), ("sac", 130)])
-def test_nothing_but_the_episodes_begins_anew(algorithm, rollouts, tmp_path, saves, seeds):
+def test_all_but_the_episodes_goes_on(algorithm, rollouts, tmp_path, saves, seeds):
     timesteps = (rollouts + 1) * ROLLOUT[algorithm]
 
     def go_on(folder, resume=True):

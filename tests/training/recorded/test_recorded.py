@@ -103,7 +103,7 @@ def test_the_rate_of_signals_is_their_angular_frequency():
 
 
 def test_signals_that_stand_still_in_each_record(tmp_path):
-    """They do not slow the filter down, and an error relative to no spread is none."""
+    """They do not slow the filter down, and have no relative error."""
     signals = replace(SIGNALS, measured=("position", "target"), hidden=("speed", "mass"))
     records = []
     for seed in range(6):
