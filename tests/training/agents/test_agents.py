@@ -8,7 +8,6 @@ from dataclasses import replace
 import linear_system
 import numpy as np
 import pytest
-import torch
 from linear_system import Oscillator
 from PIL import Image
 from stable_baselines3 import PPO, SAC
@@ -19,7 +18,7 @@ from observers.names import resolve
 from training import figures
 from training.agents import picture
 from training.agents.agent import Agent, AgentError, fingerprint, rules
-from training.agents.cost import WORST, Cost
+from training.agents.cost import WORST, paid
 from training.agents.information import observer_of
 from training.agents.learn import hyperparameters, learn, learn_recurrent
 from training.agents.play import play
@@ -202,55 +201,29 @@ def test_shipped_files_are_written_again_as_they_are(name, tmp_path):
     assert os.listdir(tmp_path / "new") == ["agent.safetensors"]
 
 
-def test_an_interrupted_save_leaves_nothing_behind(tmp_path, monkeypatch):
-    def fail(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(KeyboardInterrupt):
-        Agent.read(find("lorenz")).save(tmp_path / "agent.safetensors")
-    assert not os.listdir(tmp_path)
-
-
-def test_rewards_are_minus_the_cost_and_escaping_never_pays():
-    task = ControlTask("rossler", period=0.05, duration=20.0, start_box=((-44, -44), (-17, -17), (212, 212)))
-    ours, bare = Cost(task.make(1), task), task.make(1)
-    ours.reset(seed=0)
-    bare.reset(seed=0)
-    rewards = []
-    for _ in range(task.steps):
-        _, reward, terminated, _, info = ours.step(np.zeros((1, 1)))
-        _, total, *_ = bare.step(np.zeros((1, 1)))
-        rewards.append(reward[0])
-        if terminated[0]:
-            break
-        assert reward[0] == pytest.approx(-min((task.repeat / total[0] - 1) / 4, WORST))
-    assert terminated[0]
-    done = len(rewards)
-    assert done == np.ceil(info["final_info"]["sample"][0] / task.repeat)
-    assert rewards[-1] == -WORST * (task.steps - done + 1)  # as if it stayed there
+def test_pay_is_minus_the_cost_and_escaping_never_pays():
+    """An action has five samples, whose rewards are 1 / (1 + 4 c); the second one of the third action escapes."""
+    task, cost = ControlTask("rossler", period=0.05, duration=20.0), np.array([0.0, 0.3, 2 * WORST])
+    total = task.repeat / (1 + 4 * cost)
+    np.testing.assert_allclose(paid(task, total, 15, False), [0.0, -0.3, -WORST], atol=1e-12)
+    escaped = paid(task, 0.4 * total, 12, True)
+    np.testing.assert_allclose(escaped, np.array([0.0, -0.3, -WORST]) * (1 + task.steps - 3), atol=1e-9)
 
 
-def test_hyperparameters():
-    assert hyperparameters(TASKS["reverse_duffing"])[0] == "sac"
-    assert hyperparameters(TASKS["lorenz"])[0] == "ppo"
-    assert hyperparameters(TASKS["reverse_duffing"], "ppo")[0] == "ppo"
+def test_hyperparameters(script):
+    own = ControlTask(f"{script}:Pendulum")  # which gets the defaults
+    duffing, lorenz = TASKS["reverse_duffing"], TASKS["lorenz"]
+    assert [hyperparameters(task)[0] for task in (duffing, lorenz, own)] == ["sac", "ppo", "ppo"]
+    assert hyperparameters(duffing, "ppo")[0] == "ppo"
+    assert hyperparameters(own, "sac") == hyperparameters(lorenz, "sac") == hyperparameters(duffing)
     for algorithm in ("ppo", "sac", "ppo_lstm"):  # any of them for any system
-        for task in TASKS.values():
-            assert hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000
-    assert hyperparameters(TASKS["lorenz"], "sac") == hyperparameters(TASKS["reverse_duffing"])
+        assert all(hyperparameters(task, algorithm)[1]["n_timesteps"] >= 100_000 for task in TASKS.values())
     with pytest.raises(ValueError, match="unknown algorithm 'dqn'"):
-        hyperparameters(TASKS["lorenz"], "dqn")
+        hyperparameters(lorenz, "dqn")
     with pytest.raises(ValueError, match="algorithm must be one of ppo, sac"):
-        learn(TASKS["lorenz"], "y", None, algorithm="ppo_lstm")
+        learn(lorenz, "y", None, algorithm="ppo_lstm")
     with pytest.raises(ValueError, match="timesteps must be positive"):
-        learn(TASKS["lorenz"], "y", None, timesteps=0)
-
-
-def test_own_systems_get_the_defaults(script):
-    task = ControlTask(f"{script}:Pendulum")
-    assert hyperparameters(task)[0] == "ppo"
-    assert hyperparameters(task, "sac") == hyperparameters(TASKS["reverse_duffing"])
+        learn(lorenz, "y", None, timesteps=0)
 
 
 def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
@@ -265,15 +238,10 @@ def test_a_recurrent_policy_remembers_and_begins_anew(tmp_path):
 
 
 @pytest.mark.slow
-def test_an_agent_learns():
+def test_an_agent_learns(tmp_path):
     """Half a minute of PPO on the full state of Van der Pol."""
-    import tempfile
-    from pathlib import Path
-
-    torch.set_num_threads(2)
     task = TASKS["van_der_pol"]
-    with tempfile.TemporaryDirectory() as folder:
-        agent = learn(task, "state", Path(folder), timesteps=200_000)
+    agent = learn(task, "state", tmp_path, timesteps=200_000)
     x = play(agent.make(50), agent, steps=task.steps, seed=0).x
     assert scores(get_system(task.system), x).mean() > -0.25
 
@@ -283,18 +251,18 @@ def test_pictures_show_states_outputs_and_inputs(learned, tmp_path, monkeypatch)
     drawn = []
     monkeypatch.setattr(figures, "save", lambda path, figure: drawn.append(figure))
     agent, _ = learned
-    episodes = play(agent.make(2), agent, steps=TASK.steps, seed=0)
+    episodes = play(agent.make(1), agent, steps=TASK.steps, seed=0)
     picture.draw(TASK, episodes, tmp_path / "a.png")
     (figure,) = drawn
-    axes = np.reshape(figure.axes, (4, 2))
-    assert [ax.get_ylabel() for ax in axes[:, 0]] == ["x1", "x2", "y", "u"]
-    for i in range(2):
-        found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in axes[:, i]]
-        for j in range(2):
-            np.testing.assert_array_equal(found[j]["state"], episodes.x[:, i, j])
-            np.testing.assert_array_equal(found[j]["estimate"], episodes.x_hat[:, i, j])
-        np.testing.assert_array_equal(found[2]["measured output"], episodes.y[:, i, 0])
-        np.testing.assert_array_equal(found[3]["input"], episodes.u[:, i, 0])
+    assert [ax.get_ylabel() for ax in figure.axes] == ["x1", "x2", "y", "u"]
+    found = [{line.get_label(): line.get_ydata() for line in ax.lines} for ax in figure.axes]
+    for row, label, values in (
+        (0, "state", episodes.x[:, 0, 0]),
+        (1, "estimate", episodes.x_hat[:, 0, 1]),
+        (2, "measured output", episodes.y[:, 0, 0]),
+        (3, "input", episodes.u[:, 0, 0]),
+    ):
+        np.testing.assert_array_equal(found[row][label], values)
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()
     assert -10 < box.x0 < box.x1 < figure.bbox.x1 + 10

@@ -64,21 +64,15 @@ def test_stacked_observations_hold_actions_and_begin_with_the_first():
     np.testing.assert_array_equal(show(PENDULUM, "recurrent").reset(seed=0)[0], [*y0, 0])
 
 
-def test_a_task_says_how_long_memories_and_stacks_are():
+def test_a_task_says_what_memories_and_stacks_hold():
     task = replace(PENDULUM, time_constants=(1, 2), frames=4)
     assert show(task, "stacked").observation_space.shape == (4 * 3,)
-    z = show(task, "z")
-    assert z.observation_space.shape == (2 + 2 * 2 + 2,)
-    assert z.get_wrapper_attr("spec").additional_wrappers[-1].kwargs["time_constants"] == (1.0, 2.0)
-
-
-def test_past_actions_can_be_left_out():
+    assert show(task, "z").observation_space.shape == (2 + 2 * 2 + 2,)
     z, stacked = (show(replace(CART, past_actions=False), kind) for kind in ("z", "stacked"))
     assert z.observation_space.shape == (2 + 2 * 4,)
     seen = [z.reset(seed=0)[0], *(z.step(action)[0] for action in (0, 1, 1))]
     shown = [stacked.reset(seed=0)[0], *(stacked.step(action)[0] for action in (0, 1, 1))]
     outputs = np.array(seen)[:, :2]
-    np.testing.assert_array_equal(shown[0], np.tile(outputs[0], 8))
     np.testing.assert_array_equal(shown[-1].reshape(8, 2), [*[outputs[0]] * 4, *outputs])
     assert shown[-1] in stacked.observation_space
 
@@ -103,27 +97,24 @@ def test_agents_on_memories_and_stacks_can_be_told_of_angles():
     assert abs(turned[-1]) > 2 * np.pi
 
 
-@pytest.mark.parametrize("nothing", [[0, 0], [np.nan, 0]])
-def test_stacks_of_angles_outlive_samples_without_one(nothing):
+def test_stacks_of_angles_outlive_samples_without_one():
     class Blind(gym.Env):
         observation_space = gym.spaces.Box(-1, 1, (2,))
-        action_space = gym.spaces.Box(-1, 1, (1,))
+        action_space = gym.spaces.Box(-1, 1, (2,))
         seen = np.float32([1, 0])
 
         def reset(self, *, seed=None, options=None):
             return self.seen, {}
 
         def step(self, action):
+            self.seen[:] = action  # a buffer that is filled again
             return self.seen, 0.0, False, False, {}
 
     env = Stacked(Blind(), 3, [(0, 1)], actions=False)
     env.reset()
-    env.unwrapped.seen = np.float32(nothing)
-    env.step(np.zeros(1))
-    env.unwrapped.seen = np.float32([0, 1])
-    np.testing.assert_allclose(env.step(np.zeros(1))[0], [np.pi / 2, np.pi / 2, 0, 1], atol=1e-6)
-    env.unwrapped.seen[:] = [-1, 0]  # a buffer that is filled again
-    np.testing.assert_allclose(env.step(np.zeros(1))[0], [np.pi, np.pi / 2, -1, 0], atol=1e-6)
+    shown = [env.step(seen)[0] for seen in ([0, 0], [np.nan, 0], [0, 1], [-1, 0])]
+    np.testing.assert_allclose(shown[2], [np.pi / 2, np.pi / 2, 0, 1], atol=1e-6)
+    np.testing.assert_allclose(shown[3], [np.pi, np.pi / 2, -1, 0], atol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from observers import Artifact
 from training.agents.any_environment import observing
 from training.agents.any_environment.information import show
 from training.agents.any_environment.learning import ALGORITHMS, hyperparameters, learn_to_play, settings_of
-from training.agents.any_environment.observing import KKL, Told, learn_observer, wander
+from training.agents.any_environment.observing import KKL, Told, learn_observer
 from training.agents.any_environment.player import Player
 from training.agents.any_environment.task import HIDDEN_VELOCITIES, HiddenTask
 from training.progress import ProgressBars
@@ -98,10 +98,10 @@ def test_an_agent_on_estimates_is_told_the_truth_until_there_are_some(tmp_path, 
 @pytest.mark.parametrize(
     ("task", "algorithm", "timesteps", "aggregate", "told"),
     [
-        (CART, "ppo", 1600, 1, 1440 + 2),  # it stops with the first step of what it would collect next
+        (CART, "ppo", 320, 1, 288 + 2),  # it stops with the first step of what it would collect next
         (CART, "ppo", 98, 0, 64 + 2),  # the third time is with estimates
         (PENDULUM, "sac", 97, 1, 87 + 1),
-        (NOISY_CART, "ppo", 1600, 1, 160),
+        (NOISY_CART, "ppo", 320, 1, 32),
     ],
 )
 def test_who_is_told_the_truth_how_long(tmp_path, small, task, algorithm, timesteps, aggregate, told):
@@ -139,21 +139,17 @@ def test_refits_are_to_what_the_agent_did_before_too(tmp_path, small):
 def test_an_observer_is_learned_from_the_latest_steps(monkeypatch):
     def played():
         told = Told(CART, 2)
-        for row, env in enumerate([told.make(), told.make()]):
-            play_at_random(env, 200, seed=row)
-        return told.records()
+        for env in (told.make(), told.make()):
+            play_at_random(env, 200)
+        return [record.fingerprint for record in told.records()], steps_of(told.records())
 
-    everything = played()
-    assert steps_of(everything) == 400
+    everything, steps = played()
     monkeypatch.setattr(observing, "KEPT", 100)
-    latest = {record.fingerprint for record in played()}
-    ends = np.cumsum([len(record.t) - 1 for record in everything])
-    half = int(np.searchsorted(ends, 200)) + 1
-    assert ends[half - 1] == 200
-    for row in (everything[:half], everything[half:]):
-        kept = [record for record in row if record.fingerprint in latest]
-        assert kept == row[-len(kept) :]
-        assert steps_of(kept[1:]) < 50 <= steps_of(kept)
+    latest, fewer = played()
+    assert steps == 400
+    assert 100 <= fewer < 200
+    half, kept = len(everything) // 2, len(latest) // 2  # of each environment
+    assert latest == [*everything[half - kept : half], *everything[-kept:]]
 
 
 @pytest.mark.parametrize("task", [CART, PENDULUM], ids=["no bounds", "bounds"])
@@ -170,15 +166,11 @@ def test_what_is_told_stands_where_estimates_will(tmp_path, small, task):
     np.testing.assert_allclose(truth, np.concatenate([info["y"], info["x"]]), rtol=1e-6)
 
 
-def test_the_filter_settles_in_an_episode_that_is_trained_on(tmp_path, small):
-    """Of these few random steps the longest episode is held out."""
-    records = wander(NOISY_CART, 600, seed=5, progress=QUIET)
-    assert learn_observer(NOISY_CART, records, tmp_path, seed=5, progress=QUIET).exists()
-
-
 @pytest.mark.parametrize("task", [CART, NOISY_CART])
-def test_short_episodes_at_the_end_are_no_error(tmp_path, small, task):
-    learn_to_play(task, "x_hat", tmp_path, algorithm="dqn", timesteps=600, observer_steps=300, aggregate=1)
+def test_short_episodes_are_no_error(tmp_path, small, task):
+    """Neither at the end nor where the longest one is held out, as of this seed."""
+    options = {"algorithm": "dqn", "timesteps": 600, "observer_steps": 300, "aggregate": 1, "seed": 11}
+    learn_to_play(task, "x_hat", tmp_path, **options)
     player = Player.read(tmp_path / "agent.safetensors")
     assert player.observer == str(tmp_path / "observer.safetensors")
     assert player.make().reset(seed=0)[0].shape == (4,)

@@ -1,14 +1,13 @@
 """Parameters and observers from records of outputs."""
 
 import json
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import pytest
+from spring import Spring
 
 from kkl_gym.simulate import simulate
-from kkl_gym.system import System
 from kkl_gym.systems import Lorenz, ReverseDuffing, VanDerPol
 from observers import Artifact, KKLObserver
 from training.identification import adapt, estimate_parameters, identify
@@ -20,30 +19,6 @@ from training.records import Record
 from training.trajectories.signals import random_inputs
 
 SMALL = {"trajectories": 40, "samples": 40, "inverse_steps": 60, "width": 16, "depth": 1, "batch": 256}
-
-
-@dataclass(frozen=True)
-class Spring(System):
-    """A damped spring with a force."""
-
-    stiffness: float = 4.0
-    damping: float = 0.3
-    gain: float = 2.0
-
-    name: ClassVar[str] = "spring"
-    X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
-    bounds: ClassVar = ((-9.0, 9.0), (-30.0, 30.0))
-    u_max: ClassVar = (1.0,)
-    dt: ClassVar = 0.05
-
-    def f(self, x):
-        return x[1], -self.stiffness * x[0] - self.damping * x[1]
-
-    def g(self, x):
-        return (0.0,), (self.gain,)
-
-    def h(self, x):
-        return (x[0],)
 
 
 class HiddenSigns(Lorenz):
@@ -173,42 +148,27 @@ def test_identified_and_adapted_observers(tmp_path):
     assert np.isfinite(x_hat).all()
 
 
-@pytest.mark.parametrize(
-    ("unknown", "message"),
-    [
-        ({}, "name a parameter"),
-        ({"nu": (0.0, 1.0)}, "no parameter 'nu'"),
-        ({"mu": (4.0, 5.0)}, "between finite limits, got 3 in 4.0 to 5.0"),
-        ({"mu": (0.0, float("inf"))}, "between finite limits, got 3 in 0.0 to inf"),
-    ],
-)
-def test_unknowns_that_make_no_sense(unknown, message, tmp_path):
-    with progress_bars(None) as progress, pytest.raises(ValueError, match=message):
-        estimate_parameters(VanDerPol(), unknown, records(VanDerPol(), 2, seconds=3), tmp_path, progress=progress)
-
-
-def test_records_that_do_not_fit_the_system(tmp_path):
+def test_what_makes_no_sense(tmp_path):
     (free,), (driven,) = records(Spring(), 1, seconds=3), records(Spring(), 1, seconds=3, driven=True)
     doubled = Record("doubled", free.t, np.hstack([free.y, free.y]))
-    for given, message in (
-        ([], "there is no record"),
-        ([doubled], "spring has 1 measured, but the columns are y1, y2"),
-        ([free, driven], "inputs are columns u1, but none in"),
+    stiffness = {"stiffness": (1.0, 9.0)}
+    for unknown, given, message in (
+        ({}, [free], "name a parameter"),
+        ({"mass": (0.0, 1.0)}, [free], "no parameter 'mass'"),
+        ({"stiffness": (5.0, 6.0)}, [free], "between finite limits, got 4 in 5.0 to 6.0"),
+        ({"stiffness": (0.0, float("inf"))}, [free], "between finite limits, got 4 in 0.0 to inf"),
+        (stiffness, [], "there is no record"),
+        (stiffness, [doubled], "spring has 1 measured, but the columns are y1, y2"),
+        (stiffness, [free, driven], "inputs are columns u1, but none in"),
     ):
-        with pytest.raises(ValueError, match=message):
-            found(Spring(), {"stiffness": 4.0}, given, tmp_path)
+        with progress_bars(None) as progress, pytest.raises(ValueError, match=message):
+            estimate_parameters(Spring(), unknown, given, tmp_path, progress=progress)
 
 
 def test_a_parameter_at_its_limit_is_told(tmp_path):
+    measured, limits = records(Spring(), 2, seconds=8, noise=0.05), {"stiffness": (3.0, 3.7)}
     with progress_bars(None) as progress:
-        got = estimate_parameters(
-            Spring(3.5),
-            {"stiffness": (3.0, 3.7)},
-            records(Spring(), 2, seconds=8, noise=0.05),
-            tmp_path,
-            progress=progress,
-            steps=1,
-        )
+        got = estimate_parameters(Spring(3.5), limits, measured, tmp_path, progress=progress, steps=1)
     assert got.at_limits == ("stiffness",)
     assert "stiffness is at its limit: give it a wider range" in got.told()
     assert "fewer than 20 windows" in " ".join(got.told())

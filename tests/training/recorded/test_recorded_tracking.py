@@ -119,15 +119,12 @@ def test_increments_are_between_samples_that_are_known(plain):
 
 def test_outputs_are_sums_of_states_or_an_error(records):
     rng, run = np.random.default_rng(0), records[0]
-    noisy = replace(run, y=run.y + 0.01 * rng.standard_normal(run.y.shape))
-    C, least = linear_output([noisy])
-    np.testing.assert_allclose(C, [[1.0, 0.0]], atol=2e-3)
-    assert least == pytest.approx(0.01, rel=0.1)
-    loud = replace(run, y=run.y + 0.3 * rng.standard_normal(run.y.shape))
-    loud.y[5] = 1e3  # and one sample is wrong
-    C, least = linear_output([loud])
-    np.testing.assert_allclose(C, [[1.0, 0.0]], atol=0.05)
-    assert least == pytest.approx(0.3, rel=0.1)
+    for noise, off in ((0.01, 2e-3), (0.3, 0.05)):
+        noisy = replace(run, y=run.y + noise * rng.standard_normal(run.y.shape))
+        noisy.y[5] = 1e3 if noise == 0.3 else noisy.y[5]  # one sample is wrong
+        C, least = linear_output([noisy])
+        np.testing.assert_allclose(C, [[1.0, 0.0]], atol=off)
+        assert least == pytest.approx(noise, rel=0.1)
     for other in (run.y**2, run.y + 3.0, rng.standard_normal(run.y.shape)):
         with pytest.raises(ValueError, match=r"position cannot be told as a sum of position, speed"):
             linear_output([replace(run, y=other)])
