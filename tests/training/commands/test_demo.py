@@ -75,8 +75,7 @@ def test_the_policy_of_its_training_acts(tmp_path):
         play(environment, 2000, 0.1, seed=0)
 
 
-def test_what_a_policy_returns_and_how_long_it_takes(saved):
-    """Actions of any type count as numbers; the time of a step is not the policy's."""
+def test_actions_of_any_type_count_as_numbers_and_the_time_of_a_step_is_not_the_policys(saved):
     (environment,) = shown(OWN, saved(system=OWN, dt=0.02))
     episode = play(environment, 10, 0.1, seed=0, policy=f"{__file__}:slow_switch")
     assert len(episode.x) == 11

@@ -12,16 +12,9 @@ from kkl_gym import System, VanDerPol, get_system
 from kkl_gym.simulate import advance_batch
 from observers import KKLObserver
 from training import errors, unseen_trajectories
-from training.evaluation.errors import kalman_errors, measured, starts
+from training.evaluation.errors import kalman_errors, measured
 from training.evaluation.plants import off_by, show_parameters
 from training.filter_noise import stationary_covariance
-
-
-def test_starts_outside_lie_outside():
-    low, high = VanDerPol().box()
-    x0 = starts(VanDerPol(), "2X", 50, np.random.default_rng(0))
-    assert ((x0 < low) | (x0 > high)).any(-1).all()
-    assert (np.abs(x0) <= 2 * high).all()
 
 
 def test_process_noise_disturbs_the_motion_and_is_passed_to_the_observer(make_artifact, monkeypatch):
@@ -64,8 +57,12 @@ def test_impossible_evaluations(wrong, message):
         unseen_trajectories(**{"system": VanDerPol(), "dt": 0.01, "n": 1, "duration": 1.0, "seed": 0} | wrong)
 
 
-def test_escapes_are_counted():
-    runs = unseen_trajectories(get_system("rossler"), 0.01, n=200, duration=20.0, seed=0, domain="2X")
+def test_starts_outside_lie_outside_and_escapes_are_counted():
+    system = get_system("rossler")
+    runs = unseen_trajectories(system, 0.01, n=200, duration=20.0, seed=0, domain="2X")
+    low, high = system.box()
+    assert ((runs.x[0] < low) | (runs.x[0] > high)).any(-1).all()
+    assert ((runs.x[0] >= system.box(2)[0]) & (runs.x[0] <= system.box(2)[1])).all()
     assert runs.escaped > 0
     assert runs.x.shape[1] == 200 - runs.escaped
     assert np.isfinite(runs.x).all()
