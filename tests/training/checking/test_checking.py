@@ -16,7 +16,7 @@ from linear_system import Autonomous, Oscillator
 import kkl_gym.compiled
 import training.checking.subject
 import training.smoothness
-from kkl_gym import SYSTEMS, System, get_system
+from kkl_gym import SYSTEMS, get_system
 from kkl_gym.compiled import SamplingStep
 from kkl_gym.elementary import abs as absolute
 from kkl_gym.elementary import sqrt
@@ -117,22 +117,14 @@ def test_the_command_prints_a_table_of_findings(capsys, tmp_path, monkeypatch):
     assert any("under the policy" in line for line in shown)
 
 
-@dataclass(frozen=True)
-class Rotation(System):
+class Rotation(Oscillator):
     """The oscillator in discrete time, started on a circle."""
 
-    name: ClassVar[str] = "rotation"
-    X: ClassVar = ((-1, 1), (-1, 1))
-    bounds: ClassVar = ((-30, 30), (-30, 30))
-    u_max: ClassVar = (0.5,)
-    dt: ClassVar[float] = 0.1
+    name, dt = "rotation", 0.1
 
     def step(self, x, u):
         c, s = math.cos(0.1), math.sin(0.1)
         return c * x[0] + s * x[1], c * x[1] - s * x[0] + 0.1 * u[0]
-
-    def h(self, x):
-        return (x[0],)
 
     def draw_starts(self, rng, n, factor=1.0):
         angle = rng.uniform(0, 2 * np.pi, n)
@@ -140,14 +132,13 @@ class Rotation(System):
 
 
 def test_discrete_time_and_starts_of_its_own():
-    found = findings(Rotation())
-    assert "problem" not in {one.verdict for one in found}
-    by_name = {one.check: one.found for one in found}
-    assert by_name["equations"].startswith("step and h work on floats, arrays, tensors, symbols")
-    assert by_name["inputs"] == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
-    assert by_name["starts"] == "draw_starts of its own, all within the bounds"
-    assert "rate" not in by_name
-    assert by_name["observability"].startswith("x2: predicted error 4.7 %")
+    found = {one.check: one for one in findings(Rotation())}
+    assert "problem" not in {one.verdict for one in found.values()}
+    assert found["equations"].found.startswith("step and h work on floats, arrays, tensors, symbols")
+    assert found["inputs"].found == "input 1 at its bound 0.5 moves x2 by 0.5 per second"
+    assert found["starts"].found == "draw_starts of its own, all within the bounds"
+    assert "rate" not in found
+    assert found["observability"].found.startswith("x2: predicted error 4.7 %")
     with pytest.raises(ValueError, match="no others"):
         findings(Rotation(), dt=0.2)
 
@@ -358,23 +349,20 @@ def test_motions_that_are_short_or_idle_or_come_to_rest(monkeypatch):
 
 
 @dataclass(frozen=True)
-class Draining(System):
+class Draining(Oscillator):
     """Two tanks that run empty, where the outflow of Torricelli is infinitely steep. Metres and seconds."""
 
     smooth: float = 0.0  # m
 
-    name = "draining"
+    name, dt, duration = "draining", 0.5, 500.0
     X = ((0.05, 0.6), (0.05, 0.6))
     bounds = ((-0.1, 2.0), (-0.1, 2.0))
-    u_max = (5e-5,)
-    G = ((65.0,), (0.0,))
+    u_max = ()
+    G = ()
 
     def f(self, x):
         outflow = [0.0144 * level / sqrt(absolute(level) + self.smooth) for level in x]
         return -outflow[0], outflow[0] - outflow[1]
-
-    def h(self, x):
-        return (x[1],)
 
 
 @pytest.mark.parametrize(("smooth", "verdict", "seconds"), [(1e-30, "note", 100), (1e-3, "ok", 500)])
@@ -403,21 +391,18 @@ def test_motions_are_no_longer_than_can_be_followed_in_seconds():
 
 
 @dataclass(frozen=True)
-class Blind(System):
+class Blind(Autonomous):
     """The oscillator, and a state of which y tells nothing."""
 
     growth: float = 0.0
 
-    name: ClassVar[str] = "blind"
-    state_names: ClassVar = ("x1", "x2", "bias")
-    X: ClassVar = ((-1, 1), (-1, 1), (-1, 1))
-    bounds: ClassVar = ((-30, 30), (-30, 30), (-30, 30))
+    name = "blind"
+    state_names = ("x1", "x2", "bias")
+    X = ((-1, 1), (-1, 1), (-1, 1))
+    bounds = ((-30, 30), (-30, 30), (-30, 30))
 
     def f(self, x):
         return x[1], -x[0], self.growth * x[2]
-
-    def h(self, x):
-        return (x[0],)
 
 
 def test_states_of_which_y_tells_nothing():

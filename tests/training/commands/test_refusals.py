@@ -25,6 +25,7 @@ def _records():
     rows = Path("spring.csv").read_text().splitlines()
     for name, row, changed in (("cells", 5, "1,2,3"), ("time", 9, "0.1,0,0,0"), ("number", 4, "0.15,much,0,0")):
         Path(f"{name}.csv").write_text("\n".join([*rows[:row], changed, *rows[row + 1 :]]))
+    Path("list.json").write_text("[1]")
     Path("binary.json").write_bytes(b"\xff")
     Path("policy.json").write_text('{"policy": "evil.py:act"}')
 
@@ -56,6 +57,9 @@ def _records():
         (RECORDED.replace("spring.csv", "cells.csv"), "cells.csv: row 5 has 3 cells, the header 4"),
         (RECORDED.replace("spring.csv", "time.csv"), "time.csv: column time, row 9: time must increase"),
         (RECORDED.replace("spring.csv", "number.csv"), "number.csv: column position, row 4: 'much' is no number"),
+        ("train lorenz --forward-steps 5", "pipeline 'input-aware' does not go with forward_steps = 5"),
+        ("train lorenz --adaptive --no-transients", "adaptive = True, transients = False: settings of the pipeline"),
+        ("train lorenz --config list.json", "list.json must be an object of settings among"),
         ("train lorenz --config binary.json", "binary.json is no JSON"),
         ("train lorenz --config policy.json", "it has .'policy'."),
         (RECORDED.replace("spring", "../spring", 1), "SYSTEM is a name of your choice"),

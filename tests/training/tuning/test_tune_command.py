@@ -130,20 +130,3 @@ def test_an_interval_for_spinn(tmp_path, capsys, monkeypatch):
     shown = capsys.readouterr().out
     assert "--pipeline spinn" in shown
     assert "outside the paper's" in shown
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "no JSON"),
-        ("[1]", "object of settings"),
-        ('{"modes": 3}', "modes"),
-        ('{"eigenvalues": ["-1"]}', "eigenvalues"),
-        ('{"pairs": [[-1, 2, 3]]}', "pairs"),
-        ('{"dt": true}', "dt"),
-    ],
-)
-def test_files_that_hold_no_settings(text, message, tmp_path):
-    (tmp_path / "c.json").write_text(text)
-    with pytest.raises(ValueError, match=message):
-        read_changes(tmp_path / "c.json")
