@@ -17,8 +17,6 @@ from training.commands import live as module
 from training.commands.live import Live
 from training.commands.options import shown
 
-OWN = f"{linear_system.__file__}:Oscillator"
-
 
 def live_of(system, observer=None, noise=None):
     figure = Figure(figsize=(12, 7.5))
@@ -84,8 +82,7 @@ def test_keys_and_sliders():
 
 
 class Slow(linear_system.Oscillator):
-    name = "slow"
-    dt = 1.0
+    name, dt = "slow", 1.0
 
 
 def test_slow_systems_of_ones_own_move_at_the_pace_of_those_that_ship(saved):
@@ -109,13 +106,12 @@ def test_the_command(monkeypatch):
 def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
     opened, frames = [], []
 
-    class Animation(FuncAnimation):
-        def __init__(self, figure, frame, **options):
-            super().__init__(figure, frame, **options)
-            frames.append(frame)
+    def animated(figure, frame, **options):
+        frames.append(frame)
+        return FuncAnimation(figure, frame, **options)
 
     monkeypatch.setattr(module, "Live", lambda *args, **options: opened.append(Live(*args, **options)) or opened[-1])
-    monkeypatch.setattr(matplotlib.animation, "FuncAnimation", Animation)
+    monkeypatch.setattr(matplotlib.animation, "FuncAnimation", animated)
     plt.switch_backend("agg")
     monkeypatch.setattr(plt, "get_backend", lambda: "TkAgg")  # which would open a window
     animation = module.show(shown("rossler", None)[0], None, seed=0)
@@ -125,10 +121,10 @@ def test_time_passes_in_a_window_unless_it_is_paused(monkeypatch):
     while len(live.history) < before + 5:
         frame(0)
     canvas.callbacks.process("key_press_event", KeyEvent("key_press_event", canvas, " "))
-    assert live.paused
     before = len(live.history)
     time.sleep(0.05)
     frame(0)
+    assert live.paused
     assert len(live.history) == before
     plt.close("all")
     del animation
