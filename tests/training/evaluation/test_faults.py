@@ -80,25 +80,6 @@ def test_the_table_is_made_of_the_file_alone_for_duffing_by_amplitude_too(tmp_pa
         assert table in (tmp_path / "table.md").read_text()
 
 
-def test_the_level_and_the_duration_are_the_systems_own(make_artifact, tmp_path, monkeypatch):
-    asked = []
-
-    def spy(artifact, system, *, duration, measurement_noise, **_):
-        asked.append((duration, measurement_noise))
-        return pd.DataFrame({"fault": ["none"]})
-
-    monkeypatch.setattr(training.evaluation.faults, "simulate_faults", spy)
-    monkeypatch.setattr(training.commands.faults, "report", lambda out: "")
-    (tmp_path / "slow.py").write_text(
-        "from linear_system import Oscillator\nclass Slow(Oscillator):\n    name, dt = 'slow', 0.1"
-    )
-    path = str(tmp_path / "map.safetensors")
-    for system in ("van_der_pol", OSCILLATOR, f"{tmp_path / 'slow.py'}:Slow"):
-        make_artifact(system=system).save(path)
-        main(["faults", path, *(["--system", system] if ":" in system else []), "--out", str(tmp_path / "out")])
-    assert asked == [(50.0, 0.5), (50.0, 0.1), (500.0, 0.1)]
-
-
 def test_an_observer_in_a_file_for_a_system_of_ones_own(make_artifact, tmp_path, capsys):
     limits = Limits(
         np.array([0.0, 1.0]), np.full((2, 1), 0.5), np.zeros((2, 1)), np.full((2, 1), 2.0), 0.5, 5.0, 0.01, 50.0
