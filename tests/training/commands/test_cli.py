@@ -1,6 +1,5 @@
 """The command line as a whole: help, errors and interruptions."""
 
-import errno
 import signal
 import subprocess
 import sys
@@ -207,11 +206,6 @@ def test_commands_run_in_threads_too(capsys):
     thread.start()
     thread.join()
     assert "van_der_pol" in capsys.readouterr().out
-
-
-def test_files_that_cannot_be_written_are_named_in_one_line(monkeypatch):
-    error = OSError(errno.ENOSPC, "No space left on device", "run/config.json")
-    assert ends(["maps"], raising(error), monkeypatch) == "kkl-gym: run/config.json: No space left on device"
 
 
 def test_figures_leave_the_users_matplotlib_alone():

@@ -95,15 +95,15 @@ def test_each_output_has_noise_of_its_level():
 
 
 def test_an_exact_kalman_filter_follows_the_same_runs():
-    system, dt = Oscillator(), 0.05
-    runs = unseen_trajectories(system, dt, n=20, duration=20.0, seed=0, driven=True)
-    found = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0)
+    runs = unseen_trajectories(Oscillator(), 0.05, n=20, duration=20.0, seed=0, driven=True)
+    found, longer, louder = (
+        kalman_errors(Oscillator(), runs, 0.05, measurement_noise=noise, seed=0, skip=skip)
+        for noise, skip in ((0.1, None), (0.1, 15.0), (0.4, None))
+    )
     assert found.nrmse.shape == (20, 2)
     assert 0.5 < np.median(found.nrmse) < 10  # noise of some 15 % of the output, averaged
     assert np.median(found.late) < np.median(found.full)
-    longer = kalman_errors(system, runs, dt, measurement_noise=0.1, seed=0, skip=15.0)
     assert np.median(longer.nrmse) < np.median(found.nrmse)
-    louder = kalman_errors(system, runs, dt, measurement_noise=0.4, seed=0)
     assert (louder.nrmse.mean(0) > 1.5 * found.nrmse.mean(0)).all()
 
 

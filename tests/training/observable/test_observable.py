@@ -4,13 +4,17 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import gymnasium as gym
+import linear_system
 import numpy as np
+import pandas as pd
 import pytest
 import scipy
 from linear_system import Oscillator
+from recorded_runs import as_csv, swing
 
 import training
 from kkl_gym.systems import Lorenz
+from training.cli import main
 from training.observable import Observability, of_records, of_system
 from training.records import Record, Signals
 
@@ -193,3 +197,42 @@ def test_verdicts(errors, changes, verdict, window):
     of = {"errors": errors, "predicted": errors.min(1), "changes": changes, "linear": errors[0]}
     found = Observability(("y",), (), ("x",), dt=0.1, windows=(0, 1, 2), noise=(0.0,), **of).judgements[0]
     assert (found.verdict, found.window) == (verdict, window)
+
+
+def shown(arguments, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
+    main(["observability", *arguments])
+    return capsys.readouterr().out
+
+
+def test_the_command_on_an_environment(capsys, tmp_path, monkeypatch):
+    words = "Pendulum-v1 --measured 0,1 --hidden 2 --steps 2000 --measurement-noise 0.05,0.1 --out"
+    text = shown([*words.split(), str(tmp_path)], capsys, monkeypatch)
+    assert "what follows from obs[0], obs[1] and action[0]" in text
+    row = next(line for line in text.splitlines() if "obs[2]" in line)
+    assert "determined" in row
+    assert "0.05 s)" in row
+    assert "noise 0.05, 0.1" in text
+    assert (tmp_path / "observability.png").stat().st_size > 10_000
+    written = pd.read_csv(tmp_path / "observability.csv", dtype={"measurement_noise": str})
+    assert list(written) == ["signal", "measurement_noise", "steps", "seconds", "error", "linear", "change"]
+    assert set(written.measurement_noise) == {"0.0", "0.05, 0.1"}
+    np.testing.assert_allclose(written.seconds, 0.05 * written.steps)
+    exact = written[written.measurement_noise == "0.0"].set_index("steps")
+    assert exact.error[0] > 0.9 > 0.05 > exact.error[8]
+    assert written[written.steps == 8].error.is_monotonic_increasing
+
+
+def test_the_command_on_records_and_on_a_system(capsys, tmp_path, monkeypatch):
+    files = [as_csv(tmp_path / f"{i}.csv", swing(i, n=200)) for i in range(6)]
+    options = ["--measured", "position", "--inputs", "force", "--hidden", "speed", "--measurement-noise", "0.5"]
+    text = shown(["--data", *files, *options], capsys, monkeypatch)
+    assert "0.csv and 5 more" in text
+    assert "what follows from position and force" in " ".join(text.split())
+    assert "determined" in next(line for line in text.splitlines() if "│ speed" in line)
+    system = f"{linear_system.__file__}:Oscillator"
+    text = shown([system, "--dt", "0.05", "--duration", "10"], capsys, monkeypatch)
+    first, second = (line for line in text.splitlines() if "│ x" in line)
+    assert "y alone" in first
+    assert "determined" in second
+    assert "equations, noise" in text
