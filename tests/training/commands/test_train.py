@@ -19,36 +19,7 @@ SMALL_RUN = {"trajectories": 20, "duration": 5, "samples": 20, "width": 8, "dept
 SIZES = [f"--{name}={value}" for name, value in SMALL_RUN.items()]
 
 
-def test_train_evaluate_and_report_from_the_command_line(capsys):
-    main(["train", "van_der_pol", *SIZES, "--threads", "1", "--no-monitor"])
-    path = Path("runs/van_der_pol/van_der_pol.safetensors")
-    assert path.with_name("report.png").stat().st_size > 10_000
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "training an observer for van_der_pol, mu = 3: 2 states, 1 output, 1 input"
-    assert lines[1].startswith("pipeline input-aware, preset fast; trajectories = 20; duration = 5.0; ")
-    assert lines[2].startswith("20 trajectories of 5 s at dt = 0.01 s; 23 modes of A for each output, from -0.1 to -20")
-    wrote = re.fullmatch(r"wrote (\S+) \(0\.\d\d MB\), report\.png and log\.txt beside it, in (\S+) s", lines[-1])
-    assert wrote.group(1) == str(path)
-    assert float(wrote.group(2)) > Artifact.read(path).training["seconds"] - 0.5  # which are whole seconds
-    logged = path.with_name("log.txt").read_text().splitlines()
-    assert [line.split(" ", 2)[2] for line in logged] == lines
-    main(["evaluate", str(path), "--trajectories", "3", "--duration", "8", "--csv", "errors.csv"])
-    assert "2X" in capsys.readouterr().out
-    assert len(pd.read_csv("errors.csv")) == 3 * 3 * 2
-
-
-def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(capsys):
-    sizes = [size for size in SIZES if not size.startswith("--width")]
-    main(["train", "van_der_pol", "--size", "small", "--no-inputs", *sizes, "--no-monitor"])
-    artifact = Artifact.read("runs/van_der_pol-small/van_der_pol-small.safetensors")
-    assert artifact.inverse.mlp.weights[0].shape[0] == 20
-    assert len(artifact.filter.A) == 15  # without the default's pairs of slow modes
-    assert "width = 20" in capsys.readouterr().out
-
-
 PLANTS = """
-from dataclasses import dataclass
-
 import numpy as np
 from linear_system import Autonomous
 from unstable_system import Falling as Plant
@@ -70,9 +41,8 @@ class OnFloats(Autonomous):
         return (np.sin(x[0]),)
 
 
-@dataclass(frozen=True)
 class Falling(Plant):
-    name = "falling_in_a_script"
+    name = "falling"
 
 
 def hold(x):
@@ -83,6 +53,32 @@ def hold(x):
 @pytest.fixture(autouse=True)
 def _plants(tmp_path):
     (tmp_path / "own.py").write_text(PLANTS)
+
+
+def test_from_a_system_to_an_observer(capsys):
+    main(["train", "van_der_pol", *SIZES, "--threads", "1", "--no-monitor"])
+    path = Path("runs/van_der_pol/van_der_pol.safetensors")
+    assert path.with_name("report.png").stat().st_size > 10_000
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "training an observer for van_der_pol, mu = 3: 2 states, 1 output, 1 input"
+    assert lines[1].startswith("pipeline input-aware, preset fast; trajectories = 20; duration = 5.0; ")
+    assert lines[2].startswith("20 trajectories of 5 s at dt = 0.01 s; 23 modes of A for each output, from -0.1 to -20")
+    wrote = re.fullmatch(r"wrote (\S+) \(0\.\d\d MB\), report\.png and log\.txt beside it, in (\S+) s", lines[-1])
+    assert wrote.group(1) == str(path)
+    assert float(wrote.group(2)) > Artifact.read(path).training["seconds"] - 0.5  # which are whole seconds
+    logged = path.with_name("log.txt").read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in logged] == lines
+    main(["evaluate", str(path), "--trajectories", "3", "--duration", "8"])
+    assert "2X" in capsys.readouterr().out
+
+
+def test_a_small_map_has_narrow_layers_and_a_name_of_its_own(capsys):
+    sizes = [size for size in SIZES if not size.startswith("--width")]
+    main(["train", "van_der_pol", "--size", "small", "--no-inputs", *sizes, "--no-monitor"])
+    artifact = Artifact.read("runs/van_der_pol-small/van_der_pol-small.safetensors")
+    assert artifact.inverse.mlp.weights[0].shape[0] == 20
+    assert len(artifact.filter.A) == 15  # without the default's pairs of slow modes
+    assert "width = 20" in capsys.readouterr().out
 
 
 def test_outputs_that_are_not_linear_are_written_down_or_it_is_said_why_not(capsys):
@@ -102,14 +98,9 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(monk
     monkeypatch.setattr(monitor, "calibrate", partial(monitor.calibrate, duration=6.0))
     main(["train", "own.py:Falling", "--policy", "own.py:hold", *SIZES])
     assert "no limits" not in capsys.readouterr().out
-    path, system = "runs/falling_in_a_script/falling_in_a_script.safetensors", ["--system", "own.py:Falling"]
+    path, system = "runs/falling/falling.safetensors", ["--system", "own.py:Falling"]
     for command in (
-        [
-            "evaluate",
-            path,
-            *system,
-            *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0", "--csv", "errors.csv"],
-        ],
+        ["evaluate", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0", "--csv", "errors.csv"]],
         ["faults", path, *system, *["--trajectories", "4", "--duration", "6", "--measurement-noise", "0.01"]],
     ):
         with pytest.raises(SystemExit, match="--policy"):
@@ -122,8 +113,8 @@ def test_commands_follow_an_unstable_plant_under_the_policy_of_its_training(monk
 
 def test_the_systems_own_controller_needs_no_option():
     main(["train", "own.py:Falling", "--policy", "controller", "--no-monitor", *SIZES, "--out", "."])
-    small = "--trajectories 5 --duration 6 --measurement-noise 0 --csv errors.csv --system own.py:Falling"
-    main(["evaluate", "falling_in_a_script.safetensors", *small.split()])
+    options = "--system own.py:Falling --trajectories 5 --duration 6 --measurement-noise 0 --csv errors.csv"
+    main(["evaluate", "falling.safetensors", *options.split()])
     assert (pd.read_csv("errors.csv").starts == "X").sum() == 10
 
 
