@@ -7,7 +7,7 @@ SYSTEMS := reverse_duffing van_der_pol rossler lorenz
 STATIC := $(SYSTEMS:%=%-static)
 SMALL := $(SYSTEMS:%=%-small)
 
-.PHONY: demo install test test-coverage test-slow test-long test-browser lint format maps results figures benchmark ablation \
+.PHONY: demo install test test-coverage guard test-slow test-long test-browser lint format maps results figures benchmark ablation \
 	certificates agents environments speed sizes clients docs clean help
 
 demo: $(VENV)/ready  ## run the four environments with their shipped observers
@@ -21,6 +21,9 @@ test: $(VENV)/ready $(if $(AREA),,lint)  ## all that CI runs; AREA=training/maps
 
 test-coverage: $(VENV)/ready  ## the same tests, and which lines they run, in htmlcov; takes a quarter longer
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --cov --cov-report=html
+
+guard: $(VENV)/ready  ## what must not change: estimates, dynamics, names, held-out errors, short trainings; two minutes
+	OMP_NUM_THREADS=1 $(BIN)/python tests/guard/guard.py
 
 test-slow: $(VENV)/ready  ## the tests that train for minutes
 	$(BIN)/pytest -m slow
@@ -43,7 +46,7 @@ format: $(VENV)/ready  ## mend what can be mended of style
 	$(BIN)/ruff format .
 
 # Into runs/; with error bars into runs/errorbars, which ship as NAME-static, and those that also track, which ship as
-# NAME and NAME-small, into runs/tracking. A new version ships as observers/maps/NAME-vN.safetensors, beside the released ones.
+# NAME and NAME-small, into runs/tracking. What ships lies in observers/maps.
 # One thread each, with which the same machine makes the same numbers to the last bit.
 maps: $(SYSTEMS:%=maps-%)  ## train the shipped maps again, two hours, or one with make -j 2 maps; resumable
 

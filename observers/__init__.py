@@ -8,10 +8,11 @@ from observers.filter import LinearFilter
 from observers.flow import Flow
 from observers.forward import ForwardMap
 from observers.inverse import InverseMap
+from observers.loading import load
 from observers.monitor import Limits, Monitor
 from observers.names import shipped
 from observers.network import MLP
-from observers.observer import KKLObserver, load
+from observers.observer import KKLObserver
 from observers.spread import Spread
 
 __all__ = [

@@ -168,11 +168,11 @@ class Artifact:
             raise ArtifactError(f"a map of free motion must be of z_y, {nz} values, beside one that knows of inputs")
         if (free.mlp.outputs, free.measurement_noise_max) != (driven.mlp.outputs, driven.measurement_noise_max):
             raise ArtifactError("the maps of free and of driven motion differ in states, or in noise")
-        told = {
-            ("process_noise" in each.features, each.process_noise_unit, each.process_noise_max)
+        process_noise = [
+            "process_noise" in each.features and (each.process_noise_unit, each.process_noise_max)
             for each in (free, driven)
-        }
-        if len(told) > 1:
+        ]
+        if process_noise[0] != process_noise[1]:
             raise ArtifactError("the maps of free and of driven motion differ in what they are told of process noise")
         if (free.spread is None) != (driven.spread is None):
             raise ArtifactError("of the maps of free and of driven motion one has error bars and the other has none")
@@ -437,18 +437,16 @@ class Artifact:
         return artifact
 
 
-# What is read as one of these: a part of the observer, or of a part of it.
-_PARTS: dict[type, dict[str, type]] = {
-    Artifact: {
-        "inverse": InverseMap,
-        "free_inverse": InverseMap,
-        "forward": ForwardMap,
-        "flow": Flow,
-        "limits": Limits,
-        "h": Expression,
-    },
-    InverseMap: {"spread": Spread},
-    Flow: {"factors": Factors, "free_factors": Factors},
+_PARTS: dict[str, type] = {  # what fields hold that are parts with fields of their own
+    "inverse": InverseMap,
+    "free_inverse": InverseMap,
+    "forward": ForwardMap,
+    "flow": Flow,
+    "limits": Limits,
+    "h": Expression,
+    "spread": Spread,
+    "factors": Factors,
+    "free_factors": Factors,
 }
 
 
@@ -476,7 +474,8 @@ def _put(tensors: dict[str, np.ndarray], prefix: str, part: Any) -> dict[str, An
 
 def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: Mapping[str, Any]) -> Any:
     """The part that :func:`_put` took apart; raises KeyError unless all is there that it writes."""
-    left, values = dict(described), {}
+    left = dict(described)
+    values: dict[str, Any] = {}
     for entry in fields(kind):
         name = entry.name
         if name == "filter":
@@ -485,8 +484,8 @@ def _get(kind: type, tensors: Mapping[str, np.ndarray], prefix: str, described: 
             values[name] = storage.get_mlp(tensors, prefix, left.pop("activation"))
         elif f"{prefix}{name}" in tensors:
             values[name] = tensors[f"{prefix}{name}"]
-        elif name in left and name in _PARTS.get(kind, {}):
-            values[name] = _get(_PARTS[kind][name], tensors, f"{prefix}{name}.", left.pop(name))
+        elif name in left and name in _PARTS:
+            values[name] = _get(_PARTS[name], tensors, f"{prefix}{name}.", left.pop(name))
         elif name in left:
             value = left.pop(name)
             values[name] = tuple(value) if isinstance(value, list) else value

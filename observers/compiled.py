@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from observers.machine import fast_kernel, fast_part, kernel
+
 PIECE = 2**15  # values of a layer that a batch computes at once: they fit into the second cache
 _TILE = 256  # biases that lie one after another for some rows: in loops as short as a narrow layer much would be lost
 UNROLLED = 4  # inputs that a single sample's loop takes at once
 _LINE = 16  # numbers of float32 in a line of the cache
-FAST = {"contract", "reassoc", "nsz", "arcp"}  # what may be done to sums; NaN and infinity keep their meaning
 
 Layers = Sequence[tuple[np.ndarray, np.ndarray]]
 """Weights (inputs, outputs) and biases (outputs,) in float32."""
@@ -211,9 +212,8 @@ def _padded(weight: np.ndarray) -> np.ndarray:
 @functools.cache
 def entering_kernel() -> Callable[..., None]:
     """What :func:`first_layer` makes of a filter's state and an age, before the activation."""
-    import numba
 
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_part
     def enter(first: np.ndarray, age: float, z: np.ndarray, sums: np.ndarray) -> None:
         width, size = len(sums), len(z)
         for j in range(width):
@@ -232,11 +232,9 @@ def entering_kernel() -> Callable[..., None]:
 @functools.cache
 def _decode(activation: str) -> Callable[..., None]:
     """The first layer on z and age, and the network behind it, for one sample."""
-    import numba
+    active, evaluate, enter = active_kernel(activation), single_network(activation), entering_kernel()
 
-    active, evaluate, enter = active_kernel(activation), network_kernels(activation).single, entering_kernel()
-
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_kernel
     def decode(
         first: np.ndarray,
         sums: np.ndarray,
@@ -278,11 +276,9 @@ class NetworkKernels(NamedTuple):
 @functools.cache
 def batch_kernels(activation: str) -> BatchKernels:
     """What follows the first layer's matrix product, and what follows the last one's, for the rows of a piece."""
-    import numba
-
     active = active_kernel(activation)
 
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_kernel
     def enter(sums: np.ndarray, first: np.ndarray, ages: np.ndarray, entered: np.ndarray) -> None:
         bias, of_age = first[0], first[1]
         for row in range(len(ages)):
@@ -290,7 +286,7 @@ def batch_kernels(activation: str) -> BatchKernels:
             for j in range(len(bias)):
                 entered[row, j] = active(np.float32(sums[row, j] + bias[j] + age * of_age[j]))
 
-    @numba.njit
+    @kernel()
     def finish(h: np.ndarray, bias: np.ndarray, units: np.ndarray, out: np.ndarray) -> None:
         for row in range(len(out)):
             for j in range(len(bias)):
@@ -302,28 +298,30 @@ def batch_kernels(activation: str) -> BatchKernels:
 @functools.cache
 def active_kernel(activation: str) -> Any:
     """An activation of one number in float32."""
-    import numba
-
-    compiled = functools.partial(numba.njit, fastmath=FAST, error_model="numpy")
-    return compiled(_ACTIVATIONS[activation](compiled))
+    return fast_part(_ACTIVATIONS[activation]())
 
 
 @functools.cache
 def network_kernels(activation: str) -> NetworkKernels:
     """For an activation: bias and activation of a batch's layer in place, and a whole network for one sample."""
-    import numba
-
-    compiled = functools.partial(numba.njit, fastmath=FAST, error_model="numpy")
     active = active_kernel(activation)
 
-    @compiled
+    @fast_kernel
     def activate(h: np.ndarray, tile: np.ndarray) -> None:
         for first in range(0, len(h), len(tile)):
             part = h[first : first + len(tile)]
             for j in range(len(part)):
                 part[j] = active(part[j] + tile[j])
 
-    @compiled
+    return NetworkKernels(activate, fast_kernel(single_network(activation)))
+
+
+@functools.cache
+def single_network(activation: str) -> Callable[..., None]:
+    """A whole network for one sample."""
+    active = active_kernel(activation)
+
+    @fast_part
     def evaluate(
         x: np.ndarray,
         packed: np.ndarray,
@@ -355,10 +353,10 @@ def network_kernels(activation: str) -> NetworkKernels:
         for j in range(len(out)):
             out[j] = h[j]
 
-    return NetworkKernels(activate, evaluate)
+    return evaluate
 
 
-def _tanh(compiled: Any) -> Callable[[Any], Any]:
+def _tanh() -> Callable[[Any], Any]:
     """A quotient of polynomials in x^2 that is tanh(x)/x to 2e-8, and to 4e-7 with the rounding of float32.
 
     Loops take many values of it at a time. The coefficients are those of the least relative error.
@@ -377,8 +375,8 @@ def _tanh(compiled: Any) -> Callable[[Any], Any]:
     return tanh
 
 
-def _silu(compiled: Any) -> Callable[[Any], Any]:
-    tanh, half = compiled(_tanh(compiled)), np.float32(0.5)
+def _silu() -> Callable[[Any], Any]:
+    tanh, half = fast_part(_tanh()), np.float32(0.5)
 
     def silu(x: Any) -> Any:
         x = half * x  # as observers.network has it
@@ -387,7 +385,7 @@ def _silu(compiled: Any) -> Callable[[Any], Any]:
     return silu
 
 
-def _relu(compiled: Any) -> Callable[[Any], Any]:
+def _relu() -> Callable[[Any], Any]:
     zero = np.float32(0.0)
 
     def relu(x: Any) -> Any:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from observers.compiled import FAST, Layers, active_kernel, batch_kernels, entering_kernel, first_layer
+from observers.compiled import Layers, active_kernel, batch_kernels, entering_kernel, first_layer
+from observers.machine import fast_kernel, fast_part
 
 
 class CompiledCovariance:
@@ -63,18 +64,16 @@ class CompiledCovariance:
 @functools.cache
 def _covary(activation: str) -> Callable[..., None]:
     """The whole of it, for one sample."""
-    import numba
-
     active, enter = active_kernel(activation), entering_kernel()
 
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_part
     def output(row: np.ndarray, h: np.ndarray) -> float:
         total = row[len(h)]
         for j in range(len(h)):
             total += row[j] * h[j]
         return total
 
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_part
     def interpolated(age: float, table: np.ndarray) -> float:  # as np.interp, which takes a second to compile
         last = table.shape[1] - 1
         if age >= table[0, last]:
@@ -85,7 +84,7 @@ def _covary(activation: str) -> Callable[..., None]:
         share = (age - table[0, i]) / (table[0, i + 1] - table[0, i])
         return table[1, i] + share * (table[1, i + 1] - table[1, i])
 
-    @numba.njit(fastmath=FAST, error_model="numpy")
+    @fast_kernel
     def covary(
         first: np.ndarray,
         second: np.ndarray,

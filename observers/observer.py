@@ -1,27 +1,22 @@
 """The observer at run time: filter the output, invert the map."""
 
 import copy
-import math
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import bool_array, flag, noise_level, noise_levels, real_array, shown
+from observers.checks import bool_array, noise_level, noise_levels, real_array
 from observers.compiled import available
 from observers.decoder import Decoders, Parts
-from observers.errors import ArtifactError
 from observers.monitor import Monitor
-from observers.names import resolve
 from observers.replacement import check_replacement
-from observers.samples import check_output, checked_record, first_state, held_input
+from observers.replay import along, filled, replayed
+from observers.samples import check_arguments, check_output, first_state, held_input
 from observers.spread import deviations
 from observers.thresholds import SOON
 from observers.tracker import Tracker
-
-_CHUNK = 8192  # rows of a record that go through the network at once; more fall out of the cache
 
 
 class KKLObserver:
@@ -29,15 +24,14 @@ class KKLObserver:
 
     ``x_hat_0 = reset(y_0)``, then ``x_hat_k+1 = step(y_k+1, u_k)`` with u_k the input held over [t_k, t_k+1].
     All calls are batched: outputs of shape (..., ny) give estimates of shape (..., nx). A step is :meth:`advance`, the
-    linear filter, followed by :meth:`decode`, the network; :meth:`restart` begins anew in some rows of a batch.
+    linear filter, followed by :meth:`decode`, the network; :meth:`restart` restarts some rows of a batch.
 
-    A filter that is switched on knows nothing of what came before, and its estimates need some time. Where the state
-    x_0 is known and the artifact holds the forward map T, ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead, where a
-    filter would be that has run for ever. T also gives :attr:`mismatch`, which says how far z is from T(x_hat).
+    A filter that is switched on needs some time. Where the state x_0 is known and the artifact holds the forward map T,
+    ``reset(y_0, x_0)`` begins at z_0 = T(x_0) instead. T also gives :attr:`mismatch`, the distance of z from T(x_hat).
 
-    Where the artifact holds a flow, the observer tracks: T_inv says where the estimate begins, the learned motion
-    carries it on, and each sample corrects it (:class:`observers.tracker.Tracker`). What T_inv says takes its place
-    where that is surer, or where the samples show that it is lost.
+    Where the artifact holds a flow, the observer tracks: T_inv initialises the estimate, the learned motion predicts
+    it, and each sample corrects it (:class:`observers.tracker.Tracker`). T_inv's estimate replaces it where its
+    covariance is smaller, or where the samples show divergence.
 
     Parameters
     ----------
@@ -48,26 +42,25 @@ class KKLObserver:
         is usual, :attr:`observers.Artifact.measurement_noise`: 0.5 for the maps that ship.
     process_noise : float, optional
         Level of the noise on the state's derivative, in multiples of the system's scale per second as for the
-        environments, for maps that ask for it. What lies beyond their training counts as its end for T_inv; where the
-        observer tracks, its filter takes any level. None is that end, the system's own level, which is also that of the
-        environments and of the monitor's limits.
+        environments, for maps that ask for it. T_inv takes levels beyond its training for its largest; where the
+        observer tracks, its filter takes any level. None is the system's own level, which the environments and the
+        monitor's limits have too.
     monitor : bool, default False
         Whether to watch if the samples fit the estimates, see :attr:`score`.
     compiled : bool, optional
-        Whether single samples go through machine code, which takes some seconds to make, and then a third of the time,
-        or a twentieth where the observer tracks. True makes it here, such as before a loop in real time, and where the
-        observer is unpickled; it needs Numba, the extra ``fast``. False leaves them to NumPy. None is NumPy until a
-        :meth:`reset` after 1,000 samples, and then Numba if it is installed: no run is held up in its midst. The two
-        agree to rounding. Batches of 128 rows or more take Numba wherever it is.
+        Whether single samples run compiled by Numba (the extra ``fast``), in a third of the time, or a twentieth where
+        the observer tracks; compilation takes seconds, once. True compiles here, such as before a loop in real time,
+        and after unpickling. False uses NumPy. None uses NumPy until a :meth:`reset` after 1,000 samples. The two agree
+        to rounding. Batches of 128 rows or more always use Numba where it is installed.
 
     Raises
     ------
     ImportError
         If ``compiled`` is True and Numba is not installed.
     ValueError
-        If ``artifact`` is none or ``monitor`` or ``compiled`` no bool, a noise level is no number, negative or
-        beyond 1e12, the measurement noise is beyond what the map was trained for or differs between outputs where the
-        map is told one level for all, or the artifact holds no limits for a monitor.
+        If an argument has the wrong type, a noise level is negative or beyond 1e12, the measurement noise is beyond
+        the map's training or differs between outputs where the map takes one level for all, or the artifact holds no
+        limits for a monitor.
     """
 
     def __init__(
@@ -79,18 +72,7 @@ class KKLObserver:
         monitor: bool = False,
         compiled: bool | None = None,
     ) -> None:
-        if not isinstance(artifact, Artifact):
-            raise ValueError(
-                f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names"
-            )
-        if flag("monitor", monitor) and artifact.limits is None:
-            found = "them" if artifact.knows_output else "them, and the output h(x), which this artifact lacks as well"
-            raise ValueError(
-                f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
-                f"system) finds {found}, and returns an artifact that does"
-            )
-        if compiled is not None and flag("compiled", compiled) and not available():
-            raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
+        check_arguments(artifact, monitor, compiled)
         self.artifact = artifact
         self._monitored = bool(monitor)
         self._compile, self._compiled = compiled, bool(compiled)
@@ -152,29 +134,21 @@ class KKLObserver:
         if before is not None and self._tracker is not None and self._z is not None:
             self._tracker.go_on(before)
 
+    @property
+    def _levels(self) -> dict[str, Any]:
+        return {
+            "measurement_noise": self._measurement_noise,
+            "process_noise": self._process_noise,
+            "compiled": self._compiled,
+        }
+
     def _new_tracker(self) -> Tracker | None:
         """One that has not begun, where the artifact holds a flow."""
-        if self.artifact.flow is None:
-            return None
-        level, process_noise = self._measurement_noise, self._process_noise
-        return Tracker(
-            self.artifact,
-            self._states,
-            measurement_noise=level,
-            process_noise=process_noise,
-            compiled=self._compiled,
-        )
+        return None if self.artifact.flow is None else Tracker(self.artifact, self._states, **self._levels)
 
     def _decoders(self, outputs: slice) -> Decoders:
-        """The maps, or what of their outputs is meant, at the levels of noise."""
-        level, process_noise = self._measurement_noise, self._process_noise
-        return Decoders.of(
-            self.artifact,
-            outputs,
-            measurement_noise=level,
-            process_noise=process_noise,
-            compiled=self._compiled,
-        )
+        """The maps, or some of their outputs, at the levels of noise."""
+        return Decoders.of(self.artifact, outputs, **self._levels)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -205,7 +179,7 @@ class KKLObserver:
     def replace(self, artifact: Artifact) -> None:
         """Take other maps for the same filter, whose state stays as it is: the next estimate is theirs.
 
-        A map that tracks, in place of one that does not, takes all samples since the reset for such as were there.
+        A map that tracks, in place of one that does not, counts all samples since the reset as present.
 
         Parameters
         ----------
@@ -217,7 +191,7 @@ class KKLObserver:
         ArtifactError
             If it differs in more than its maps.
         ValueError
-            If the noise level is beyond its range, or it holds no limits and there is a monitor, which begins anew. The
+            If the noise level is beyond its range, or there is a monitor, which restarts, and it holds no limits. The
             observer is then as it was.
         """
         check_replacement(self.artifact, artifact)
@@ -255,25 +229,22 @@ class KKLObserver:
             The sample; its shape is that of the batch from here on.
         x0 : array_like, shape (..., nx), optional
             The state, where it is known. The filter then starts at z_y = T(x0) and z_u = 0, as if it had run for ever
-            beside a motion without input: there is no transient, and a map that is told the age is told that it is
-            past it. An observer that tracks begins at x0 itself, cut at the flow's bounds, with T or without. Where it
-            is known in some rows only, :meth:`restart` those.
+            beside a motion without input: there is no transient. An observer that tracks begins at x0 itself, cut at
+            the flow's bounds, with T or without. Where only some rows are known, :meth:`restart` those.
 
         Returns
         -------
         ndarray, shape (..., nx)
-            The first estimate, T_inv(z_0). With x0 that is T_inv(T(x0)), as close to x0 as the maps are good, and x0
-            of an observer that tracks.
+            The first estimate: T_inv(z_0), or x0 where the observer tracks and x0 is given.
 
         Raises
         ------
         ValueError
-            If a shape is wrong, there is anything but finite real numbers, or x0 is given and the artifact holds
-            neither T nor a flow; the observer is then as it was.
+            If a shape is wrong, an entry is not a finite real number, or x0 is given and the artifact holds neither T
+            nor a flow; the observer is then as it was.
         """
-        y0 = real_array("y", y0).copy()  # it is kept, and the caller may reuse its array
+        y0, x0 = real_array("y", y0).copy(), None if x0 is None else real_array("x0", x0)  # callers reuse arrays
         check_output(self.artifact, y0, y0.shape[:-1], first=True)
-        x0 = None if x0 is None else real_array("x0", x0)
         z0, age = first_state(self.artifact, y0, x0)
         if self._compile is None and not self._compiled and y0.ndim == 1 and self._samples >= SOON and available():
             self._compiled = True
@@ -288,12 +259,11 @@ class KKLObserver:
 
     @property
     def score(self) -> np.ndarray:
-        """How well the samples since reset fit the estimates, shape (...,): above 1 something is wrong.
+        """How well the samples since reset fit the estimates, shape (...,): above 1 a fault is likely.
 
-        The running mean and mean square of y - h(x_hat) over their limits in sound operation. The score is 0 right
-        after reset, and outputs that are missing leave it as it was. A sensor's bias, freezing or dropping out raise
-        it, and so do states that the map was not made for. See :class:`observers.Limits` for what a score above 1 is
-        worth.
+        The running mean and mean square of y - h(x_hat) over their limits in sound operation. It is 0 right after
+        reset; missing outputs leave it as it was. A biased, frozen or dropped-out sensor raises it, and so do states
+        outside the training. :class:`observers.Limits` gives the rate of false alarms.
 
         Raises
         ------
@@ -306,18 +276,11 @@ class KKLObserver:
 
     @property
     def mismatch(self) -> np.ndarray:
-        """How far the filter's state is from the image of T, shape (...,): 0 where z_y = T(x_hat).
+        """Distance of the filter's state from the image of T, shape (...,): 0 where z_y = T(x_hat).
 
-        The root mean square of (T(x_hat) - z_y) / z_scale over the modes, where z_scale is that of
-        :class:`observers.ForwardMap`, each mode's spread over the motions that T was trained on: 0.1 is a tenth of it.
-
-        It is near 0 where z_y is the T of some state, and T_inv finds that state. It is large in the transient, under
-        sensor faults and inputs (T is that of motions without), on another plant, and where the maps are bad, such as
-        beyond their training. Noise adds a little. A fault that keeps z on the image of T does not show.
-
-        :attr:`score` judges the estimate by the output alone and over a time; this judges it by all that the filter
-        remembers, at once, and nothing is computed until it is asked for. There are no limits to hold it against: what
-        sound runs show depends on map and noise, and has to be measured.
+        The root mean square of (T(x_hat) - z_y) / :attr:`ForwardMap.z_scale` over the modes. It is large in the
+        transient, under sensor faults and inputs, on another plant, and beyond the training; noise adds a little. A
+        fault that keeps z on the image of T does not show. There are no limits: measure what sound runs give.
 
         Raises
         ------
@@ -344,10 +307,8 @@ class KKLObserver:
 
         Raises
         ------
-        ValueError
-            As :meth:`reset`.
-        RuntimeError
-            Before :meth:`reset`.
+        ValueError, RuntimeError
+            As :meth:`reset`, and before it.
         """
         z = self.z
         rows = bool_array("rows", rows, z.shape[:-1])
@@ -366,18 +327,17 @@ class KKLObserver:
     def step(self, y: np.ndarray | None, u: np.ndarray | None = None) -> np.ndarray:
         """Take in the next sample.
 
-        Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes
-        z' = A z + B h(T_inv(z)) a model of the system. One that tracks coasts on its learned motion. With several
-        outputs, some may be missing where others are not, such as those of slower sensors: it then coasts on these
-        alone. Where the artifact holds no h, the last value of what is missing is taken as still valid.
+        Without a sample the observer coasts on its own prediction of the output, h(x_hat), which makes z' = A z + B
+        h(T_inv(z)) a model of the system; one that tracks coasts on its learned motion. Of several outputs some may be
+        missing, such as those of slower sensors: it then coasts on these alone. Where the artifact holds no h, the last
+        value of a missing output is held.
 
         Parameters
         ----------
         y : array_like, shape (..., ny), or None
-            The sample; None if it is missing. Of several outputs, and of the rows of a batch, some may be missing: they
-            are NaN.
+            The sample; None if it is missing. NaN marks outputs, or rows of a batch, that are missing.
         u : array_like, shape (..., nu), optional
-            The input that led to it, by default zero.
+            The input held since the sample before, by default zero.
 
         Returns
         -------
@@ -387,8 +347,8 @@ class KKLObserver:
         Raises
         ------
         ValueError
-            If a shape is wrong, there is anything but finite real numbers (and NaN as described), or an input that the
-            map does not know of is not zero; the observer is then as it was.
+            If a shape is wrong, an entry is not a finite real number (or NaN as described), or an input that the map
+            does not take is not zero; the observer is then as it was.
         RuntimeError
             Before :meth:`reset`.
         """
@@ -396,21 +356,14 @@ class KKLObserver:
         return self.decode()
 
     def advance(self, y: np.ndarray | None, u: np.ndarray | None = None, rows: np.ndarray | None = None) -> None:
-        """Take in the next sample without an estimate: the filter's half of :meth:`step`.
+        """Take in the next sample without an estimate: the filter's half of :meth:`step`, which raises the same.
 
         Parameters
         ----------
-        y : array_like, shape (..., ny), or None
-            The sample, as for :meth:`step`.
-        u : array_like, shape (..., nu), optional
-            The input that led to it, by default zero.
+        y, u
+            As for :meth:`step`.
         rows : array_like of bool, shape (...,), optional
             The rows of the batch that take it in, by default all.
-
-        Raises
-        ------
-        ValueError, RuntimeError
-            As :meth:`step`.
         """
         if self._z is None:
             raise RuntimeError("call reset(y0) before step(y)")
@@ -439,7 +392,7 @@ class KKLObserver:
                 if gaps is not None:
                     y = np.where(gaps, np.where(np.isfinite(h), h, self._y), y)
             elif gaps is not None:
-                y = self._filled(y, gaps, u, z=self._z, before=self._y, age=self._age)
+                y = filled(self.artifact, self._states, y, gaps, u, z=self._z, before=self._y, age=self._age)
             advance = linear.advance_single if self._compiled and not batch else linear.advance
             z = advance(self._z, self._y, u, y)
         if rows is None:
@@ -460,7 +413,7 @@ class KKLObserver:
             self._monitor.update(self.artifact.residual(self._y, self._x_hat), seen)
 
     def decode(self, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return the estimate as things stand: T_inv(z), the network's half of :meth:`step`, or what a tracker has.
+        """Return the current estimate: T_inv(z), the network's half of :meth:`step`, or the tracker's.
 
         Parameters
         ----------
@@ -474,10 +427,8 @@ class KKLObserver:
 
         Raises
         ------
-        RuntimeError
-            Before :meth:`reset`.
-        ValueError
-            If ``rows`` does not fit the batch.
+        ValueError, RuntimeError
+            If ``rows`` does not fit the batch; before :meth:`reset`.
         """
         if self._tracker is not None:
             if self._z is None:
@@ -495,9 +446,7 @@ class KKLObserver:
 
     @property
     def parameters_hat(self) -> np.ndarray:
-        """Estimates of the system's uncertain parameters as things stand, shape (..., number).
-
-        They are those of :attr:`observers.Artifact.estimated_parameters`, in its order; the network is evaluated anew.
+        """Current estimates of the uncertain parameters :attr:`Artifact.estimated_parameters`, shape (..., number).
 
         Raises
         ------
@@ -506,19 +455,17 @@ class KKLObserver:
         ValueError
             If the artifact estimates no parameters.
         """
-        if self._z is None:
-            raise RuntimeError("call reset(y0) before the observer is used")
-        return self._identifier()(self._z, self._age * self.artifact.filter.dt)
+        z, age = self._moment(None)
+        return self._identifier()(z, age)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the estimate's error x - x_hat as things stand, shape (..., nx, nx).
+        """Covariance of the error x - x_hat of the current estimate, shape (..., nx, nx).
 
-        It is that of the errors in the runs that the map was calibrated on, given all that the map is told: z, the
-        levels of noise and the age. Nine errors in ten there, or a few more where some are far off, lie where (x -
-        x_hat)^T P^-1 (x - x_hat) is below the 90 % quantile of the chi-square distribution with nx degrees of freedom.
-        On another plant, under a faulty sensor or far from the training it says too little. Nothing is computed until
-        it is asked for.
+        It is that of the errors in the runs of the calibration, given z, the levels of noise and the age: 90 % of the
+        errors there have (x - x_hat)^T P^-1 (x - x_hat) below the 90 % quantile of the chi-square distribution with nx
+        degrees of freedom. On another plant, under a faulty sensor or far from the training it is too small. Computed
+        when asked for.
 
         Raises
         ------
@@ -540,25 +487,17 @@ class KKLObserver:
         Parameters
         ----------
         rows : ndarray of bool, shape (...,), optional
-            The rows of the batch that are meant, by default all.
+            As for :meth:`decode`.
 
         Returns
         -------
         ndarray, shape (..., nx, nx) or (number of True in rows, nx, nx)
-            As :attr:`covariance`.
-
-        Raises
-        ------
-        RuntimeError
-            Before :meth:`reset`.
-        ValueError
-            If ``rows`` does not fit the batch, or the artifact holds no error bars.
+            As :attr:`covariance`, which also raises the same.
         """
         if self._tracker is not None:  # its artifact has error bars
-            if self._z is None:
-                raise RuntimeError("call reset(y0) before the observer is used")
-            covariance = self._tracker.covariance(self._z, self._age)
-            return covariance if rows is None else covariance[bool_array("rows", rows, self._z.shape[:-1])]
+            z, _ = self._moment(None)  # not a copy: the tracker knows by it whether T_inv was asked already
+            covariance = self._tracker.covariance(z, self._age)
+            return covariance if rows is None else covariance[bool_array("rows", rows, z.shape[:-1])]
         self.artifact.require_spread()
         self._asked = True
         if rows is None and self._parts is not None:
@@ -567,12 +506,7 @@ class KKLObserver:
 
     def _twin(self) -> "KKLObserver":
         """Another of the same artifact, levels of noise and compilation, without a monitor."""
-        return KKLObserver(
-            self.artifact,
-            self._measurement_noise,
-            process_noise=self._process_noise,
-            compiled=self._compiled or self._compile,
-        )
+        return KKLObserver(self.artifact, **self._levels | {"compiled": self._compiled or self._compile})
 
     def _moment(self, rows: np.ndarray | None) -> tuple[np.ndarray, Any]:
         """The filter's state and its age in seconds, of some rows."""
@@ -591,24 +525,6 @@ class KKLObserver:
                 "with kkl-gym train --uncertain all=0.1 --estimate-parameters"
             )
         return self._parameters
-
-    def _filled(
-        self, y: np.ndarray, gaps: np.ndarray, u: np.ndarray, *, z: np.ndarray, before: np.ndarray, age: Any
-    ) -> np.ndarray:
-        """Samples y with gaps filled by the observer's own prediction; z and ``before`` are of the sample before."""
-        artifact, linear, rows = self.artifact, self.artifact.filter, gaps.any(-1)
-        if not artifact.knows_output:
-            return np.where(gaps, before, y)
-        if rows.ndim and not rows.all():  # the network says nothing of rows where all is there
-            y, age = y.copy(), np.broadcast_to(age, rows.shape)[rows]
-            y[rows] = self._filled(y[rows], gaps[rows], u[rows], z=z[rows], before=before[rows], age=age)
-            return y
-
-        def predicted(z: np.ndarray, age: Any) -> np.ndarray:
-            h = artifact.output(self._states(z, age * linear.dt))
-            return np.where(gaps, np.where(np.isfinite(h), h, before), y)
-
-        return predicted(linear.advance(z, before, u, predicted(z, age)), age + 1)  # as it is now, corrected once
 
     def estimate(self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None) -> np.ndarray:
         """Estimate along a whole record, as :meth:`reset` and :meth:`step` would row by row.
@@ -635,30 +551,28 @@ class KKLObserver:
             As :meth:`reset` and :meth:`step`.
         """
         if self._tracker is not None:
-            return self._replayed(y, u, x0, of=KKLObserver.decode)
-        return self._along(y, u, of=self._states, x0=x0)
+            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode)
+        return along(self.artifact, self._states, y, u, of=self._states, x0=x0)
 
     def estimate_parameters(self, y: np.ndarray, u: np.ndarray | None = None) -> np.ndarray:
-        """Estimate the system's uncertain parameters along a whole record.
+        """Estimate the system's uncertain parameters along a whole record: :attr:`parameters_hat` at each sample.
 
         Parameters
         ----------
-        y : array_like, shape (steps, ..., ny)
-            Outputs, as for :meth:`estimate`.
-        u : array_like, shape (steps - 1, ..., nu), optional
-            Inputs, as there.
+        y, u
+            As for :meth:`estimate`.
 
         Returns
         -------
         ndarray, shape (steps, ..., number)
-            What :attr:`parameters_hat` would be at each sample.
+            Estimates.
 
         Raises
         ------
         ValueError
             As :meth:`estimate`, and if the artifact estimates no parameters.
         """
-        return self._along(y, u, of=self._identifier())
+        return along(self.artifact, self._states, y, u, of=self._identifier())
 
     def estimate_covariance(
         self, y: np.ndarray, u: np.ndarray | None = None, *, x0: np.ndarray | None = None
@@ -667,12 +581,8 @@ class KKLObserver:
 
         Parameters
         ----------
-        y : array_like, shape (steps, ..., ny)
-            Outputs, as for :meth:`estimate`.
-        u : array_like, shape (steps - 1, ..., nu), optional
-            Inputs, as there.
-        x0 : array_like, shape (..., nx), optional
-            The state at y_0, as there.
+        y, u, x0
+            As for :meth:`estimate`.
 
         Returns
         -------
@@ -686,107 +596,5 @@ class KKLObserver:
         """
         self.artifact.require_spread()
         if self._tracker is not None:
-            return self._replayed(y, u, x0, of=KKLObserver.decode_covariance)
-        return self._along(y, u, of=self._states.covariances, x0=x0)
-
-    def _along(
-        self,
-        y: np.ndarray,
-        u: np.ndarray | None,
-        *,
-        of: Callable[[np.ndarray, Any], np.ndarray],
-        x0: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """What a function of the filter's states and their ages gives along a record."""
-        y, u, gaps = checked_record(self.artifact, y, u)
-        steps, batch = len(y), y.shape[1:-1]
-        linear = self.artifact.filter
-        out: np.ndarray | None = None
-        rows = max(1, _CHUNK // max(1, math.prod(batch)))
-        z, age0 = first_state(self.artifact, y[0], x0)
-        for first in range(0, steps, rows):
-            count = min(rows, steps - first)
-            record = np.empty((count, *z.shape))
-            for i, k in enumerate(range(first, first + count)):
-                if k > 0:
-                    held = held_input(self.artifact, None if u is None else u[k - 1], batch)
-                    if gaps is not None and gaps[k].any():
-                        y[k] = self._filled(y[k], gaps[k], held, z=z, before=y[k - 1], age=age0 + k - 1)
-                    z = linear.advance(z, y[k - 1], held, y[k])
-                record[i] = z
-            age = (age0 + np.arange(first, first + count)) * linear.dt
-            found = of(record, age.reshape(count, *(1 for _ in batch)))
-            out = np.empty((steps, *found.shape[1:])) if out is None else out
-            out[first : first + count] = found
-        assert out is not None  # there is one sample at least
-        return out
-
-    def _replayed(
-        self,
-        y: np.ndarray,
-        u: np.ndarray | None,
-        x0: np.ndarray | None,
-        *,
-        of: Callable[["KKLObserver"], np.ndarray],
-    ) -> np.ndarray:
-        """What is asked of another observer like this one at each sample of a record."""
-        y, u, gaps = checked_record(self.artifact, y, u)
-        other = self._twin()
-        other.reset(y[0], x0)
-        first = of(other)
-        found = np.empty((len(y), *first.shape))
-        found[0] = first
-        for k in range(1, len(y)):
-            missing = gaps is not None and gaps[k].all()
-            other.advance(None if missing else y[k], None if u is None else u[k - 1])
-            found[k] = of(other)
-        return found
-
-
-def load(
-    name_or_path: str | os.PathLike[str],
-    measurement_noise: float | Sequence[float] | None = None,
-    *,
-    process_noise: float | None = None,
-    monitor: bool = False,
-    compiled: bool | None = None,
-) -> KKLObserver:
-    """Return the observer behind a name.
-
-    Parameters
-    ----------
-    name_or_path : str or PathLike
-        A shipped name (``"van_der_pol"``, ``"lorenz-spinn"``) or a ``.safetensors`` file.
-    measurement_noise : float or sequence of float, length ny, optional
-        As for :class:`KKLObserver`.
-    process_noise : float, optional
-        As for :class:`KKLObserver`.
-    monitor : bool, default False
-        As for :class:`KKLObserver`.
-    compiled : bool, optional
-        As for :class:`KKLObserver`.
-
-    Returns
-    -------
-    KKLObserver
-        The observer, which awaits :meth:`KKLObserver.reset`.
-
-    Raises
-    ------
-    ArtifactError
-        If there is no such name or file, or the file is damaged or foreign. It is a ValueError.
-    ImportError
-        If ``compiled`` is True and Numba is not installed.
-    ValueError
-        If a noise level is out of range, or a monitor is asked for and the file holds no limits.
-    """
-    return KKLObserver(
-        Artifact.read(resolve(name_or_path)),
-        measurement_noise,
-        process_noise=process_noise,
-        monitor=monitor,
-        compiled=compiled,
-    )
-
-
-__all__ = ["ArtifactError", "KKLObserver", "load"]
+            return replayed(self._twin(), y, u, x0, of=KKLObserver.decode_covariance)
+        return along(self.artifact, self._states, y, u, of=self._states.covariances, x0=x0)

@@ -5,7 +5,22 @@ import math
 import numpy as np
 
 from observers.artifact import Artifact
-from observers.checks import LARGEST, all_finite, real_array
+from observers.checks import LARGEST, all_finite, flag, real_array, shown
+from observers.compiled import available
+
+
+def check_arguments(artifact: Artifact, monitor: bool, compiled: bool | None) -> None:
+    """Raise ValueError or ImportError unless an observer can be made of an artifact in the way that is asked for."""
+    if not isinstance(artifact, Artifact):
+        raise ValueError(f"artifact must be an observers.Artifact, got {shown(artifact)}; observers.load takes names")
+    if flag("monitor", monitor) and artifact.limits is None:
+        found = "them" if artifact.knows_output else "them, and the output h(x), which this artifact lacks as well"
+        raise ValueError(
+            f"this artifact for {artifact.system!r} holds no limits to monitor by; training.calibrate(artifact, "
+            f"system) finds {found}, and returns an artifact that does"
+        )
+    if compiled is not None and flag("compiled", compiled) and not available():
+        raise ImportError("compiled=True needs Numba: pip install kkl-gym[fast], or leave compiled out")
 
 
 def check_output(

@@ -11,6 +11,8 @@ from functools import cache, partial
 
 import numpy as np
 
+from observers.machine import kernel, part
+
 
 class SparseUpdate:
     """z_next = z transition^T + terms drive, for a transition with few entries off its diagonal.
@@ -23,7 +25,7 @@ class SparseUpdate:
         if len(mixing) > len(transition):
             raise ValueError(f"{len(mixing)} entries off the diagonal of {len(transition)} are too many to gain")
         self._terms, self._shape = len(drive), gains.shape
-        self._batch, self._one = partial(_kernel(), *parts), partial(single_kernel(), *parts)
+        self._batch, self._one = partial(_kernel(), *parts), partial(_single_kernel(), *parts)
 
     def __call__(self, z: np.ndarray, *terms: np.ndarray) -> np.ndarray:
         """Return the next z.
@@ -63,11 +65,10 @@ def without_zeros(transition: np.ndarray, drive: np.ndarray) -> tuple[np.ndarray
 
 
 @cache
-def single_kernel() -> Callable[..., None]:
+def single_update() -> Callable[..., None]:
     """The step of one sample: (gains, places, mixing, z, y, u, y_next, z_next), the last of which is written."""
-    import numba
 
-    @numba.njit(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
+    @part(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
     def update(
         gains: np.ndarray,
         places: np.ndarray,
@@ -81,8 +82,8 @@ def single_kernel() -> Callable[..., None]:
         size, j = len(z), 1
         for i in range(size):
             z_next[i] = gains[0, i] * z[i]
-        for part in (y, u, y_next):
-            for value in part:
+        for values in (y, u, y_next):
+            for value in values:
                 for i in range(size):
                     z_next[i] += gains[j, i] * value
                 j += 1
@@ -93,10 +94,13 @@ def single_kernel() -> Callable[..., None]:
 
 
 @cache
-def _kernel() -> Callable[..., None]:
-    import numba
+def _single_kernel() -> Callable[..., None]:
+    return kernel(fastmath=False)(single_update())
 
-    @numba.njit
+
+@cache
+def _kernel() -> Callable[..., None]:
+    @kernel()
     def update(
         gains: np.ndarray,
         places: np.ndarray,

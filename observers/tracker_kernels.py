@@ -12,16 +12,15 @@ offset, scale and bend. That of outputs has their mean, the variance of the nois
 import functools
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
 
-from observers.compiled import UNROLLED, active_kernel, network_kernels
+from observers.compiled import UNROLLED, active_kernel, single_network
+from observers.machine import kernel, part
 from observers.polynomial import count, table
-from observers.sparse import single_kernel
+from observers.sparse import single_update
 from observers.supervision import INFLATION
-
-_F = TypeVar("_F", bound=Callable[..., Any])
 
 _LOW, _HIGH, _GAIN, _NOISE, _OFFSET, _SCALE, _BEND = range(7)  # columns of the table of states
 _WRITTEN_OUT = 400  # coefficients of a polynomial: more would take the compiler long
@@ -30,23 +29,19 @@ _LANES = 32  # rows of a batch that go through together: what there is of them s
 _MEAN, _VARIANCE, _SHARE, _TREND_SHARE, _TREND_SQUARE_SHARE, _TREND_GAIN, _TREND_LIMIT, _C = range(8)  # of outputs
 
 
-def _compiled(function: _F) -> _F:
-    import numba
-
-    made: Any = numba.njit(function, fastmath={"contract"}, error_model="numpy")
-    return cast(_F, made)
+_kernel = kernel(fastmath={"contract"}, error_model="numpy")
+_part = part(fastmath={"contract"}, error_model="numpy")
 
 
 @functools.cache
 def _unscaling() -> Callable[[float, float, float], float]:
     """A state in its own units, rounded as NumPy does it: a row that stands still says the same whoever is asked."""
-    import numba
 
-    @numba.njit(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
+    @part(fastmath=False)  # said aloud, or it would be as in the first kernel that calls it
     def unscaled(offset: float, scale: float, s: float) -> float:
         return offset + scale * s
 
-    return cast(Callable[[float, float, float], float], unscaled)
+    return unscaled
 
 
 @functools.cache
@@ -55,11 +50,11 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
 
     ``used`` says for each state which terms its polynomial has.
     """
-    update, unscaled, nx = single_kernel(), _unscaling(), len(used)
+    update, unscaled, nx = single_update(), _unscaling(), len(used)
     terms = count(nx + nu, degree)
     step_one, step_lanes = (_step(activation, nu, ny, degree, used, lanes) for lanes in (1, _LANES))
 
-    @_compiled
+    @_kernel
     def one(
         numbers: np.ndarray,
         whole: np.ndarray,
@@ -105,7 +100,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
                 filled[k] = expected[k] if np.isfinite(expected[k]) else y[k]
         update(gains, places, mixing, z, y, u, filled, shown[nx + 2 * ny :])
 
-    @_compiled
+    @_kernel
     def take(
         states: np.ndarray,
         x: np.ndarray,
@@ -133,7 +128,7 @@ def kernels(activation: str, nu: int, ny: int, degree: int, used: tuple[tuple[bo
                     row[nx + nx * nx] = row[nx + nx * nx + 1] = 1.0
                     row[nx + nx * nx + 3 :] = 0.0
 
-    return one, step_lanes, take
+    return one, _kernel(step_lanes), take
 
 
 def _along(signals: int, degree: int, used: tuple[tuple[bool, ...], ...], points: int) -> Callable[..., None]:
@@ -146,7 +141,7 @@ def _along(signals: int, degree: int, used: tuple[tuple[bool, ...], ...], points
     terms = len(by)
     if sum(map(sum, used)) > _WRITTEN_OUT:
 
-        @_compiled
+        @_part
         def along(polynomial: np.ndarray, flat: np.ndarray) -> None:
             at = flat.reshape(signals + nx, points)
             products = np.ones((terms, points))
@@ -179,7 +174,7 @@ def _along(signals: int, degree: int, used: tuple[tuple[bool, ...], ...], points
         lines += [f"        flat[{(signals + i) * points} + p] = s{i} + ({change or 0.0})"]
     namespace: dict[str, Any] = {}
     exec("\n".join(lines), namespace)
-    return _compiled(namespace["along"])
+    return _part(namespace["along"])
 
 
 def _step(
@@ -189,12 +184,13 @@ def _step(
 
     Its arrays have an entry for each row in the end, or for each sigma point of each row.
     """
-    active, of_one, nx = active_kernel(activation), network_kernels(activation).single, len(used)
+    active, of_one, nx = active_kernel(activation), single_network(activation), len(used)
     signals, each = nx + nu, 2 * nx
     far, weight, points = math.sqrt(nx), 1 / each, each * lanes
+    unrolled, inflation = UNROLLED, INFLATION  # of other files, to which the cache would not look
     along, unscaled = _along(signals, degree, used, points), _unscaling()
 
-    @_compiled
+    @_part
     def factorise(P: np.ndarray) -> None:
         """Cholesky's factor in the place of P's lower half; NaN where there is none."""
         for i in range(nx):
@@ -209,7 +205,7 @@ def _step(
                     for r in range(lanes):
                         P[i, j, r] = math.sqrt(P[i, j, r]) if P[i, j, r] > 0.0 else np.nan
 
-    @_compiled
+    @_part
     def spread_out(states: np.ndarray, x: np.ndarray, L: np.ndarray, at: np.ndarray) -> None:
         """The sigma points, within the bounds."""
         for i in range(nx):
@@ -226,7 +222,7 @@ def _step(
                 s = low if s < low else s
                 at[i, p] = high if s > high else s
 
-    @_compiled
+    @_part
     def evaluate_each(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The network, of inputs h; what it says lies in what is returned. The loops are over its width."""
         memory = np.empty((5, len(h)), np.float32)
@@ -238,13 +234,13 @@ def _step(
                 into[i, p] = memory[4, i]
         return into
 
-    @_compiled
+    @_part
     def evaluate_all(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The same, in one of the two arrays. The loops are over the points."""
         begin = 0
         for layer in range(len(widths) - 1):
             inputs, width = widths[layer], widths[layer + 1]
-            for i in range(inputs, inputs + UNROLLED):
+            for i in range(inputs, inputs + unrolled):
                 for p in range(points):
                     h[i, p] = 0.0  # beside the rows of zeros
             for j in range(width):
@@ -252,27 +248,27 @@ def _step(
                 for p in range(points):
                     row[p] = packed[begin + j]
                 at = begin + width + j
-                for i in range(0, inputs, UNROLLED):
+                for i in range(0, inputs, unrolled):
                     w0, w1, w2, w3 = packed[at], packed[at + width], packed[at + 2 * width], packed[at + 3 * width]
                     a, b, c, d = h[i], h[i + 1], h[i + 2], h[i + 3]
                     for p in range(points):
                         row[p] += w0 * a[p] + w1 * b[p] + w2 * c[p] + w3 * d[p]
-                    at += UNROLLED * width
+                    at += unrolled * width
                 if layer < len(widths) - 2:
                     for p in range(points):
                         row[p] = active(row[p])
-            begin += width + (inputs + (-inputs) % UNROLLED) * width
+            begin += width + (inputs + (-inputs) % unrolled) * width
             h, into = into, h
         return h
 
-    @_compiled
+    @_part
     def evaluate(packed: np.ndarray, widths: np.ndarray, h: np.ndarray, into: np.ndarray) -> np.ndarray:
         """The quicker of both."""
         if lanes == 1 and widths.max() > _WIDE:
             return evaluate_each(packed, widths, h, into)
         return evaluate_all(packed, widths, h, into)
 
-    @_compiled
+    @_part
     def moments(
         states: np.ndarray,
         h: np.ndarray,
@@ -312,7 +308,7 @@ def _step(
                     bent = states[i, _BEND] * distance[r]
                     P[i, i, r] += bent * bent
 
-    @_compiled
+    @_part
     def correct(
         output: np.ndarray,
         y: np.ndarray,
@@ -356,7 +352,7 @@ def _step(
                 for r in range(lanes):
                     P[i, j, r] -= there[r] * across[i, r] * across[j, r]
 
-    @_compiled
+    @_part
     def step(
         states: np.ndarray,
         outputs: np.ndarray,
@@ -380,7 +376,7 @@ def _step(
         flat = np.empty((signals + nx) * points)
         of_points = flat.reshape(signals + nx, points)
         at, moved = of_points[:signals], of_points[signals:]
-        between = np.empty((2, widths.max() + UNROLLED, points), np.float32)
+        between = np.empty((2, widths.max() + unrolled, points), np.float32)
         for first in range(0, n, lanes):
             for r in range(lanes):
                 now = min(first + r, n - 1)  # behind the last row, copies of it
@@ -434,7 +430,7 @@ def _step(
                             row[nx + cut + 3 + k] = trends[k, r]
                         if row[nx + cut + 1] > outputs[0, _TREND_LIMIT]:
                             for i in range(nx, nx + cut):
-                                row[i] *= INFLATION
+                                row[i] *= inflation
                             row[nx + cut + 1] = 1.0
                             row[nx + cut + 3 :] = 0.0
                 elif rows[first + r]:

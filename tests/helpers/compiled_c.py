@@ -8,16 +8,22 @@ import pytest
 
 from training.export.c_source import c_files
 
-WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic")
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="there is no C compiler, cc")
+
+
+def written(exported, folder):
+    """The path of its source, beside which its other files are."""
+    for name, text in c_files(exported).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder / f"{exported.name}.c"
 
 
 def compiled(exported, folder, *options, main=None):
     """The program around an exported observer, its own or another."""
-    for name, text in c_files(exported).items():
-        (folder / name).write_text(text, encoding="utf-8")
-    program, sources = folder / "program", [folder / f"{exported.name}.c", main or folder / f"{exported.name}_main.c"]
-    done = subprocess.run(["cc", *WARNINGS, *options, *sources, "-lm", "-o", program], capture_output=True, text=True)
+    program, source = folder / "program", written(exported, folder)
+    command = ["cc", *WARNINGS, "-O1", *options, source, main or source.with_name(f"{exported.name}_main.c")]
+    done = subprocess.run([*command, "-lm", "-o", program], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return program
 
@@ -61,7 +67,7 @@ def microseconds(exported, folder, y, u, turns=20):
     text = TIMED.replace("NAME", exported.name).replace("GIVEN", "u[k]," if nu else "")
     (folder / "timed.c").write_text(text, encoding="utf-8")
     told = [f"-D{name}={size}" for name, size in sizes.items()]
-    program = compiled(exported, folder, *told, main=folder / "timed.c")
+    program = compiled(exported, folder, "-O2", *told, main=folder / "timed.c")
     held = np.concatenate([np.zeros((1, nu)), u[: len(y) - 1]])
     rows = np.concatenate([held, y], axis=-1).tolist()
     done = fed(program, "\n".join(" ".join(map(repr, row)) for row in rows))

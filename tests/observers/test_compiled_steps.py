@@ -1,8 +1,9 @@
-"""Machine code against NumPy, which is the reference. Estimates are compared in units of the map's scales."""
+"""Machine code against NumPy, which is the reference. Batches of few rows go through NumPy."""
 
 import copy
 import itertools
 import pickle
+import subprocess
 import sys
 import threading
 from dataclasses import replace
@@ -10,22 +11,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from error_bars import with_error_bars
-from exported_steps import apart_at_all_levels
+from exported_steps import apart_at_all_levels, t_inv
+from random_artifacts import random_artifact
+from random_tracking import JUMPS, signals, tracking
 
 import observers
-from kkl_gym import get_system
-from observers import compiled as machine
-from observers import compiled_covariance
-from observers.artifact import Artifact
+from observers import Artifact, Expression, KKLObserver, tracker_kernels
 from observers.names import resolve
 from observers.thresholds import MANY_ROWS, SOON
 
 pytest.importorskip("numba")
 
-NAMES = sorted(set(observers.shipped().values()))
-ARTIFACTS = {name: Artifact.read(resolve(name)) for name in NAMES}
-BY_T_INV = [name for name, artifact in ARTIFACTS.items() if artifact.inverse.spread and artifact.flow is None]
 ACCURATE = 1e-5
+ROWS = MANY_ROWS + 7
 REFERENCE = {
     "tanh": np.tanh,
     "silu": lambda h: h / 2 * (1 + np.tanh(h / 2)),
@@ -33,215 +31,118 @@ REFERENCE = {
 }
 
 
-def forget():
-    """Forgets what has been compiled."""
-    for cache in (machine.network_kernels, machine._decode, machine.batch_kernels):
-        cache.cache_clear()
-    for cache in (machine.active_kernel, machine.entering_kernel):
-        cache.cache_clear()
-    for cache in (observers.sparse._kernel, observers.sparse.single_kernel, compiled_covariance._covary):
-        cache.cache_clear()
+def with_terms(artifact, degree):
+    """With a flow that lacks terms, or with one whose polynomial is too long to be written out."""
+    flow, rng = artifact.flow, np.random.default_rng(5)
+    if degree == 6:
+        terms = 210  # of three states and an input
+        higher = 1e-9 * rng.normal(size=(flow.nx, terms - flow.polynomial.shape[1]))
+        return replace(artifact, flow=replace(flow, polynomial=np.hstack([flow.polynomial, higher])))
+    kept = rng.random(flow.polynomial.shape) < 0.5
+    kept[:, 1 : 1 + flow.nx + flow.nu] = True
+    return replace(artifact, flow=replace(flow, polynomial=kept * flow.polynomial))
 
 
-@pytest.fixture
-def without_numba(monkeypatch):
-    forget()
-    monkeypatch.setitem(sys.modules, "numba", None)
+TRACKERS = [
+    lambda: with_terms(tracking(bend=0.5), 3),
+    lambda: with_terms(tracking(2, system="lorenz", surer=2.0), 6),
+]
+STATIC = [
+    lambda: with_error_bars(random_artifact(free_inverse=True, process=True), activation="silu"),
+    lambda: Artifact.read(resolve("lorenz-static")),
+]
 
 
-def signals(artifact, steps, batch=(), seed=0):
-    """Outputs as large as the system's, with a slow and a fast part, and inputs that begin after a while."""
-    rng = np.random.default_rng(seed)
-    size = np.array(get_system(artifact.system).output_range)
-    t = 0.01 * np.arange(steps).reshape(-1, *(1 for _ in batch), 1)
-    y = 0.4 * size * np.sin(t * rng.uniform(1, 4, (*batch, artifact.ny)) + rng.uniform(0, 6, (*batch, artifact.ny)))
-    u = rng.uniform(-1, 1, (steps, *batch, artifact.nu))
-    u[: steps // 3] = 0.0
-    return y + 0.05 * size * rng.standard_normal(y.shape), u
-
-
-def along(observer, y, u):
-    return np.array([observer.reset(y[0]), *(observer.step(y[k], u[k]) for k in range(1, len(y)))])
-
-
-def apart(found, expected, artifact):
-    """Largest difference in units of the states' scales."""
-    return np.abs((found - expected) / artifact.inverse.x_scale).max()
-
-
-def along_z(observer, y, u):
-    """Filter states."""
+def along(observer, y, u, masks):
+    """Estimates and covariances along a record, with all that may happen on the way."""
+    found, batch = [], y.shape[1:-1]
     observer.reset(y[0])
-    found = [observer.z]
     for k in range(1, len(y)):
-        observer.step(y[k], u[k])
-        found.append(observer.z)
-    return np.array(found)
+        sample, some = y[k].copy(), masks[k]
+        if k % 7 == 3 and y.shape[-1] > 1:
+            sample[..., 0] = np.nan
+        if k == 50:
+            observer.measurement_noise, observer.process_noise = 0.3, 0.15
+        if k % 60 == 20:
+            observer.restart(y[k][some], some)
+        rows = some if k % 3 == 0 else None
+        observer.advance(None if k % 7 == 5 else sample, u[k - 1], rows)
+        x_hat, covariance = observer.decode(), observer.covariance
+        if batch and k % 10 == 0:
+            np.testing.assert_allclose(observer.decode(some), x_hat[some], rtol=1e-4, atol=1e-4)
+            np.testing.assert_allclose(observer.decode_covariance(some), covariance[some], rtol=1e-3, atol=1e-9)
+        found.append((x_hat, covariance))
+    return tuple(map(np.array, zip(*found, strict=True)))
 
 
-@pytest.mark.parametrize("name", BY_T_INV)
-def test_compiled_error_bars_of_single_samples_are_numpys(name):
-    """Free and driven motion, at levels of noise and ages between those of the factors, at them and beyond."""
-    artifact = Artifact.read(resolve(name))
-    y, u = signals(artifact, 60)
-    for level, process_noise in ((0.0, 0.0), (0.37, 0.4), (1.0, 5.0)):
-        options = {"process_noise": process_noise}
-        one, other = (observers.KKLObserver(artifact, level, compiled=choice, **options) for choice in (True, False))
-        for z in along_z(other, y, u)[[0, 19, 59]]:
-            ages = artifact.inverse.spread.ages
-            for age in (*ages, *(ages[1:] + ages[:-1]) / 2, 1e3, np.inf):
-                found, expected = (observer._states.covariances(z, float(age)) for observer in (one, other))
-                size = np.sqrt(expected.diagonal())
-                assert 0 < np.abs((found - expected) / np.outer(size, size)).max() < 1e-4  # not the same arithmetic
-                np.testing.assert_array_equal(found, found.T)
+def assert_alike(found, expected, within=1e-4):
+    """Estimates in units of their standard deviations, and covariances in units of themselves."""
+    (x, P), (x_expected, P_expected) = found, expected
+    size = np.sqrt(P_expected.diagonal(0, -2, -1))
+    assert np.isfinite(x_expected).all()
+    assert np.abs((x - x_expected) / size).max() < within
+    assert np.abs((P - P_expected) / (size[..., :, None] * size[..., None, :])).max() < within
+    assert not np.array_equal(P, P_expected)  # not the same arithmetic
 
 
-@pytest.mark.parametrize("name", BY_T_INV)
-def test_estimates_whose_error_bars_are_asked_for_at_each_sample(name):
-    """NumPy makes both in one go from the second on. Levels of noise change meanwhile, and inputs begin."""
-    one, other = (observers.load(name, compiled=choice) for choice in (True, False))
-    y, u = signals(one.artifact, 60)
-    plain = along(observers.load(name, compiled=False), y[:40], u)
-    for k in range(60):
-        found = []
-        for observer in (one, other):
-            if k == 40:
-                observer.measurement_noise, observer.process_noise = 0.2, 0.3
-            if k == 50:
-                observer.replace(observer.artifact)
-            x_hat = observer.step(y[k], u[k]) if k else observer.reset(y[k])
-            found.append((x_hat, observer.covariance, observer.std))
-        (x_hat, covariance, std), expected = found
-        assert apart(x_hat, expected[0], one.artifact) < ACCURATE
-        assert np.abs((covariance - expected[1]) / np.outer(std, std)).max() < 1e-4
-        np.testing.assert_allclose(std, np.sqrt(covariance.diagonal()), rtol=1e-12)
-        if k < 40:
-            assert apart(expected[0], plain[k], one.artifact) < ACCURATE
+def record(artifact, steps, batch=()):
+    rng = np.random.default_rng(2)
+    if artifact.flow is not None:
+        return *signals(artifact, steps, batch), rng.random((steps, *batch)) < 0.5
+    y, u = rng.normal(size=(steps, *batch, artifact.ny)), rng.normal(size=(steps, *batch, artifact.nu))
+    u[: steps // 3] = u[:, : batch[0] // 2 if batch else 0] = 0.0  # free motion
+    return np.cumsum(0.3 * y, axis=0), u, rng.random((steps, *batch)) < 0.5
 
 
-@pytest.mark.parametrize("name", BY_T_INV)
-def test_error_bars_of_batches_are_those_of_single_samples(name):
-    """Free motion, both, and driven motion alone; at ages that differ and in some rows."""
-    artifact = Artifact.read(resolve(name))
-    y, u = signals(artifact, 6, (2 * MANY_ROWS + 3,))
-    u[1:3, ::2] = 0.0
-    rows = np.arange(y.shape[1]) < MANY_ROWS
-    observer = observers.KKLObserver(artifact, 0.3)
-    single = observers.KKLObserver(artifact, 0.3, compiled=False)._states
-    observer.reset(y[0])
-    for k in range(1, 6):
-        observer.step(y[k], u[k])
-        if k == 4:
-            observer.restart(y[4][::5], np.arange(y.shape[1]) % 5 == 0)
-        found, part = observer.covariance, observer.decode_covariance(rows)
-        z, ages = observer._moment(np.ones(y.shape[1], dtype=bool))
-        for row in range(0, y.shape[1], 23):
-            expected = single.covariances(z[row], float(ages[row]))
-            size = np.sqrt(expected.diagonal())
-            assert np.abs((found[row] - expected) / np.outer(size, size)).max() < 1e-4
-            if rows[row]:
-                assert np.abs((part[row] - expected) / np.outer(size, size)).max() < 1e-4
+@pytest.mark.parametrize("make", [*TRACKERS, *STATIC], ids=["bent", "lorenz", "random", "lorenz-static"])
+def test_single_samples(make):
+    artifact = make()
+    y, u, masks = record(artifact, JUMPS[1] + 100)
+    found, expected = (along(KKLObserver(artifact, 0.1, compiled=choice), y, u, masks) for choice in (True, False))
+    assert_alike(found, expected, 1e-4 if artifact.flow else 1e-3)
 
 
-def test_error_bars_are_compiled_with_the_observer_and_stay_when_it_travels():
-    compiled_covariance._covary.cache_clear()
-    observer = observers.load("van_der_pol", compiled=True)
-    y, u = signals(observer.artifact, 3)
-    along(observer, y, u)
-    kernel = compiled_covariance._covary(observer.artifact.inverse.spread.mlp.activation)
-    assert len(kernel.signatures) == 1
-    before = observer.covariance
-    observer.step(y[1], np.array([0.3]))
-    assert len(kernel.signatures) == 1  # for free and driven motion, and at any age
-    assert not np.array_equal(observer.covariance, before)
-    travelled = pickle.loads(pickle.dumps(observer))
-    np.testing.assert_array_equal(travelled.covariance, observer.covariance)
-    assert b"CompiledCovariance" not in pickle.dumps(observer)
+@pytest.mark.parametrize("make", [*TRACKERS, *STATIC], ids=["bent", "lorenz", "random", "lorenz-static"])
+def test_batches(make):
+    artifact = make()
+    y, u, masks = record(artifact, 200, (ROWS,))
+    y[150:155, ::3] += 9.0  # where trackers are lost
+    found, few = along(KKLObserver(artifact, 0.1), y, u, masks), MANY_ROWS - 1
+    parts = [
+        along(KKLObserver(artifact, 0.1), y[:, at], u[:, at], masks[:, at]) for at in (slice(few), slice(few, None))
+    ]
+    assert_alike(found, [np.concatenate(both, axis=1) for both in zip(*parts, strict=True)])
+    if artifact.flow is None:
+        whole = KKLObserver(artifact, 0.1).estimate(y, u)
+        np.testing.assert_allclose(
+            whole[:, :few], KKLObserver(artifact, 0.1).estimate(y[:, :few], u[:, :few]), atol=1e-4
+        )
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_single_samples_of_every_shipped_map(name):
-    one, other = (observers.load(name, compiled=choice) for choice in (True, False))
-    y, u = signals(one.artifact, 400)
-    expected = along(other, y, u)
-    assert expected.dtype == float
-    # These signals are of no motion, so that a flow carries roundings on until the estimate is lost.
-    assert apart(along(one, y, u), expected, one.artifact) < (ACCURATE if one.artifact.flow is None else 2e-4)
-    assert np.allclose(one.z, other.z, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["van_der_pol-static", "lorenz-spinn"])
-def test_ten_thousand_samples(name):
-    one, other = (observers.load(name, compiled=choice) for choice in (True, False))
-    y, u = signals(one.artifact, 10_001)
-    assert apart(along(one, y, u), along(other, y, u), one.artifact) < ACCURATE
+def test_known_starts_and_parameters():
+    artifact = replace(with_error_bars(random_artifact(estimated=True)), forward=random_artifact(forward=True).forward)
+    y, u, _ = record(artifact, 30)
+    found = []
+    for choice in (True, False):
+        observer = KKLObserver(artifact, compiled=choice)
+        steps = [observer.reset(y[0], [0.3, 0.2])]
+        for k in range(1, 30):
+            steps += [observer.step(y[k], u[k]), observer.std, np.tile(observer.parameters_hat, 2)]
+        found.append(np.array(steps))
+    np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", observers.shipped())
 def test_100_000_samples_of_every_shipped_map(name):
     def compiled(exported, y, u):
         levels = {"measurement_noise": exported.measurement_noise, "process_noise": exported.process_noise}
-        observer = observers.KKLObserver(exported.artifact, **levels, compiled=True)
+        observer = KKLObserver(exported.artifact, **levels, compiled=True)
         return np.array([observer.reset(y[0]), *(observer.step(y[k], u[k - 1]) for k in range(1, len(y)))])
 
     of_range, of_scale = apart_at_all_levels(name, "float", compiled)
     print(f"{name}: {of_range:.1e} of the range, {of_scale:.1e} of the scale")
     assert of_range < 1e-5
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_batches_of_every_shipped_map(name):
-    """Of an odd number of rows, of which some have had no input yet; row by row is NumPy."""
-    artifact = Artifact.read(resolve(name))
-    y, u = signals(artifact, 4, (2 * MANY_ROWS + 3,))
-    u[:, ::2] = 0.0
-    found = along(observers.KKLObserver(artifact, 0.3), y, u)
-    for row in range(0, y.shape[1], 37):
-        single = observers.KKLObserver(artifact, 0.3, compiled=False)
-        limit = ACCURATE if artifact.flow is None else 10 * ACCURATE  # what tracks adds up the rounding of each step
-        assert apart(found[:, row], along(single, y[:, row], u[:, row]), artifact) < limit
-
-
-def test_whatever_may_happen_to_a_batch(without_numba, monkeypatch):
-    """Missing samples, rows that wait, restarts, records and error bars."""
-    artifact = with_error_bars(Artifact.read(resolve("rossler")))
-    n, rng = MANY_ROWS + 7, np.random.default_rng(1)
-    y, u = signals(artifact, 40, (n,))
-    masks = rng.random((40, n)) < 0.7
-
-    def run():
-        observer, found = observers.KKLObserver(artifact), []
-        observer.reset(y[0])
-        for k in range(1, 40):
-            if k % 9 == 4:
-                observer.step(None, u[k])
-            elif k % 9 == 7:
-                observer.restart(y[k][masks[k]], masks[k])
-            else:
-                observer.advance(y[k], u[k], masks[k] if k % 2 else None)
-            found.append([observer.decode(), np.zeros((n, 3))])
-            found[-1][1][masks[k]] = observer.decode(masks[k])
-        return np.array(found), observer.covariance, observer.estimate(y, u[1:])
-
-    expected = run()
-    monkeypatch.undo()
-    for found, other in zip(run(), expected, strict=True):
-        assert np.abs(found - other).max() < ACCURATE * np.abs(other).max()
-
-
-def test_single_samples_with_gaps_known_starts_and_error_bars():
-    artifact = with_error_bars(Artifact.read(resolve("lorenz-spinn")))
-    y, _ = signals(artifact, 60)
-    x0, found = np.array([1.0, 2.0, 25.0]), []
-    for choice in (True, False):
-        observer = observers.KKLObserver(artifact, compiled=choice)
-        steps = [observer.reset(y[0], x0)]
-        for k in range(1, 60):
-            steps.append(observer.step(None if k % 7 == 3 else y[k]))
-            steps.append(observer.std)
-        found.append(np.array(steps))
-    assert apart(*found, artifact) < ACCURATE
 
 
 @pytest.mark.parametrize("activation", sorted(REFERENCE))
@@ -261,85 +162,95 @@ def test_networks(activation, width):
         h = REFERENCE[activation](h @ weight.T + bias)
     expected = h @ mlp.weights[-1].T + mlp.biases[-1]
     size = np.abs(expected).max()
-    assert np.abs(mlp.compiled.batch(x) - expected).max() < ACCURATE * size
+    assert np.abs(mlp(x) - expected).max() < ACCURATE * size
     assert np.abs([mlp.compiled.single(row) for row in x] - expected).max() < ACCURATE * size
-    assert np.array_equal(mlp(x), mlp.compiled.batch(x))
-    assert np.array_equal(mlp(x.reshape(2, 150, 3)).reshape(300, 2), mlp.compiled.batch(x))
+    assert np.array_equal(mlp(x.reshape(2, 150, 3)).reshape(300, 2), mlp(x))
 
 
 @pytest.mark.parametrize("activation", sorted(REFERENCE))
 def test_activations_to_the_last_digits(activation):
-    x = np.concatenate([np.linspace(-30, 30, 20001), np.logspace(-30, 1, 2001), [0.0]]).astype(np.float32)
-    h = x.copy()
-    machine.network_kernels(activation).activate(h, np.zeros(7, np.float32))
+    x = np.concatenate([np.linspace(-30, 30, 20001), np.logspace(-30, 1, 2001), [0.0, np.nan]]).astype(np.float32)
+    one = np.ones((1, 1), np.float32)
+    h = observers.MLP([one, one], [np.zeros(1), np.zeros(1)], activation)(x[:, None])[:, 0]
+    assert np.isnan(h[-1])
+    x, h = x[:-1], h[:-1]
     expected = REFERENCE[activation](x.astype(float))
     assert (np.abs(h - expected) <= 1e-6 * np.abs(x)).all()  # silu of -30 is a difference, in NumPy as well
     assert (np.abs(h - expected) <= 1e-6 * np.abs(expected))[x >= -1].all()
     if activation == "tanh":
         assert (np.abs(h - expected) <= 3e-7 * np.abs(expected)).all()
         assert np.abs(h).max() <= 1.0
-    lost = np.array([np.nan], np.float32)
-    machine.network_kernels(activation).activate(lost, np.zeros(1, np.float32))
-    assert np.isnan(lost).all()
 
 
-def test_a_network_without_hidden_layers_is_numpys():
-    artifact = Artifact.read(resolve("lorenz-spinn"))
-    rng = np.random.default_rng(0)
-    mlp = observers.MLP([rng.normal(size=(3, artifact.inverse.mlp.inputs))], [rng.normal(size=3)], "tanh")
-    artifact = replace(artifact, inverse=replace(artifact.inverse, mlp=mlp))
-    y, u = signals(artifact, 5)
-    one, other = (observers.KKLObserver(artifact, compiled=choice) for choice in (True, False))
-    assert np.allclose(along(one, y, u), along(other, y, u), rtol=1e-12)
+@pytest.mark.parametrize("make", [TRACKERS[0], STATIC[0]], ids=["tracks", "static"])
+def test_long_simulations_are_compiled_at_a_reset_and_not_before(make):
+    """Bit by bit they are what compiled=True gives from there on, and what compiled=False gives before."""
+    artifact, y = make(), np.full(1, 0.1)
+    auto, never, always = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (None, False, True))
 
+    def same(*others, steps=3):
+        rng = np.random.default_rng(0)
+        found = [[each.reset(y)] for each in (auto, *others)]
+        for sample in 0.3 * rng.normal(size=(steps, 1)):
+            for each, of in zip((auto, *others), found, strict=True):
+                of.append(each.step(sample))
+        return [np.array_equal(found[0], each) for each in found[1:]]
 
-def is_compiled(observer):
-    return observer._compiled
-
-
-def test_a_long_simulation_is_compiled_at_a_reset_and_not_before():
-    observer = observers.load("lorenz")
-    y, u = signals(observer.artifact, SOON)
-    along(observer, y, u)  # one step less than it takes
-    observer.reset(y[0])
-    assert not is_compiled(observer)
+    auto.reset(np.zeros((2, 1)))
     for _ in range(SOON):
-        observer.step(y[1])
-    assert not is_compiled(observer)
-    before = observer.z
-    observer.reset(y[0])
-    assert is_compiled(observer)
-    assert before.shape == observer.z.shape
-    observer.measurement_noise = 0.1  # new maps, compiled as well
-    observer.replace(observer.artifact)
-    assert is_compiled(observer)
-    assert (
-        apart(along(observer, y[:20], u), along(observers.load("lorenz", 0.1), y[:20], u), observer.artifact) < ACCURATE
-    )
+        auto.step(np.zeros((2, 1)))  # a batch, which does not count
+    assert same(never, always, steps=SOON) == [True, False]
+    assert same(never, always) == [False, True]
+    for each in (auto, always):
+        each.measurement_noise = 0.2
+    auto.replace(artifact)
+    assert same(always) == [True]
+    never.reset(y)
+    assert not np.array_equal(never.step(y), auto.step(y))
 
 
-def test_batches_do_not_count_and_false_is_never():
-    batched, never = observers.load("lorenz"), observers.load("lorenz", compiled=False)
-    batched.reset(np.zeros((2, 1)))
-    never.reset(np.zeros(1))
-    for _ in range(SOON):
-        batched.step(np.zeros((2, 1)))
-        never.step(np.zeros(1))
-    batched.reset(np.zeros(1))
-    never.reset(np.zeros(1))
-    assert not is_compiled(batched)
-    assert not is_compiled(never)
+NO_NUMBA = """
+import pickle, sys
+sys.modules["numba"] = None
+import numpy as np
+import observers
+found = []
+for observer, y, u in pickle.load(sys.stdin.buffer):
+    found.append([observer.step(*each) for each in zip(y, u)])
+try:
+    observers.load("lorenz", compiled=True)
+except ImportError as error:
+    found.append(str(error))
+observer = observers.load("lorenz-spinn")
+observer.reset([0.0])
+for _ in range(1001):
+    observer.step([0.0])
+observer.reset([0.0])
+pickle.dump(found, sys.stdout.buffer)
+"""
 
 
-def test_without_numba_long_simulations_go_on_in_numpy(without_numba):
-    observer = observers.load("lorenz")
-    observer.reset(np.zeros(1))
-    for _ in range(SOON):
-        observer.step(np.zeros(1))
-    observer.reset(np.zeros(1))
-    assert not is_compiled(observer)
-    with pytest.raises(ImportError, match=r"kkl-gym\[fast\]"):
-        observers.load("lorenz", compiled=True)
+def test_what_is_compiled_goes_where_numba_is_not():
+    there, expected = [], []
+    for make, batch in itertools.product((TRACKERS[0], STATIC[0]), ((), (ROWS,))):
+        artifact = make()
+        y, u, _ = record(artifact, 60, batch)
+        observer = KKLObserver(artifact, 0.1, compiled=True)
+        observer.reset(y[0])
+        for k in range(1, 30):
+            observer.step(y[k], u[k])
+        there.append(pickle.loads(pickle.dumps((observer, y[30:], u[30:]))))
+        others = [copy.deepcopy(observer), copy.copy(observer), pickle.loads(pickle.dumps(observer))]
+        expected.append([observer.step(y[k], u[k]) for k in range(30, 60)])
+        for other in others:  # to the last bit where Numba is
+            assert np.array_equal([other.step(y[k], u[k]) for k in range(30, 60)], expected[-1])
+            np.testing.assert_array_equal(other.covariance, observer.covariance)
+    command = [sys.executable, "-c", NO_NUMBA]
+    done = subprocess.run(command, input=pickle.dumps(there), capture_output=True, check=True)
+    *found, refused = pickle.loads(done.stdout)
+    assert "pip install kkl-gym[fast]" in refused
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("wrong", ["yes", 1, np.array([True])])
@@ -348,62 +259,109 @@ def test_compiled_is_a_bool(wrong):
         observers.load("lorenz", compiled=wrong)
 
 
-def test_a_compiled_observer_goes_where_numba_is_not(monkeypatch):
-    observer = observers.load("lorenz", compiled=True)
-    y, u = signals(observer.artifact, 30)
-    along(observer, y[:10], u)
-    packed, twin = pickle.dumps(observer), copy.deepcopy(observer)
-    expected = np.array([observer.step(y[k], u[k]) for k in range(10, 30)])
-    assert np.array_equal(expected, [twin.step(y[k], u[k]) for k in range(10, 30)])
-    forget()
-    monkeypatch.setitem(sys.modules, "numba", None)
-    there = pickle.loads(packed)
-    assert apart(np.array([there.step(y[k], u[k]) for k in range(10, 30)]), expected, observer.artifact) < ACCURATE
-
-
-def test_threads_do_not_share_memory():
-    observer = observers.load("lorenz")
-    n, found = 2000, {}
-    y = np.linspace(-20, 20, n)[:, None]
-    observer.reset(y)
-    inputs = {i: observer.z * (1 + 0.1 * i) for i in range(4)}
+@pytest.mark.parametrize("batch", [(), (2000,)])
+def test_threads_do_not_share_memory(batch):
+    """Trackers of one artifact, and records of one observer."""
+    artifact, shared, found = TRACKERS[0](), KKLObserver(STATIC[0](), 0.1, compiled=True), {}
+    y, u, _ = record(artifact, 40, batch)
 
     def work(i):
-        found[i] = [observer._states(inputs[i], 1.0) for _ in range(20)]
+        observer = KKLObserver(artifact, 0.1 * (i + 1), compiled=True)
+        observer.reset(y[0])
+        steps = np.array([observer.step((1 + 0.1 * i) * y[k], u[k]) for k in range(1, 40)])
+        found[i] = steps, shared.estimate((1 + 0.1 * i) * y, u)
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in inputs]
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for i, z in inputs.items():
-        expected = observer._states(z, 1.0)
-        assert all(np.array_equal(x_hat, expected) for x_hat in found[i])
+    for i in range(4):
+        before = found.pop(i)
+        work(i)
+        assert all(map(np.array_equal, before, found[i]))
 
 
-def test_inputs_that_are_read_only_or_have_strides():
-    """To Numba they are of other types, but a run goes on and compiles nothing in its midst."""
-    one, other = (observers.load("van_der_pol", compiled=choice) for choice in (True, False))
-    held = np.broadcast_to(0.3, (1,))
-    frozen = np.array([0.2])
+def test_a_run_compiles_nothing_in_its_midst():
+    """Whatever may come: inputs that are read-only or have strides, missing samples, restarts."""
+    artifact = TRACKERS[1]()
+    tracker_kernels.kernels.cache_clear()
+    observer, other = (KKLObserver(artifact, 0.1, compiled=choice) for choice in (True, False))
+    used = tuple(map(tuple, (artifact.flow.polynomial != 0).tolist()))
+    kernels = tracker_kernels.kernels(
+        artifact.flow.mlp.activation, artifact.nu, artifact.ny, artifact.flow.degree, used
+    )
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 1]
+    frozen, y = np.array([0.2]), np.array([0.1, 0.2])
     frozen.flags.writeable = False
-    for observer in (one, other):
-        observer.reset([0.5])
-        observer.step([0.4], [0.1])
-    made = len(observers.sparse.single_kernel().signatures)
-    for u in (held, frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0]):
-        assert apart(one.step([0.4], u), other.step([0.4], u), one.artifact) < ACCURATE
-    assert len(observers.sparse.single_kernel().signatures) == made
+    for each in (observer, other):
+        each.reset(y)
+        for u in (np.broadcast_to(0.3, (1,)), frozen, np.zeros((3, 2))[:1, 1], np.float32([0.1]), [0], None):
+            each.step(y, u)
+        for sample in (None, [np.nan, 0.3], [np.nan, np.nan], np.full((2, 2), 0.1)[:, 1], [0, 0]):
+            each.advance(sample)
+            each.advance(sample, rows=np.array(True))
+            each.advance(sample, rows=np.broadcast_to(False, ()))
+        each.restart([y], np.array(True))
+        each.step(y + 1e6)
+    np.testing.assert_allclose(observer.step(y), other.step(y), rtol=1e-4)
+    assert [len(kernel.signatures) for kernel in kernels] == [1, 0, 1]
 
 
-def test_a_batch_compiles_nothing_more_where_rows_restart():
-    observer = observers.load("van_der_pol")
-    y = np.linspace(-1, 1, MANY_ROWS)[:, None]
-    enter = machine.batch_kernels(observer.artifact.inverse.mlp.activation).enter
-    observer.reset(y)
-    observer.step(y, y)
-    made = len(enter.signatures)
-    observer.restart(y[:3], np.arange(MANY_ROWS) < 3)
-    observer.step(y, y)
-    observer.estimate(np.zeros((MANY_ROWS, 1)))
-    assert len(enter.signatures) == made
+def test_outputs_that_are_not_linear_and_maps_without_hidden_layers_stay_with_numpy():
+    artifact, rng = TRACKERS[0](), np.random.default_rng(0)
+    terms = ["+", *(["*", weight, ["x", i]] for i, weight in enumerate(artifact.C[0].tolist()))]
+    mlp = observers.MLP([rng.normal(size=(2, artifact.inverse.mlp.inputs))], [rng.normal(size=2)], "tanh")
+    shallow = replace(random_artifact(), inverse=replace(random_artifact().inverse, mlp=mlp))
+    for one, other in (
+        (KKLObserver(artifact, 0.1, compiled=True), replace(artifact, C=None, h=Expression([terms]))),
+        (KKLObserver(shallow, 0.1, compiled=False), shallow),
+    ):
+        y, u, _ = record(artifact, 30)
+        found = [
+            [each.reset(y[0]), *(each.step(*step) for step in zip(y[1:], u))]
+            for each in (one, KKLObserver(other, 0.1, compiled=True))
+        ]
+        np.testing.assert_allclose(*found, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("batch", [(), (ROWS,)])
+def test_who_stands_still_says_the_same(batch):
+    """To the last bit: a copy, rows that take no sample in, rows beside those that begin anew, what was looked at."""
+    artifact = TRACKERS[0]()
+    y, u, _ = record(artifact, 20, batch)
+    observer, seen = KKLObserver(artifact, 0.1, compiled=True), []
+    observer.reset(y[0])
+    rows = np.arange(ROWS) < 3 if batch else np.array(False)
+    for k in range(1, 20):
+        seen += [observer.step(y[k], u[k]), observer.covariance]
+        kept = [each.copy() for each in seen]
+        seen[-2] += 1.0  # the caller's own
+        x_hat = observer.decode()
+        assert np.array_equal(x_hat, kept[-2])
+        assert np.array_equal(copy.copy(observer).decode(), x_hat)
+        observer.advance(y[k], rows=rows)
+        assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
+        if batch:
+            observer.restart(y[k][rows], rows)
+            assert np.array_equal(observer.decode()[~rows], x_hat[~rows])
+        seen[-2] -= 1.0
+        assert all(np.allclose(each, before, rtol=1e-12) for each, before in zip(seen, kept, strict=True))
+
+
+@pytest.mark.parametrize(("batch", "compiled"), [((), False), ((), True), ((2,), False), ((ROWS,), True)])
+def test_a_covariance_that_breaks_down_is_lost(batch, compiled):
+    """Where outputs are all but exact, rounding makes some of them none."""
+    artifact = TRACKERS[0]()
+    flow = replace(artifact.flow, least_measurement_noise=np.full(1, 1e-13), error=np.full(2, 1e-9))
+    artifact = replace(artifact, flow=replace(flow, process_noise=np.full(2, 1e-9)))
+    observer, taken = KKLObserver(artifact, 0.0, process_noise=0.0, compiled=compiled), 0
+    x = np.random.default_rng(0).normal(size=(*batch, 2))
+    observer.reset(x @ artifact.C.T, x)
+    for _ in range(200):
+        x = artifact.flow(x, np.zeros((*batch, 1)))
+        x_hat = observer.step(x @ artifact.C.T)
+        assert np.isfinite(x_hat).all()
+        assert np.isfinite(observer.covariance).all()
+        taken += np.isclose(x_hat, t_inv(observer), rtol=1e-4).all(-1).any()
+    assert taken

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kkl_gym import KKLObservation, KKLVectorObservation
-from observers import Artifact, ArtifactError, KKLObserver
+from observers import ArtifactError, KKLObserver
 
 
 def records(artifact, *batch, steps=30):
@@ -31,7 +31,7 @@ def test_states_and_parameters_are_parts_of_one_map(make_artifact, free_inverse)
 
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_parameters_step_by_step(make_artifact, batch):
-    observer = KKLObserver(make_artifact(estimated=True, free_inverse=True))
+    observer = KKLObserver(make_artifact(estimated=True, free_inverse=True), 0.1)
     y, u = records(observer.artifact, *batch)
     along = observer.estimate_parameters(y, u)
     assert along.shape == (30, *batch, 1)
@@ -39,14 +39,8 @@ def test_parameters_step_by_step(make_artifact, batch):
     for k in range(1, 30):
         assert observer.step(y[k], u[k - 1]).shape == (*batch, 2)
         np.testing.assert_allclose(observer.parameters_hat, along[k], rtol=1e-5, atol=1e-6)
-
-
-def test_parameters_follow_the_level_of_noise(make_artifact):
-    observer = KKLObserver(make_artifact(estimated=True), 0.1)
-    observer.reset(np.ones(1))
-    before = observer.parameters_hat
     observer.measurement_noise = 0.9
-    assert observer.parameters_hat != before
+    assert (observer.parameters_hat != along[-1]).all()
 
 
 def test_who_estimates_no_parameters_says_so(make_artifact):
@@ -70,39 +64,22 @@ def test_an_observer_fits_every_plant_of_its_range(make_artifact):
         artifact.check("van_der_pol", {}, dt=0.01, ny=1, nu=1)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"parameter_ranges": {"mu": (3.1, 3.3)}}, "must hold its value"),
-        ({"parameter_ranges": {"nu": (3.1, 3.3)}}, "must hold its value"),
-        ({"parameter_ranges": {"mu": (2.0, np.nan)}}, "two finite numbers"),
-        ({"parameter_ranges": {"mu": 3.0}}, "two finite numbers"),
-        ({"parameter_ranges": [3.0]}, "must be a mapping"),
-        ({"parameter_ranges": {}}, "must be among those with a range"),
-    ],
-)
-def test_ranges_that_make_no_sense(make_artifact, changes, message):
-    with pytest.raises(ArtifactError, match=message):
-        dataclasses.replace(make_artifact(estimated=True), **changes)
-
-
-def test_parameters_alone_make_no_observer(make_artifact):
+def test_ranges_that_make_no_sense(make_artifact):
+    artifact = make_artifact(estimated=True)
+    for ranges, message in (
+        ({"mu": (3.1, 3.3)}, "must hold its value"),
+        ({"nu": (3.1, 3.3)}, "must hold its value"),
+        ({"mu": (2.0, np.nan)}, "two finite numbers"),
+        ({"mu": 3.0}, "two finite numbers"),
+        ([3.0], "must be a mapping"),
+        ({}, "must be among those with a range"),
+    ):
+        with pytest.raises(ArtifactError, match=message):
+            dataclasses.replace(artifact, parameter_ranges=ranges)
     names = ("mu", "nu", "xi")
     own = {"parameters": dict.fromkeys(names, 3.0), "parameter_ranges": dict.fromkeys(names, (2, 4))}
     with pytest.raises(ArtifactError, match="no room for a state"):
-        dataclasses.replace(make_artifact(estimated=True), estimated_parameters=names, **own)
-
-
-def test_a_map_of_states_alone_is_itself(make_artifact):
-    inverse = make_artifact("lorenz").inverse
-    assert inverse.part(slice(3)) is inverse
-
-
-def test_files_of_observers_that_estimate_no_parameters_are_of_an_earlier_format(make_artifact, tmp_path):
-    ranged = dataclasses.replace(make_artifact(), parameter_ranges={"mu": (2.0, 4.0)})
-    ranged.save(tmp_path / "ranged.safetensors")
-    assert b'"format":1' in (tmp_path / "ranged.safetensors").read_bytes().replace(b" ", b"").replace(b"\\", b"")
-    assert Artifact.read(tmp_path / "ranged.safetensors").parameter_ranges == {"mu": (2.0, 4.0)}
+        dataclasses.replace(artifact, estimated_parameters=names, **own)
 
 
 def test_wrappers_show_parameters(saved):

@@ -12,7 +12,7 @@ from kkl_gym import get_system
 from kkl_gym.simulate import simulate
 from observers import KKLObserver
 
-KINDS = [{"inputs": inputs, "age": age} for inputs in (0, 1) for age in (0, 1)] + [{"pair": True}]
+KINDS = [{"inputs": 0, "age": 0}, {"pair": True}]
 CLOSE = {"rtol": 1e-5, "atol": 1e-5}  # the networks work in float32
 
 
@@ -138,28 +138,27 @@ def test_shapes_are_the_batches(batch, make_artifact):
     assert np.allclose(observer.estimate(y, x0=x0), steps, **CLOSE)
 
 
-@pytest.mark.parametrize(
-    ("x0", "match"),
-    [
+def test_a_refused_start_changes_nothing(make_artifact):
+    observer = observer_with_T(make_artifact)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer.mismatch
+    observer.reset([0.5])
+    z = observer.z
+    for x0, match in (
         ([0.1], r"x0 must have shape \(.*2,?\), got \(.*1,?\)"),
         ([[0.1, 0.2]], r"x0 must have shape \(.*2,?\), got \(.*1, 2\)"),
         ([0.1, math.nan], "x0 holds NaN, infinity"),
         ([0.1, -math.inf], "leave x0 out"),
         (["a", "b"], "x0 must hold real numbers"),
         (np.ma.masked_array([0.1, 0.2], [False, True]), "x0 holds masked entries"),
-    ],
-)
-def test_a_refused_start_changes_nothing(x0, match, make_artifact):
-    observer = observer_with_T(make_artifact)
-    observer.reset([0.5])
-    z = observer.z
-    for call in (
-        lambda: observer.reset([0.6], x0),
-        lambda: observer.restart([[0.6]], np.array(True), np.ma.stack([x0]) if np.ma.isMA(x0) else [x0]),
-        lambda: observer.estimate([[0.6]], x0=x0),
     ):
-        with pytest.raises(ValueError, match=match):
-            call()
+        for call in (
+            lambda: observer.reset([0.6], x0),  # noqa: B023 - called at once
+            lambda: observer.restart([[0.6]], np.array(True), np.ma.stack([x0]) if np.ma.isMA(x0) else [x0]),  # noqa: B023
+            lambda: observer.estimate([[0.6]], x0=x0),  # noqa: B023
+        ):
+            with pytest.raises(ValueError, match=match):
+                call()
     assert np.array_equal(observer.z, z)
     assert np.array_equal(observer.decode(), KKLObserver(observer.artifact, 0.3).reset([0.5]))
 
@@ -175,23 +174,6 @@ def test_artifacts_without_T_say_where_to_get_one(make_artifact):
         observer.restart([[0.5]], np.array(True), [[0.1, 0.2]])
     with pytest.raises(ValueError, match="no forward map"):
         _ = observer.mismatch
-
-
-def test_mismatch_needs_a_reset(make_artifact):
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer_with_T(make_artifact).mismatch
-
-
-def test_the_network_runs_for_mismatch_only_when_it_is_asked_for(make_artifact, monkeypatch):
-    observer, asked = observer_with_T(make_artifact), []
-    decode = KKLObserver.decode
-    monkeypatch.setattr(KKLObserver, "decode", lambda self, rows=None: asked.append(rows) or decode(self, rows))
-    observer.reset([0.5])
-    asked.clear()
-    observer.advance([0.5])
-    assert not asked
-    _ = observer.mismatch
-    assert len(asked) == 1
 
 
 def test_the_shipped_map_of_reverse_duffing_starts_where_it_is_told():
@@ -220,10 +202,5 @@ def test_a_known_start_may_be_any_array_of_numbers():
     expected = observer.reset([1.0], np.array([1.0, 0.5]))
     for x0 in (torch.tensor([1.0, 0.5]), np.ma.array([1.0, 0.5]), [1, 0.5]):
         found = observer.reset([1.0], x0)
-        assert type(found) is np.ndarray
+        assert type(found) is type(observer.step([1.0])) is np.ndarray
         np.testing.assert_array_equal(found, expected)
-        assert type(observer.step([1.0])) is np.ndarray
-        before = observer.z
-        with pytest.raises(ValueError, match="x0"):
-            observer.reset([2.0], np.array([1.0, np.nan]))
-        np.testing.assert_array_equal(observer.z, before)

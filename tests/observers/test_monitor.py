@@ -1,5 +1,6 @@
 """The residual against its limits."""
 
+import copy
 import dataclasses
 
 import gymnasium as gym
@@ -8,7 +9,7 @@ import pytest
 from random_artifacts import random_artifact
 
 from kkl_gym import ENV_IDS, KKLObservation, KKLVectorObservation
-from observers import Artifact, ArtifactError, KKLObserver, Limits, Monitor
+from observers import ArtifactError, KKLObserver, Limits, Monitor, load
 
 
 def limits(ny=1, **changes):
@@ -47,21 +48,24 @@ def test_limits_between_levels_add_as_variances():
         limits().at(1.01)
 
 
-@pytest.mark.parametrize("wrong", [
-    {"levels": np.array([0.1, 1.0])}, {"levels": np.array([0.0, 0.0])}, {"levels": np.array([0.0])},
-    {"mean": np.array([[0.3], [0.0]])}, {"low": np.array([[-1.0], [0.0]])}, {"high": np.array([[0.1], [0.3]])},
-    {"levels": np.array([[0.0, 0.0], [1.0, 1.0]])}, {"window": np.inf}, {"warm_up": np.inf}, {"duration": np.nan},
-    {"window": 0.0}, {"warm_up": -1.0}, {"false_alarms": 1.0}, {"duration": 0.0}, {"warm_up": 50.0},
-    {"levels": np.array([0.0, np.nan])}, {"high": np.array([[0.1], [np.inf]])}, {"window": True}, {"window": "0.1"},
-    {"duration": None}, {"false_alarms": [0.01]},
-])  # fmt: skip
-def test_impossible_limits(wrong):
-    with pytest.raises(ValueError, match=r"limits|levels|window"):
-        limits(**wrong)
+def test_impossible_limits():
+    for wrong in (
+        {"levels": np.array([0.1, 1.0])}, {"levels": np.array([0.0, 0.0])}, {"levels": np.array([0.0])},
+        {"mean": np.array([[0.3], [0.0]])}, {"low": np.array([[-1.0], [0.0]])}, {"high": np.array([[0.1], [0.3]])},
+        {"levels": np.array([[0.0, 0.0], [1.0, 1.0]])}, {"levels": np.array([0.0, np.nan])}, {"duration": np.nan},
+        {"high": np.array([[0.1], [np.inf]])}, {"window": 0.0}, {"window": np.inf}, {"window": True},
+        {"warm_up": -1.0}, {"warm_up": 50.0}, {"false_alarms": 1.0}, {"false_alarms": [0.01]}, {"duration": "50"},
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=r"limits|levels|window"):
+            limits(**wrong)
+
+
+def watched_artifact(**options):
+    return dataclasses.replace(random_artifact(**options), C=np.array([[1.0, 0.0]]), limits=limits())
 
 
 def test_rows_of_a_batch_are_monitors_of_their_own():
-    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    artifact = watched_artifact()
     rng = np.random.default_rng(1)
     y, u = rng.normal(size=(30, 3, 1)), rng.uniform(-1, 1, (30, 3, 1))
     together = KKLObserver(artifact, 1.0, monitor=True)
@@ -84,7 +88,7 @@ def test_rows_of_a_batch_are_monitors_of_their_own():
 
 
 def test_a_monitor_changes_no_estimate():
-    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    artifact = watched_artifact()
     rng = np.random.default_rng(2)
     y = rng.normal(size=(20, 4, 1))
     plain, watched = KKLObserver(artifact, 0.3), KKLObserver(artifact, 0.3, monitor=True)
@@ -118,7 +122,7 @@ def test_no_score_without_a_monitor_or_limits():
 
 
 def test_another_noise_level_is_another_monitor():
-    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
+    artifact = watched_artifact()
     plain, watched = KKLObserver(artifact, 0.3), KKLObserver(artifact, 0.3, monitor=True)
     y = np.random.default_rng(3).normal(size=(30, 2, 1))
     for observer in (plain, watched):
@@ -131,7 +135,7 @@ def test_another_noise_level_is_another_monitor():
     for k in range(15, 30):
         assert (plain.step(y[k]) == watched.step(y[k])).all()
     assert (watched.score > 0).all()
-    blind = dataclasses.replace(random_artifact(noise=False), C=np.array([[1.0, 0.0]]), limits=limits())
+    blind = watched_artifact(noise=False)
     observer = KKLObserver(blind, 0.5, monitor=True)
     with pytest.raises(ValueError, match="beyond"):
         observer.measurement_noise = 3.0
@@ -139,8 +143,7 @@ def test_another_noise_level_is_another_monitor():
 
 
 def test_rows_are_checked_with_a_monitor_too():
-    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
-    observer = KKLObserver(artifact, 0.3, monitor=True)
+    observer = KKLObserver(watched_artifact(), 0.3, monitor=True)
     observer.reset(np.zeros((3, 1)))
     observer.step(np.zeros((3, 1)))
     for rows in (np.array([0, 2]), np.array([True, False])):
@@ -148,21 +151,26 @@ def test_rows_are_checked_with_a_monitor_too():
             observer.decode(rows)
 
 
-def test_limits_are_stored(tmp_path):
-    artifact = dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits())
-    artifact.save(tmp_path / "a.safetensors")
-    read = Artifact.read(tmp_path / "a.safetensors").limits
+def test_copies_have_monitors_of_their_own_and_files_keep_limits(tmp_path):
+    watched_artifact().save(tmp_path / "a.safetensors")
+    observer = load(tmp_path / "a.safetensors", monitor=True)
+    observer.reset(np.zeros(1))
+    for _ in range(30):
+        observer.step(np.ones(1))
+    score, other = observer.score, copy.copy(observer)
+    for _ in range(30):
+        other.step(np.full(1, 5.0))
+    assert other.score > score == observer.score
     for entry in dataclasses.fields(Limits):
-        assert np.array_equal(getattr(read, entry.name), getattr(artifact.limits, entry.name))
+        assert np.array_equal(getattr(observer.artifact.limits, entry.name), getattr(limits(), entry.name))
 
 
-@pytest.mark.parametrize("estimate", ["x", "z"])
-def test_wrappers_report_the_score(tmp_path, estimate):
+def test_wrappers_report_the_score(tmp_path):
     path = tmp_path / "a.safetensors"
-    dataclasses.replace(random_artifact(), C=np.array([[1.0, 0.0]]), limits=limits()).save(path)
+    watched_artifact().save(path)
     rows = gym.make_vec(ENV_IDS["van_der_pol"], num_envs=2, vectorization_mode="vector_entry_point")
-    many = KKLVectorObservation(rows, str(path), estimate=estimate, monitor=True)
-    ones = [KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, estimate=estimate, monitor=True) for _ in range(2)]
+    many = KKLVectorObservation(rows, str(path), estimate="z", monitor=True)
+    ones = [KKLObservation(gym.make(ENV_IDS["van_der_pol"]), path, estimate="z", monitor=True) for _ in range(2)]
     _, info = many.reset(seed=5)
     assert (info["score"] == 0).all()
     for i, env in enumerate(ones):

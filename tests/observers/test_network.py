@@ -13,8 +13,7 @@ def layers(*sizes):
 
 
 @pytest.mark.parametrize(("activation", "module"), [("tanh", "Tanh"), ("silu", "SiLU")])
-@pytest.mark.parametrize("sizes", [(3, 2), (4, 16, 3), (7, 32, 32, 32, 2)])
-@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+@pytest.mark.parametrize(("sizes", "batch"), [((3, 2), (2, 3)), ((7, 32, 32, 32, 2), ())])
 def test_mlp_equals_torch(activation, module, sizes, batch):
     torch = pytest.importorskip("torch")
     weights, biases = layers(*sizes)

@@ -9,13 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import observers.observer
-from kkl_gym import SYSTEMS
 from observers import KKLObserver, LinearFilter, load
 
-everyone = pytest.mark.parametrize("system", SYSTEMS)
 KINDS = [{"inputs": inputs, "noise": noise, "age": age} for inputs in (0, 1) for noise in (0, 1) for age in (0, 1)] + [
-    {"pair": True},
+    {"system": "lorenz", "pair": True},
     {"free_inverse": True},
 ]
 CLOSE = {"rtol": 1e-5, "atol": 1e-4}  # the network works in float32
@@ -33,11 +30,19 @@ def step_by_step(observer, y, u):
     return np.array(out)
 
 
-@everyone
+def begun(artifact, **options):
+    """Two observers that have taken two samples in."""
+    both = KKLObserver(artifact, **options), KKLObserver(artifact, **options)
+    for observer in both:
+        observer.reset([0.5])
+        observer.step([0.7], [0.1] * artifact.nu)
+    return both
+
+
 @pytest.mark.parametrize("options", KINDS, ids=str)
-def test_the_estimate_is_the_formula(system, options, make_artifact):
-    """Everything that _invert folds together, written out with plain arrays."""
-    artifact = make_artifact(system, **options)
+def test_the_estimate_is_the_formula(options, make_artifact):
+    """All that is folded together, written out with plain arrays."""
+    artifact = make_artifact(**options)
     inverse, observer = artifact.inverse, KKLObserver(artifact, 0.3)
     y, u = record(observer, 5)
     x_hat = step_by_step(observer, y, u)[-1]
@@ -55,39 +60,44 @@ def test_the_estimate_is_the_formula(system, options, make_artifact):
     assert np.allclose(x_hat, inverse.x_offset + inverse.x_scale * (weight @ h + bias), **CLOSE)
 
 
-@pytest.mark.parametrize("options", KINDS, ids=str)
-@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_estimate_equals_step_by_step(options, batch, make_artifact):
-    observer = KKLObserver(make_artifact("lorenz", **options))
-    y, u = record(observer, 300, *batch)  # longer than age_max
-    assert np.allclose(observer.estimate(y, u), step_by_step(observer, y, u), **CLOSE)
+@settings(deadline=None, max_examples=15, derandomize=True)
+@given(
+    batch=st.lists(st.integers(0, 4), max_size=3).map(tuple),
+    options=st.sampled_from(KINDS),
+    seed=st.integers(0, 1000),
+)
+def test_batches_equal_their_rows_and_records_their_steps(make_artifact, batch, options, seed):
+    observer = KKLObserver(make_artifact(**options))
+    y, u = record(observer, 6, *batch, seed=seed)
+    x_hat, z = step_by_step(observer, y, u), observer.z
+    assert x_hat.shape == (6, *batch, observer.artifact.nx)
+    assert x_hat.dtype == z.dtype == np.float64
+    assert z.shape == (*batch, observer.artifact.filter.size)
+    assert np.allclose(observer.estimate(y, u), x_hat, **CLOSE)
+    for index in np.ndindex(*batch):
+        row = (slice(None), *index)
+        assert np.allclose(x_hat[row], step_by_step(observer, y[row], u[row]), **CLOSE)
+        assert np.allclose(z[index], observer.z, rtol=1e-12, atol=1e-13)
 
 
-def test_estimate_in_chunks_is_the_same(make_artifact, monkeypatch):
-    observer = KKLObserver(make_artifact("rossler"))
-    y, u = record(observer, 23, 3)
-    whole = observer.estimate(y, u)
-    for chunk in (1, 12, 22, 69):
-        monkeypatch.setattr(observers.observer, "_CHUNK", chunk)
-        assert np.allclose(observer.estimate(y, u), whole, **CLOSE)
-
-
-def test_estimate_leaves_the_state_alone(make_artifact):
+def test_long_records_go_through_in_parts(make_artifact):
     observer = KKLObserver(make_artifact())
-    y, u = record(observer, 10)
-    observer.estimate(y, u)
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer.z
-    step_by_step(observer, y, u)
-    z = observer.z
-    observer.estimate(-y, u)
-    assert np.array_equal(observer.z, z)
+    y, u = record(observer, 2800, 3)
+    whole, alone = observer.estimate(y, u), step_by_step(observer, y[:, 1], u[:, 1])
+    assert np.allclose(whole[:, 1], alone, **CLOSE)
 
 
-def test_estimate_takes_a_last_row_of_u_more_and_none(make_artifact):
+def test_an_estimate_leaves_the_state_alone_and_takes_a_last_row_of_u_more_and_none(make_artifact):
     observer = KKLObserver(make_artifact())
     y, u = record(observer, 10)
     expected = observer.estimate(y, u)
+    with pytest.raises(RuntimeError, match="reset"):
+        _ = observer.z
+    first = step_by_step(observer, y, u)
+    z = observer.z
+    observer.estimate(-y, u)
+    assert np.array_equal(observer.z, z)
+    assert np.array_equal(step_by_step(observer, y, u), first)  # a reset forgets
     assert np.array_equal(observer.estimate(y, np.concatenate([u, [[99.0]]])), expected)
     assert np.array_equal(observer.estimate(y), observer.estimate(y, 0 * u))
     assert not np.allclose(observer.estimate(y), expected)
@@ -96,11 +106,10 @@ def test_estimate_takes_a_last_row_of_u_more_and_none(make_artifact):
 
 def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
     both = make_artifact(free_inverse=True)
+    linear = LinearFilter(both.filter.A, both.filter.B, both.filter.dt, 0)
     driven, free = (
         KKLObserver(dataclasses.replace(both, free_inverse=None)),
-        KKLObserver(
-            dataclasses.replace(make_artifact(inputs=False), filter=autonomous(both.filter), inverse=both.free_inverse)
-        ),
+        KKLObserver(dataclasses.replace(make_artifact(inputs=False), filter=linear, inverse=both.free_inverse)),
     )
     observer, steps = KKLObserver(both), 12
     y, _ = record(observer, steps, 3)
@@ -120,184 +129,75 @@ def test_until_an_input_acts_the_map_of_free_motion_is_in_use(make_artifact):
         assert np.allclose(step_by_step(alone, y[:, row], u[:, row]), expected[:, row], **CLOSE)
 
 
-def autonomous(linear):
-    return LinearFilter(linear.A, linear.B, linear.dt, 0)
-
-
-@settings(deadline=None, max_examples=40, derandomize=True)
-@given(
-    batch=st.lists(st.integers(0, 4), max_size=3).map(tuple),
-    system=st.sampled_from(list(SYSTEMS)),
-    options=st.sampled_from(KINDS),
-    seed=st.integers(0, 1000),
-)
-def test_batches_equal_their_rows(make_artifact, batch, system, options, seed):
-    observer = KKLObserver(make_artifact(system, **options))
-    y, u = record(observer, 6, *batch, seed=seed)
-    x_hat, z = step_by_step(observer, y, u), observer.z
-    assert x_hat.shape == (6, *batch, observer.artifact.nx)
-    assert x_hat.dtype == z.dtype == np.float64
-    assert z.shape == (*batch, observer.artifact.filter.size)
-    for index in np.ndindex(*batch):
-        row = (slice(None), *index)
-        assert np.allclose(x_hat[row], step_by_step(observer, y[row], u[row]), **CLOSE)
-        assert np.allclose(z[index], observer.z, rtol=1e-12, atol=1e-13)
-
-
-def test_reset_forgets(make_artifact):
-    observer = KKLObserver(make_artifact())
-    y, u = record(observer, 10)
-    first = step_by_step(observer, y, u)
-    assert np.array_equal(step_by_step(observer, y, u), first)
-
-
-def test_a_missing_sample_holds_the_last_where_the_output_is_not_linear(make_artifact):
-    coasting, told = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    y, u = record(told, 4)
-    step_by_step(coasting, y, u)
-    step_by_step(told, y, u)
+def test_a_missing_sample_holds_the_last_where_the_output_is_not_known(make_artifact):
+    coasting, told = begun(make_artifact())
     for _ in range(3):
-        assert np.array_equal(coasting.step(None, u[0]), told.step(y[-1], u[0]))
-    assert np.array_equal(coasting.step(y[0]), told.step(y[0]))
+        assert np.array_equal(coasting.step(None, [0.1]), told.step([0.7], [0.1]))
+    assert np.array_equal(coasting.step([0.2]), told.step([0.2], [0.0]))  # no input is zero input
+    assert not np.array_equal(coasting.step([0.2]), told.step([0.2], [1.0]))
 
 
-def test_no_input_is_zero_input(make_artifact):
-    a, b = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    a.reset([1.0]), b.reset([1.0])
-    assert np.array_equal(a.step([2.0]), b.step([2.0], [0.0]))
-    assert not np.array_equal(a.step([2.0]), b.step([2.0], [1.0]))
-
-
-def test_the_callers_array_may_be_reused(make_artifact):
+def test_arrays_are_the_callers(make_artifact):
     safe, reused = KKLObserver(make_artifact()), KKLObserver(make_artifact())
     y, u = record(safe, 6)
     expected = step_by_step(safe, y, u)
     buffer = y[0].copy()
-    got = [reused.reset(buffer)]
+    got = [reused.reset(buffer).copy()]
     for k in range(5):
         buffer[:] = y[k + 1]
-        got.append(reused.step(buffer, u[k]))
+        x_hat = reused.step(buffer, u[k])
+        got.append(x_hat.copy())
+        x_hat[:] = 99.0
+        reused.z[:] = 99.0
     assert np.array_equal(got, expected)
-
-
-def test_results_are_copies(make_artifact):
-    a, b = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    for observer in (a, b):
-        observer.reset([1.0])
-    a.step([2.0])[:] = 99.0
-    b.step([2.0])
-    a.z[:] = 99.0
-    assert np.array_equal(a.step([3.0]), b.step([3.0]))
-
-
-BAD_Y = [
-    ([math.nan], "NaN, infinity"),
-    ([math.inf], "NaN, infinity"),
-    ([-math.inf], "NaN, infinity"),
-    (1.0, r"shape \(1,\), got \(\)"),
-    ([1.0, 2.0], r"shape \(1,\), got \(2,\)"),
-    ([[1.0]], r"shape \(1,\), got \(1, 1\)"),
-    ([], r"got \(0,\)"),
-]
-BAD_U = [
-    ([math.nan], "u holds NaN"),
-    ([math.inf], "u holds NaN"),
-    ([1e16], r"u holds NaN, infinity or values beyond 1e15: u\[0\] = 1e\+16"),
-    (1.0, r"u must have shape \(1,\), got \(\)"),
-    ([1.0, 2.0], r"u must have shape \(1,\), got \(2,\)"),
-    ([[1.0]], r"u must have shape \(1,\), got \(1, 1\)"),
-]
-
-
-@pytest.mark.parametrize(("y", "u", "match"), [(y, None, m) for y, m in BAD_Y] + [([1.0], u, m) for u, m in BAD_U])
-def test_a_refused_step_changes_nothing(y, u, match, make_artifact):
-    tried, other = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    for observer in (tried, other):
-        observer.reset([0.5])
-        observer.step([0.7], [0.1])
-    with pytest.raises(ValueError, match=match):
-        tried.step(y, u)
-    assert np.array_equal(tried.z, other.z)
-    assert np.array_equal(tried.step(None), other.step(None))
-
-
-@pytest.mark.parametrize(("y0", "match"), [(y, m) for y, m in BAD_Y if np.shape(y) != (1, 1)])
-def test_a_refused_reset_changes_nothing(y0, match, make_artifact):
-    observer = KKLObserver(make_artifact())
-    observer.reset([0.5])
-    z = observer.z
-    with pytest.raises(ValueError, match=match.replace(r"\(1,\)", ".*")):
-        observer.reset(y0)
-    assert np.array_equal(observer.z, z)
 
 
 NO_NUMBERS = {
     "a string": ["1.0"],
-    "bytes": [b"1.0"],
     "a date": np.array(["2020-01-01"], "datetime64[s]"),
-    "a time": np.array([3], "timedelta64[s]"),
     "complex": [1.0 + 2.0j],
-    "a complex array": np.array([1.0 + 0.0j]),
     "structured": np.zeros(1, [("y", float)]),
     "masked": np.ma.masked_array([1.0], [True]),
     "a bool array": np.array([True]),
     "a bool": [True],
     "objects": np.array([1.0], dtype=object),
-    "decimal": [Decimal(1)],
     "nothing": [None],
 }
+BAD_Y = [
+    ([math.nan], "NaN, infinity"),
+    ([-math.inf], "NaN, infinity"),
+    (1.0, r"shape \(1,\), got \(\)"),
+    ([1.0, 2.0], r"shape \(1,\), got \(2,\)"),
+    ([[1.0]], r"shape \(1,\), got \(1, 1\)"),
+    ([], r"got \(0,\)"),
+    *((wrong, "y (must hold real numbers|holds masked entries)") for wrong in NO_NUMBERS.values()),
+]
+BAD_U = [
+    ([math.nan], "u holds NaN"),
+    ([1e16], r"u holds NaN, infinity or values beyond 1e15: u\[0\] = 1e\+16"),
+    (1.0, r"u must have shape \(1,\), got \(\)"),
+    ([[1.0]], r"u must have shape \(1,\), got \(1, 1\)"),
+    *((wrong, "u (must hold real numbers|holds masked entries)") for wrong in NO_NUMBERS.values()),
+]
 
 
-@pytest.mark.parametrize("kind", NO_NUMBERS)
-def test_what_are_no_numbers_is_refused_and_changes_nothing(kind, make_artifact):
-    wrong, words = NO_NUMBERS[kind], "masked entries" if kind == "masked" else "real numbers"
-    tried, other = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    for observer in (tried, other):
-        observer.reset([0.5])
-        observer.step([0.7], [0.1])
-    batch, blind = KKLObserver(make_artifact()), KKLObserver(make_artifact(inputs=False))
-    batch.reset([[0.5], [0.5]])
-    blind.reset([0.5])
-    for call in (
-        lambda: tried.step(wrong),
-        lambda: tried.reset(wrong),
-        lambda: tried.advance(wrong),
-        lambda: tried.estimate(np.ma.stack([wrong, wrong]) if kind == "masked" else np.array([wrong, wrong])),
-        lambda: batch.restart(np.ma.stack([wrong]) if kind == "masked" else np.array([wrong]), np.array([True, False])),
-    ):
-        with pytest.raises(ValueError, match=f"y (must hold|holds) {words}"):
-            call()
-    for call in (
-        lambda: tried.step([0.3], wrong),
-        lambda: blind.step([0.3], wrong),
-        lambda: tried.estimate(np.ones((2, 1)), np.ma.stack([wrong]) if kind == "masked" else np.array([wrong])),
-    ):
-        with pytest.raises(ValueError, match=f"u (must hold|holds) {words}"):
-            call()
+def test_what_is_refused_changes_nothing(make_artifact):
+    tried, other = begun(make_artifact())
+    with pytest.raises(RuntimeError, match="reset"):
+        KKLObserver(make_artifact()).step([1.0])
+    for y, match in BAD_Y:
+        with pytest.raises(ValueError, match=match):
+            tried.step(y)
+        with pytest.raises(ValueError, match=match.replace(r"\(1,\)", ".*")):
+            tried.reset(y) if np.shape(y) != (1, 1) else tried.step(y)
+    for u, match in BAD_U:
+        with pytest.raises(ValueError, match=match):
+            tried.step([1.0], u)
+    for wrong in (np.ma.masked_array([[1.0]], [[True]]), np.array([["a"]])):
+        with pytest.raises(ValueError, match=r"y (must hold real numbers|holds masked entries)"):
+            tried.restart(wrong, np.array(True))
     assert np.array_equal(tried.z, other.z)
     assert np.array_equal(tried.step(None), other.step(None))
-
-
-@pytest.mark.parametrize(
-    "same", [[0.5], (0.5,), np.array([0.5], np.float32), np.array([0.5], ">f8"), np.ma.masked_array([0.5], [False]),
-             np.ma.masked_array([0.5]), np.array([0.5], np.float16), np.array([0.5], np.longdouble)],
-)  # fmt: skip
-def test_every_kind_of_real_array_is_taken(same, make_artifact):
-    observer, plain = KKLObserver(make_artifact()), KKLObserver(make_artifact())
-    assert np.array_equal(observer.reset(same), plain.reset(np.array([0.5])))
-    assert np.array_equal(observer.step(same, same), plain.step(np.array([0.5]), np.array([0.5])))
-    assert type(observer._y) is np.ndarray
-    assert np.array_equal(observer.step([1], np.uint8([1])), plain.step([1.0], [1.0]))
-
-
-def test_reset_is_required(make_artifact):
-    observer = KKLObserver(make_artifact())
-    with pytest.raises(RuntimeError, match="reset"):
-        observer.step([1.0])
-    with pytest.raises(RuntimeError, match="reset"):
-        observer.step(None)
-    with pytest.raises(RuntimeError, match="reset"):
-        _ = observer.z
 
 
 @pytest.mark.parametrize(
@@ -307,6 +207,7 @@ def test_reset_is_required(make_artifact):
         (np.zeros((0, 1)), None, "record"),
         (np.zeros((3, 2)), None, r"\(3, 1\)"),
         (np.full((3, 1), math.nan), None, "NaN"),
+        (np.array([["a"], ["b"]]), None, "y must hold real numbers"),
         (np.zeros((3, 1)), np.zeros((1, 1)), r"2 or 3 rows for 3 rows of y, got shape \(1, 1\)"),
         (np.zeros((3, 1)), 0.0, r"2 or 3 rows for 3 rows of y, got shape \(\)"),
         (np.zeros((3, 1)), np.zeros((2, 2)), r"u must have shape \(1,\)"),
@@ -318,44 +219,57 @@ def test_wrong_records_raise(y, u, match, make_artifact):
         KKLObserver(make_artifact()).estimate(y, u)
 
 
-def test_blind_map_refuses_inputs(make_artifact):
-    observer = KKLObserver(make_artifact(inputs=False))
-    observer.reset([1.0])
-    z = observer.z
+@pytest.mark.parametrize(
+    "same", [[0.5], (0.5,), np.array([0.5], np.float32), np.array([0.5], ">f8"), np.ma.masked_array([0.5], [False]),
+             np.array([0.5], np.longdouble)],
+)  # fmt: skip
+def test_every_kind_of_real_array_is_taken(same, make_artifact):
+    observer, plain = KKLObserver(make_artifact()), KKLObserver(make_artifact())
+    assert np.array_equal(observer.reset(same), plain.reset(np.array([0.5])))
+    assert np.array_equal(observer.step(same, same), plain.step(np.array([0.5]), np.array([0.5])))
+    assert type(observer.step(None)) is type(observer.z) is np.ndarray
+    plain.step(None)
+    assert np.array_equal(observer.step([1], np.uint8([1])), plain.step([1.0], [1.0]))
+
+
+def test_a_map_without_inputs_refuses_them(make_artifact):
+    observer, other = begun(make_artifact(inputs=False))
     with pytest.raises(ValueError, match=r"van_der_pol knows no inputs, but u = \[0\.5\]"):
         observer.step([1.0], np.array([0.5]))
     with pytest.raises(ValueError, match="knows no inputs"):
         observer.estimate(np.zeros((3, 1)), np.ones((2, 1)))
-    assert np.array_equal(observer.z, z)
-    observer.step([1.0], [0.0])
+    with pytest.raises(ValueError, match="u must hold real numbers"):
+        observer.step([1.0], ["a"])
+    assert np.array_equal(observer.step([1.0], [0.0]), other.step([1.0]))
 
 
-NO_LEVELS = [-0.1, math.nan, math.inf, 10**400, True, np.True_, "0.5", b"0.5", 0.5 + 0j, Decimal("0.5")]
+NO_LEVELS = [-0.1, math.nan, math.inf, 10**400, True, np.True_, "0.5", 0.5 + 0j, Decimal("0.5")]
 
 
-@pytest.mark.parametrize("level", [*NO_LEVELS, *([level] for level in NO_LEVELS)], ids=lambda value: repr(value)[:9])
-@pytest.mark.parametrize("noise", [False, True])
-def test_wrong_noise_level_raises(level, noise, make_artifact):
-    observer = KKLObserver(make_artifact(noise=noise), 0.2)
-    which = r"\[0\]" if isinstance(level, list) else ""
-    with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
-        observer.measurement_noise = level
-    assert observer.measurement_noise == 0.2
-    with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
-        KKLObserver(make_artifact(noise=noise), level)
+@pytest.mark.parametrize("level", NO_LEVELS, ids=lambda value: repr(value)[:9])
+def test_wrong_levels_of_noise_raise(level, make_artifact):
+    observer = KKLObserver(make_artifact(process=True), 0.2, process_noise=0.1)
+    for wrong, which in ((level, ""), ([level], r"\[0\]")):
+        with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
+            observer.measurement_noise = wrong
+        with pytest.raises(ValueError, match=f"measurement_noise{which} must be a finite number, not negative, got "):
+            KKLObserver(make_artifact(noise=False), wrong)
+        with pytest.raises(ValueError, match="process_noise must be a finite number, not negative, got"):
+            observer.process_noise = wrong
+    assert (observer.measurement_noise, observer.process_noise) == (0.2, 0.1)
 
 
 def test_there_are_as_many_noise_levels_as_outputs(make_artifact):
     observer = KKLObserver(make_artifact(), [0.2])
     assert observer.measurement_noise == 0.2
-    for wrong in ([], [0.1, 0.3], np.zeros((0,))):
+    for wrong in ([], [0.1, 0.3]):
         with pytest.raises(ValueError, match="one for each of 1 outputs"):
             observer.measurement_noise = wrong
     with pytest.raises(ValueError, match="measurement_noise must be a finite number"):
         observer.measurement_noise = None  # which means what is usual where an observer is made, and only there
 
 
-@pytest.mark.parametrize("level", [0, 1, np.float32(0.5), np.int8(1), Fraction(1, 2)])
+@pytest.mark.parametrize("level", [1, np.float32(0.5), np.int8(1), Fraction(1, 2)])
 def test_every_kind_of_real_number_is_a_noise_level(level, make_artifact):
     observer = KKLObserver(make_artifact(process=True), level, process_noise=level)
     assert (observer.measurement_noise, observer.process_noise) == (float(level), float(level))
@@ -381,11 +295,11 @@ def test_noise_level_told_changes_the_estimate(make_artifact):
 @pytest.mark.parametrize("free", [False, True])
 def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_artifact, free):
     artifact = make_artifact(process=True, free_inverse=free)
-    estimates = [KKLObserver(artifact, process_noise=level).reset([1.0]) for level in (0.0, 0.1, 0.2, 5.0)]
+    estimates = [KKLObserver(artifact, process_noise=level).reset([1.0]) for level in (0.0, 0.1, 0.2, 5.0, None)]
     assert not np.allclose(estimates[0], estimates[1], atol=1e-6)
     assert not np.allclose(estimates[1], estimates[2], atol=1e-6)
     assert np.array_equal(estimates[2], estimates[3])
-    assert np.array_equal(estimates[2], KKLObserver(artifact).reset([1.0]))
+    assert np.array_equal(estimates[2], estimates[4])
     observer = KKLObserver(artifact)
     observer.process_noise = 0.1
     assert np.array_equal(estimates[1], observer.reset([1.0]))
@@ -400,21 +314,8 @@ def test_process_noise_told_changes_the_estimate_up_to_what_training_had(make_ar
     told = [math.log1p(0.5 / inverse.measurement_noise_unit), math.log1p(0.1 / 0.01), *([] if free else [0.0])]
     expected = inverse.x_offset + inverse.x_scale * inverse.mlp(np.array([*modes, *told]))
     assert np.allclose(estimates[1], expected, atol=1e-5)
-
-
-def test_process_noise_is_told_only_to_maps_that_ask(make_artifact):
-    artifact = make_artifact()
-    assert np.array_equal(KKLObserver(artifact, process_noise=0.1).reset([1.0]), KKLObserver(artifact).reset([1.0]))
-
-
-@pytest.mark.parametrize("level", [*NO_LEVELS, [0.5], np.array([0.5])], ids=lambda value: repr(value)[:9])
-def test_wrong_process_noise_raises(level, make_artifact):
-    with pytest.raises(ValueError, match="process_noise must be a finite number, not negative, got"):
-        KKLObserver(make_artifact(), process_noise=level)
-    observer = KKLObserver(make_artifact(process=True), process_noise=0.1)
-    with pytest.raises(ValueError, match="process_noise must be"):
-        observer.process_noise = level
-    assert observer.process_noise == 0.1
+    plain = make_artifact()  # is told none
+    assert np.array_equal(KKLObserver(plain, process_noise=0.1).reset([1.0]), KKLObserver(plain).reset([1.0]))
 
 
 def test_age_changes_the_estimate_until_age_max(make_artifact):
@@ -425,28 +326,20 @@ def test_age_changes_the_estimate_until_age_max(make_artifact):
     assert np.allclose(x_hat[200:], x_hat[200], rtol=1e-6)
 
 
-def test_load_passes_its_settings_on(saved):
-    observer = load(saved(process=True), 0.3, process_noise=0.1)
+def test_load_passes_its_settings_on(saved, make_artifact):
+    path = saved(process=True)
+    observer, direct = load(path, 0.3, process_noise=0.1), KKLObserver(make_artifact(process=True), 0.3)
     assert (observer.measurement_noise, observer.process_noise) == (0.3, 0.1)
-
-
-@pytest.mark.parametrize("call", [load, KKLObserver])
-def test_all_but_the_measurement_noise_goes_by_name(call, saved, make_artifact):
-    first = saved() if call is load else make_artifact()
-    with pytest.raises(TypeError, match="positional"):
-        call(first, 0.3, True)
-    kinds = [(name, p.kind.name, p.default) for name, p in inspect.signature(call).parameters.items()][1:]
-    assert kinds == [
-        ("measurement_noise", "POSITIONAL_OR_KEYWORD", None),
-        ("process_noise", "KEYWORD_ONLY", None),
-        ("monitor", "KEYWORD_ONLY", False),
-        ("compiled", "KEYWORD_ONLY", None),
-    ]
-
-
-def test_load_from_a_file(saved, make_artifact):
-    observer = load(saved(system="lorenz"), 0.4)
-    direct = KKLObserver(make_artifact("lorenz"), 0.4)
+    direct.process_noise = 0.1
     y, u = record(direct, 5)
-    assert observer.measurement_noise == 0.4
     assert np.array_equal(observer.estimate(y, u), direct.estimate(y, u))
+    for call, first in ((load, path), (KKLObserver, make_artifact())):
+        with pytest.raises(TypeError, match="positional"):
+            call(first, 0.3, True)
+        kinds = [(name, p.kind.name, p.default) for name, p in inspect.signature(call).parameters.items()][1:]
+        assert kinds == [
+            ("measurement_noise", "POSITIONAL_OR_KEYWORD", None),
+            ("process_noise", "KEYWORD_ONLY", None),
+            ("monitor", "KEYWORD_ONLY", False),
+            ("compiled", "KEYWORD_ONLY", None),
+        ]

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from random_tracking import a_flow
 
-from observers.polynomial import count, degree_of, monomials, table
+from observers.polynomial import count, degree_of, monomials
 
 
-@pytest.mark.parametrize(("variables", "degree"), [(1, 4), (2, 1), (3, 5), (4, 3), (7, 2)])
+@pytest.mark.parametrize(("variables", "degree"), [(1, 4), (3, 5), (7, 2)])
 def test_monomials_are_all_products_once(variables, degree):
     q = np.random.default_rng(0).normal(size=(6, 2, variables))
     chosen = [each for k in range(degree + 1) for each in itertools.combinations_with_replacement(range(variables), k)]
@@ -24,12 +24,6 @@ def test_what_is_no_number_of_monomials_has_no_degree():
     found = [degree_of(terms, 3) for terms in range(12)]
     assert found == [None, 0, None, None, 1, *[None] * 5, 2, None]
     assert degree_of(0, 0) is degree_of(5, 0) is None
-
-
-def test_each_monomial_is_an_earlier_one_times_a_variable():
-    earlier, by = table(4, 3)
-    assert (earlier[1:] < np.arange(1, len(earlier))).all()
-    assert by.max() == 3
 
 
 def test_a_flow_of_a_higher_degree_goes_on_with_one_of_a_lower():

@@ -19,8 +19,7 @@ def supervision(window, ny=1):
     return Supervision.of(SimpleNamespace(window=window * DT, least_measurement_noise=np.zeros(ny)), DT)
 
 
-@pytest.mark.parametrize("ny", [1, 2])
-@pytest.mark.parametrize("window", [50, 200])
+@pytest.mark.parametrize(("ny", "window"), [(1, 50), (2, 100)])
 def test_limits_are_beyond_chance(window, ny):
     """Running means along independent innovations: 1 on average, and hardly ever beyond their limits."""
     watch, rows, steps = supervision(window, ny), 1000, 25 * window
@@ -48,7 +47,7 @@ def test_a_window_may_be_a_single_sample():
     assert 1 < watch.trend_limit < 100
 
 
-def followed(off, steps):
+def followed(off, steps, told_again=False):
     """Errors and standard deviations, (steps, 2), of an estimate that is off and holds that for impossible."""
     (Phi, _), rng = exact_motion(), np.random.default_rng(3)
     artifact = tracking_observer()
@@ -58,39 +57,29 @@ def followed(off, steps):
     observer.reset(C @ x, x0=x + off)
     for _ in range(steps):
         x = Phi @ x
-        error = observer.step(C @ x + LEVEL * rng.standard_normal(1)) - x
-        found.append((error, observer.std))
-        assert observer._tracker._mean_square[0] < observer._tracker._supervision.limit  # it is not lost
+        if told_again:
+            observer.measurement_noise = LEVEL
+        found.append((observer.step(C @ x + LEVEL * rng.standard_normal(1)) - x, observer.std))
     return map(np.array, zip(*found, strict=True))
 
 
-def test_an_estimate_that_is_off_by_less_than_the_noise_is_believed_less():
-    error, std = followed(0.5 * LEVEL * np.ones(2), 3000)
+@pytest.mark.parametrize("told_again", [False, True])
+def test_an_estimate_that_is_off_by_less_than_the_noise_is_believed_less(told_again):
+    """Also where levels of noise are set meanwhile: what is watched goes on."""
+    error, std = followed(0.5 * LEVEL * np.ones(2), 2000, told_again)
     risen = std[1:] / std[:-1]
     assert risen.max() == pytest.approx(np.sqrt(10.0), rel=0.1)
     assert 1 <= (risen[:, 0] > 2).sum() <= 4
-    assert std.max() < 0.5 * STD  # which T_inv would have said
+    assert std.max() < 0.5 * STD  # which T_inv would have said, were it lost
     assert np.abs(error[:20]).max() > 0.09
     assert np.abs(error[-200:]).max() < 0.03
     assert (np.abs(error) / std)[-200:].max() < 4
 
 
 def test_an_estimate_that_is_right_stays_as_sure():
-    error, std = followed(np.zeros(2), 5000)
+    error, std = followed(np.zeros(2), 2000)
     assert (std[1:] < 1.1 * std[:-1]).all()
     assert np.abs(error).max() < 0.01
-
-
-def test_what_is_watched_goes_on_at_other_levels_of_noise():
-    observer, rng = KKLObserver(tracking_observer(), LEVEL, process_noise=0.0), np.random.default_rng(0)
-    observer.reset(np.zeros((3, 1)))
-    for _ in range(30):
-        observer.step(LEVEL * rng.standard_normal((3, 1)))
-    before = observer._tracker._state[:, observer._tracker._end :].copy()
-    assert (before[:, :2] != 1.0).all()
-    assert (before[:, 2:] != 0.0).all()
-    observer.measurement_noise = 2 * LEVEL
-    np.testing.assert_array_equal(observer._tracker._state[:, observer._tracker._end :], before)
 
 
 def test_noise_that_is_not_white_is_told_as_the_white_noise_that_is_as_bad():
@@ -104,7 +93,7 @@ def test_noise_that_is_not_white_is_told_as_the_white_noise_that_is_as_bad():
     errors: list[list[np.ndarray]] = [[], []]
     for observer in observers:
         observer.reset(x @ C.T + noise)
-    for k in range(1000):
+    for k in range(600):
         x = x @ Phi.T
         noise = rho * noise + np.sqrt(1 - rho**2) * LEVEL * rng.standard_normal((50, 1))
         for observer, of in zip(observers, errors, strict=True):

@@ -16,9 +16,10 @@ from training.commands.teaching import Teaching
 class ErrorBars(Teaching):
     """Learn how far an observer's estimates are off: the covariance of its errors, at each sample.
 
-    T_inv and all else in the file stay as they are, to the last bit. A small network beside it learns from motions like
-    those of the training, but others, and is calibrated on further ones. Regions of 90 % then hold 90 % of the errors.
-    That is so at each level of measurement noise that the map is told, at each age, with or without process noise.
+    T_inv stays as it is, to the last bit; an observer that tracks has to be taught that again (kkl-gym tracking). A
+    small network beside it learns from motions like those of the training, but others, and is calibrated on further
+    ones. Regions of 90 % then hold 90 % of the errors. That is so at each level of measurement noise that the map is
+    told, at each age, with or without process noise.
 
     Of an observer from recorded states nothing can be simulated. It takes the records that it was trained on, --data.
     """

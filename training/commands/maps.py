@@ -9,7 +9,7 @@ from rich.table import Table
 from observers import Artifact, shipped
 from observers.names import resolve
 
-LEAST_WIDTH = 80  # of the table
+WIDTH = 80  # of the table; a narrower terminal breaks its lines, which cuts nothing
 
 
 @dataclass(frozen=True)
@@ -18,15 +18,13 @@ class Maps:
 
     def run(self, console: Console) -> None:
         """Print a row for each."""
-        names = shipped()
-        table = Table(
-            box=SIMPLE_HEAD, show_edge=False, padding=0, caption="*: tracks; –: not told", caption_justify="left"
-        )
-        table.add_column("map", min_width=max(map(len, names)))  # which wraps between words only
+        caption = "*: tracks; –: not told"
+        table = Table(box=SIMPLE_HEAD, show_edge=False, padding=0, width=WIDTH, caption=caption, caption_justify="left")
+        table.add_column("map", no_wrap=True)
         table.add_column("pipeline", no_wrap=True)
         for column in ("inputs", "modes", "measurement\nnoise up to", "process\nnoise\nup to", "MB"):
             table.add_column(column, justify="right", no_wrap=True)
-        for name in names:
+        for name in shipped():
             path = resolve(name)
             artifact = Artifact.read(path)
             told = artifact.inverse.features
@@ -39,6 +37,4 @@ class Maps:
                 f"{artifact.process_noise_max:g}" if artifact.process_noise_max is not None else "–",
                 f"{path.stat().st_size / 1e6:.2f}",
             )
-        if console.width < LEAST_WIDTH:  # the terminal breaks lines then, which cuts nothing
-            table.width = LEAST_WIDTH
         console.print(table, crop=False)

@@ -27,17 +27,13 @@ def learn_recorded_error_bars(
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,
 ) -> Artifact:
-    """Learn the covariance of an observer's errors from records. Its estimates stay as they are.
+    """Learn the covariance of an observer's errors from records, of T_inv alone where it tracks.
 
     A small network is fitted to what T_inv is off by along the records that it was trained on, at every age and level
     of noise. There it errs less than elsewhere. Factors from the records that were held out make up for that, so that
     regions of 90 % hold 90 % of the errors.
     """
-    if artifact.flow is not None:
-        raise ValueError(
-            "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
-            "it was made from (of those that ship NAME-static), then teach that to track"
-        )
+    artifact = dataclasses.replace(artifact, flow=None)  # the tracker rests on the error bars that it had
     integer("steps", steps, 1)
     integer("seed", seed, 0)
     config, device = config_of(artifact), device or torch.device("cpu")

@@ -35,7 +35,7 @@ def learn_error_bars(
     device: torch.device | None = None,
     console: Console | ProgressBars | None = None,
 ) -> Artifact:
-    """Learn the covariance of an observer's errors. Its estimates stay as they are.
+    """Learn the covariance of an observer's errors, of T_inv alone where it tracks.
 
     Motions are simulated as in its training, but others. A small network is fitted to what T_inv is off by on them, at
     every age and level of noise, by Gaussian likelihood. Then factors are found on further motions, so that regions of
@@ -44,11 +44,7 @@ def learn_error_bars(
     the ends of the ranges.
     """
     artifact.check(system.name, system.parameters, dt=artifact.filter.dt, ny=system.ny, nu=system.nu)
-    if artifact.flow is not None:
-        raise ValueError(
-            "this observer tracks, and its flow rests on the error bars that it has: learn error bars for the map that "
-            "it was made from (of those that ship NAME-static), then teach that to track"
-        )
+    artifact = dataclasses.replace(artifact, flow=None)  # the tracker rests on the error bars that it had
     if steps < 1 or trajectories < 100 or seed < 0:
         raise ValueError(
             f"need a step at least, 100 trajectories and a seed that is not negative, got {steps}, {trajectories}, "

@@ -223,29 +223,17 @@ class WindowRefits(BaseCallback):
         self.training_env.env_method("replace_estimator", estimator)
 
 
-class _Stacked:
-    """The estimator for :func:`learn_to_play`."""
-
-    learn = staticmethod(learn_window)
-
-    def show(self, task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
-        """Show the network's estimates."""
-        return show_window(task, path, keep=keep)
-
-    def refits(
-        self,
-        task: HiddenTask,
-        learn: Callable[[Sequence[Record]], Path],
-        every: int,
-        rehearsal: int,
-        path: Path,
-        records: Sequence[Record],
-    ) -> BaseCallback:
-        """Fit the network again."""
-        return WindowRefits(learn, every, rehearsal, records)
+def _show(task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
+    return show_window(task, path, keep=keep)
 
 
-STACKED: Estimation = _Stacked()
+def _refits(
+    task: HiddenTask, learn: Callable[[Sequence[Record]], Path], every: int, rehearsal: int, path: Path, records: Any
+) -> BaseCallback:
+    return WindowRefits(learn, every, rehearsal, records)
+
+
+STACKED = Estimation(learn_window, _show, _refits)
 
 
 def _or_one(scale: np.ndarray) -> np.ndarray:

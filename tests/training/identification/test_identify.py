@@ -34,7 +34,7 @@ class Spring(System):
     X: ClassVar = ((-1.0, 1.0), (-2.0, 2.0))
     bounds: ClassVar = ((-9.0, 9.0), (-30.0, 30.0))
     u_max: ClassVar = (1.0,)
-    dt: ClassVar = 0.02
+    dt: ClassVar = 0.05
 
     def f(self, x):
         return x[1], -self.stiffness * x[0] - self.damping * x[1]
@@ -72,43 +72,42 @@ def found(system, unknown, measured, folder, **options):
         return estimate_parameters(system.replace(unknown), limits, measured, folder, progress=progress, **options)
 
 
+UNKNOWN = {"stiffness": 6.0, "damping": 0.2, "gain": 1.4}
+
+
 def test_without_noise_parameters_are_exact(tmp_path):
-    got = found(VanDerPol(), {"mu": 1.8}, records(VanDerPol(), 8, seconds=12), tmp_path, steps=60)
-    assert got.system.mu == pytest.approx(3.0, rel=1e-6)
+    got = found(Spring(), UNKNOWN, records(Spring(), 6, seconds=8, driven=True), tmp_path, steps=30)
+    assert got.system.parameters == pytest.approx(Spring().parameters, rel=1e-6)
     assert (got.symmetries, got.hanging_states) == ([], ())
     assert np.abs(got.predictions[0].residuals).max() < 1e-6
-    assert list(got.to_json()) == ["mu"]
+    assert list(got.to_json()) == ["stiffness", "damping", "gain"]
 
 
-def test_inputs_and_standard_errors(tmp_path):
-    unknown = {"stiffness": 6.0, "damping": 0.2, "gain": 1.4}
-    measured = records(Spring(), 8, seconds=12, noise=0.02, driven=True)
-    got = found(Spring(), unknown, measured, tmp_path, steps=60)
+def test_noise_and_standard_errors(tmp_path):
+    measured = records(Spring(), 6, seconds=8, noise=0.02, driven=True)
+    got = found(Spring(), UNKNOWN, measured, tmp_path, steps=30)
     for name, error in got.standard_errors.items():
         truth = Spring().parameters[name]
         assert abs(got.system.parameters[name] - truth) < 4 * error < 0.1 * truth, name
     assert got.noise == pytest.approx(0.02, rel=0.1)
 
 
-def test_standard_errors_cover_the_truth(tmp_path):
-    """From the truth on, as what is tested is the error that is told: normalised, it is standard normal."""
-    off = []
-    for seed in range(10):
-        got = found(
-            Spring(),
-            {"stiffness": 4.1},
-            records(Spring(), 2, seconds=5, noise=0.05, seed=seed),
-            tmp_path / str(seed),
-            steps=1,
-        )
-        off.append((got.system.stiffness - 4.0) / got.standard_errors["stiffness"])
-    assert np.abs(off).max() < 3.5
-    assert 0.4 < np.std(off) < 1.8
+def test_equal_seeds_find_equal_parameters(tmp_path):
+    measured = records(Spring(), 2, seconds=5, noise=0.02)
+    one, same, other = (
+        found(Spring(), {"stiffness": 4.4}, measured, tmp_path / str(i), steps=3, seed=seed)
+        for i, seed in enumerate((1, 1, 2))
+    )
+    assert one.history == same.history != other.history
+    assert one.system == same.system
 
 
-@pytest.mark.slow
 def test_what_duffings_output_does_not_tell(tmp_path):
-    got = found(ReverseDuffing(), {"a": 1.4, "b": 1.3}, records(ReverseDuffing(), 8, seconds=12), tmp_path, steps=150)
+    class Duffing(ReverseDuffing):
+        name: ClassVar[str] = "coarse_duffing"
+        dt: ClassVar = 0.05
+
+    got = found(Duffing(), {"a": 1.4, "b": 1.3}, records(Duffing(), 4, seconds=4), tmp_path, steps=30)
     assert got.to_json() == {name: {"value": None, "standard_error": None} for name in "ab"}
     (product,) = got.products
     assert product.text == "a b^3"
@@ -116,6 +115,7 @@ def test_what_duffings_output_does_not_tell(tmp_path):
     assert got.hanging_states == ("x2",)
     assert "a b^3 = 1" in " ".join(got.told())
     assert got.system.a * got.system.b**3 == pytest.approx(1.0, rel=1e-5)
+    assert got.system.a / got.system.b == pytest.approx(1.4 / 1.3, rel=0.01)  # nearest to what was given
 
 
 def test_signs_that_outputs_do_not_tell():
@@ -179,9 +179,7 @@ def test_identified_and_adapted_observers(tmp_path):
         ({}, "name a parameter"),
         ({"nu": (0.0, 1.0)}, "no parameter 'nu'"),
         ({"mu": (4.0, 5.0)}, "between finite limits, got 3 in 4.0 to 5.0"),
-        ({"mu": (5.0, 1.0)}, "between finite limits"),
         ({"mu": (0.0, float("inf"))}, "between finite limits, got 3 in 0.0 to inf"),
-        ({"mu": (float("nan"), 5.0)}, "between finite limits"),
     ],
 )
 def test_unknowns_that_make_no_sense(unknown, message, tmp_path):
@@ -206,7 +204,7 @@ def test_a_parameter_at_its_limit_is_told(tmp_path):
         got = estimate_parameters(
             Spring(3.5),
             {"stiffness": (3.0, 3.7)},
-            records(Spring(), 2, seconds=5, noise=0.05),
+            records(Spring(), 2, seconds=8, noise=0.05),
             tmp_path,
             progress=progress,
             steps=1,

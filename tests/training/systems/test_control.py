@@ -10,14 +10,12 @@ from training.systems import controller
 from training.trajectories.controllers import linear_quadratic
 from training.trajectories.derivatives import linearised
 
-everyone = pytest.mark.parametrize("name", SYSTEMS)
-
 
 def nothing(obs):
     return np.zeros((len(obs), 1))
 
 
-@everyone
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_linearisation_equals_finite_differences(name):
     system = get_system(name)
     x, eps = np.random.default_rng(0).uniform(*system.box()), 1e-6
@@ -28,7 +26,7 @@ def test_linearisation_equals_finite_differences(name):
     assert B.tolist() == [list(row) for row in system.G]
 
 
-@pytest.mark.parametrize("name", ["van_der_pol", "rossler", "lorenz"])
+@pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
 def test_the_linear_quadratic_regulator_stabilises_the_target(name):
     system = get_system(name)
     A, B, _ = linearised(system, system.target)
@@ -40,7 +38,8 @@ def test_the_linear_quadratic_regulator_stabilises_the_target(name):
     assert np.abs(act(np.random.default_rng(0).uniform(*system.box(), (50, system.nx)))).max() == 1.0
 
 
-@everyone
+# Of the two others one succeeds in half of all episodes alone, and one is slow to simulate.
+@pytest.mark.parametrize("name", ["reverse_duffing", "van_der_pol"])
 def test_the_state_feedback_succeeds_where_nothing_fails(name):
     task, n = TASKS[name], 20
     episodes = play(task.make(n, autoreset_mode="Disabled"), controller(get_system(name)), steps=task.steps, seed=0)
@@ -49,7 +48,7 @@ def test_the_state_feedback_succeeds_where_nothing_fails(name):
     assert episodes.x.shape == (task.steps + 1, n, get_system(name).nx)
     assert episodes.u.shape == (task.steps, n, 1)
     assert not (episodes.escaped | idle.escaped).any()
-    assert successes(task, episodes.x).mean() >= (0.5 if name == "lorenz" else 0.95)
+    assert successes(task, episodes.x).mean() >= 0.95
     assert successes(task, idle.x).mean() <= 0.1
     assert scores(get_system(name), episodes.x).mean() > scores(get_system(name), idle.x).mean() + 0.2
 
@@ -58,14 +57,12 @@ def test_the_task_acts_once_a_period_and_ends_in_time():
     task = ControlTask("van_der_pol", measurement_noise=0.1, period=0.05, duration=1.0, start_box=((1, 1), (0, 0)))
     assert (task.repeat, task.steps) == (5, 20)
     env = task.make(2)
-    env.reset(seed=0)
+    assert env.reset(seed=0)[0].tolist() == [[1.0, 0.0]] * 2
     for k in range(task.steps):
         obs, _, _, truncated, info = env.step(np.zeros((2, 1)))
         assert truncated.all() == (k == task.steps - 1)
     assert obs.shape == (2, 2)
     assert info["final_info"]["sample"].tolist() == [100, 100]
-    start = task.make(2).reset(seed=0)[0]
-    assert start.tolist() == [[1.0, 0.0]] * 2
 
 
 def test_scores_and_successes_by_hand():
@@ -82,11 +79,9 @@ def test_scores_and_successes_by_hand():
     assert successes(task, x).tolist() == [True, True]
 
 
-@pytest.mark.parametrize("wrong", [
-    {"tolerance": 0.0}, {"tolerance": float("nan")}, {"dt": 0.0},
-    {"duration": float("inf")}, {"period": "0.05"}, {"dt": True},
-    {"period": 0.005}, {"period": 0.015}, {"duration": 0.0}, {"duration": 19.97}, {"duration": 1e9},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong", [{"tolerance": float("nan")}, {"dt": True}, {"period": 0.015}, {"duration": 19.97}, {"duration": 1e9}]
+)
 def test_impossible_tasks(wrong):
     with pytest.raises(ValueError, match=r"task needs|whole multiple|must be a finite number|at most 100000 samples"):
         ControlTask("lorenz", **wrong)

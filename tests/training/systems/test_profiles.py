@@ -7,14 +7,8 @@ from observers import shipped
 from training.presets import preset
 from training.systems import PROFILES, Profile, profile
 
-everyone = pytest.mark.parametrize("name", PROFILES)
 
-
-def test_every_shipped_system_has_a_profile():
-    assert list(PROFILES) == list(SYSTEMS)
-
-
-@everyone
+@pytest.mark.parametrize("name", PROFILES)
 def test_a_profile_fits_its_system(name):
     found, system = PROFILES[name], get_system(name)
     assert profile(system) is found
@@ -25,5 +19,6 @@ def test_a_profile_fits_its_system(name):
     assert found.eigenvalues is None or config.eigenvalues == pytest.approx(found.eigenvalues, abs=1e-6)
 
 
-def test_a_system_of_ones_own_gets_the_defaults(script):
+def test_every_shipped_system_has_one_and_others_the_defaults(script):
+    assert list(PROFILES) == list(SYSTEMS)
     assert profile(get_system(f"{script}:Pendulum")) == Profile()

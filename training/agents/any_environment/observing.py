@@ -2,8 +2,9 @@
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -103,57 +104,35 @@ def learn_observer(
     return path
 
 
-class Estimation(Protocol):
-    """How estimates of hidden signals are learned from an agent's steps, and shown to the agent."""
-
-    def learn(
-        self, task: HiddenTask, records: Sequence[Record], folder: Path, *, seed: int, progress: ProgressBars
-    ) -> Path:
-        """Learn from the first steps; returns the file of what was learned."""
-        ...
-
-    def show(self, task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
-        """Make the environment that shows estimates, and keeps the last ``keep`` steps to learn from again."""
-        ...
-
-    def refits(
-        self,
-        task: HiddenTask,
-        learn: Callable[[Sequence[Record]], Path],
-        every: int,
-        rehearsal: int,
-        path: Path,
-        records: Sequence[Record],
-    ) -> BaseCallback:
-        """Make what learns again from an agent's own steps, beside those of ``records``."""
-        ...
+def refits(
+    task: HiddenTask,
+    learn: Callable[[Sequence[Record]], Path],
+    every: int,
+    rehearsal: int,
+    path: Path,
+    records: Sequence[Record],
+) -> BaseCallback:
+    """Make what fits an observer again to an agent's own steps, beside those of ``records``."""
+    outputs = CLEAN_Y if task.measurement_noise else "y"
+    return KKLTrainingCallback(
+        every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
+    )
 
 
-class _KKL:
-    """By a KKL observer."""
-
-    learn = staticmethod(learn_observer)
-
-    def show(self, task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
-        """Show the observer's estimates; :class:`KKLTrainingCallback` keeps the steps."""
-        return show(task, "x_hat", path)
-
-    def refits(
-        self,
-        task: HiddenTask,
-        learn: Callable[[Sequence[Record]], Path],
-        every: int,
-        rehearsal: int,
-        path: Path,
-        records: Sequence[Record],
-    ) -> BaseCallback:
-        """Refit the map to what :class:`KKLTrainingCallback` has kept."""
-        outputs = CLEAN_Y if task.measurement_noise else "y"
-        return KKLTrainingCallback(
-            every, keep=KEPT, records=records, rehearsal=rehearsal, outputs=outputs, path=path, **SETTINGS
-        )
+def show_estimates(task: HiddenTask, path: str, keep: int | None) -> gym.Env[np.ndarray, Any]:
+    """Make the environment that shows an observer's estimates; :class:`KKLTrainingCallback` keeps the steps."""
+    return show(task, "x_hat", path)
 
 
-KKL: Estimation = _KKL()
+@dataclass(frozen=True)
+class Estimation:
+    """How estimates of hidden signals are learned from an agent's steps, shown to it, and learned again."""
+
+    learn: Callable[..., Path]
+    show: Callable[[HiddenTask, str, int | None], gym.Env[np.ndarray, Any]]
+    refits: Callable[..., BaseCallback]
+
+
+KKL = Estimation(learn_observer, show_estimates, refits)
 
 __all__ = ["KEPT", "KKL", "OBSERVER", "SETTINGS", "Estimation", "Told", "learn_observer", "oldest_first", "wander"]
